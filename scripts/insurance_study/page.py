@@ -46,8 +46,14 @@ PLANNED = 20
 _AXES: Mapping[str, Sequence[str]] = {"drawn": DRAWN, "remembering": REMEMBERED}
 
 
-_SHOWN = ("ideal", "matched", "drawn", "random", "double")
-"""Kinds that stand beside each other for every thing."""
+_SHOWN: Mapping[str, str] = {
+    "ideal": "ideal forces",
+    "matched": "the very dose",
+    "drawn": "drawn",
+    "random": "random",
+    "double": "random, twice",
+}
+"""Kinds that stand beside each other for every thing, and the columns' names."""
 
 
 class Found(NamedTuple):
@@ -110,32 +116,34 @@ def write(collected: Collected, out: Path) -> list[Path]:
 
 
 def _things(collected: Collected, scores: Scores) -> str:
-    """A row for every task and thing: what policies of the kinds that an owner chooses between come to there."""
-    rows = []
+    """A table a task, a row for every thing: what policies of the kinds that an owner chooses between come to there."""
+    tables = []
     for task in TASKS:
+        rows = []
         for axis, thing in THINGS.items():
             kinds = {kind: KINDS[kind](task, axis) for kind in _SHOWN if axis in _AXES.get(kind, AXES)}
             there = {kind: found(collected, scores, [under(trained, axis)]) for kind, trained in kinds.items()}
             means = {kind: np.mean(one.scores) for kind, one in there.items() if one.scores.size}
-            cells = [f"{TITLES[task]}, {1000 * find_task(task).step_duration:g} ms"]
-            cells.append(f"{thing} {dose_text(task, axis, DOSES[task][axis])}")
             far = {"lag": "", "delay": "", "weakness": "±"}  # what random actuators draw
-            cells.append(far[axis] + dose_text(task, axis, reach(task, axis)) if axis in far else "–")
+            drawn_to = f" ({far[axis]}{dose_text(task, axis, reach(task, axis))})" if axis in far else ""
+            cells = [f"{thing} {dose_text(task, axis, DOSES[task][axis])}{drawn_to}"]
             for kind in _SHOWN:
-                text = there[kind].short if kind in there else "–"
+                text = there[kind].short.replace(" ", "\u00a0") if kind in there else "–"
                 cells.append(f"**{text}**" if kind in means and means[kind] == max(means.values()) else text)
             rows.append(cells)
-    header = ["task, policy step", "tested on", "reach", *(SAYS[kind].partition(" (")[0] for kind in _SHOWN)]
+        title = f"{TITLES[task]}, a step of {1000 * find_task(task).step_duration:g} ms"
+        tables.append(markdown_table([title, *_SHOWN.values()], rows))
     text = f"""Look for what is most like yours. Mean score, 1 being ideal-trained policies on ideal forces and 0 random
 actions; how many of {PLANNED} policies fail, by losing more than {FAILED:g}; how often episodes succeed. The highest
-mean is bold. *Random actuators* draw strength, lag and delay for every episode, and push; they reach as far as the
-third column says. *The very dose* is what it is tested on; *drawn* is that one thing alone, from none to twice as much.
-Forces are shares of the largest one, or N·m; voltages are shares of [what the task needs](plan.md#doses)."""
+mean is bold. *Random* actuators draw strength, lag and delay for every episode, and push; they reach as far as is said
+in brackets, or twice as far. *The very dose* is what it is tested on; *drawn* is that one thing alone, from none
+to twice as much. Forces are shares of the largest one, or N·m; voltages are shares of [what the task
+needs](plan.md#doses)."""
     return f"""## What each kind of training comes to
 
 {textwrap.fill(" ".join(text.split()), 120, break_long_words=False)}
 
-{markdown_table(header, rows)}"""
+{chr(10).join(tables)}"""
 
 
 def _kinds(collected: Collected, scores: Scores) -> str:

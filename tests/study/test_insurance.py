@@ -171,9 +171,10 @@ def test_what_is_so_stands_on_the_page(written):
     page = (out / "insurance.md").read_text()
     assert "| random actuators | 1.00 | 0.70, 0.70; 24 of 24;" in page  # 4 policies on 6 doses
     assert "| the very dose | 1.00 | 0.90, 0.90;" in page
-    assert "| Acrobot, 200 ms | delay 600 ms | 400 ms | 0.50; 4; " in page
-    (row,) = (line for line in page.splitlines() if line.startswith("| Pendulum, 50 ms | friction 0.2 N·m | – | "))
-    assert [cell[:5] for cell in row.split(" | ")[3:]] == ["0.50;", "**0.9", "–", "0.70;", "0.50;"]
+    assert "| Acrobot, a step of 200 ms | ideal forces |" in page
+    assert "| delay 600 ms (400 ms) | 0.50; 4; " in page.replace("\u00a0", " ")
+    (row,) = (line for line in page.splitlines() if line.startswith("| friction 0.2 N·m | "))
+    assert [cell[:5] for cell in row.split(" | ")[1:]] == ["0.50;", "**0.9", "–", "0.70;", "0.50;"]
     (i10,) = (line for line in page.splitlines() if line.startswith("| I10 |"))
     assert " | -0.20, -0.20, -0.20 | " in i10
     assert "not judged" not in page
