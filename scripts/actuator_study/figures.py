@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from actuator_study import arms
+from actuator_study.units import THINGS, dose_text, size
 from codrl_mj.evaluation.measures import bootstrap_mean
 from codrl_mj.study.advice import BUY, IDEAL, MEASURE, RANDOMISE, THROUGH, decide, known, tests_through
 from codrl_mj.study.doses import AXES, SECONDS
@@ -45,8 +46,9 @@ def losses(path: Path, evidence: Evidence) -> bool:
                 panel.text(column, row, text, ha="center", va="center", fontsize=6.5, color=dark)
         shown = panel.imshow(np.clip(means, 0.0, 1.0), cmap="YlOrBr", vmin=0.0, vmax=1.0, aspect="auto")
         panel.set_xticks(range(len(axis.doses) - 1), [f"{dose:g}" for dose in axis.doses[1:]])
-        panel.set_yticks(range(len(SECONDS)), [TITLES[task] for task in SECONDS] if number % 3 == 0 else [])
-        panel.set(xlabel=axis.unit, title=axis.title)
+        named = [f"{TITLES[task]}\n{size(task)}" for task in SECONDS]
+        panel.set_yticks(range(len(SECONDS)), named if number % 3 == 0 else [], fontsize=8)
+        panel.set(xlabel=axis.unit, title=THINGS[name].capitalize())
     figure.colorbar(shown, ax=panels, label="lost [share of the span]", shrink=0.6)
     save(figure, path)
     return drawn
@@ -72,7 +74,7 @@ def insured(path: Path, evidence: Evidence) -> bool:
                 if found is not None:
                     drawn = True
                     dots(panel, place + 0.19 * (number - 1.5), 1.0 - found.lost, COLOURS[number], label)
-        named = [f"{axis.title} {axis.trained[task]:g}" for axis in AXES.values()]
+        named = [f"{thing} {dose_text(task, name, AXES[name].trained[task])}" for name, thing in THINGS.items()]
         panel.set_xticks(range(len(AXES)), named)
         panel.set(title=TITLES[task], ylabel="score [share of the span]")
         panel.grid(axis="y", color="0.9")

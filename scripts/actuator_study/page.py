@@ -11,6 +11,7 @@ import numpy as np
 
 from actuator_study import advised, arms, figures
 from actuator_study.questions import on_loop, on_motor, primary, secondary, through_loop, through_motor
+from actuator_study.units import THINGS, dose_text, scale, short, size
 from codrl_mj.runs.files import write_json
 from codrl_mj.study.advice import BUY, IDEAL, RANDOMISE, THROUGH
 from codrl_mj.study.doses import AXES, FLOORS, SECONDS, at_home, ideal
@@ -19,7 +20,6 @@ from codrl_mj.study.inference import detectable
 from codrl_mj.study.pages import TITLES, conclusions, markdown_table, write_csv, write_page
 from codrl_mj.study.questions import LEVEL, MARGIN, Scores, Verdict, judge
 from codrl_mj.study.trials import FAILED, RUNS, TOTALS, Collected, Trial, run_rows, trial_rows
-from codrl_mj.tasks import find_task
 
 PAGE, FOLDER = "actuators.md", "actuators"
 """The page, and the folder beside it with its figures and tables."""
@@ -124,16 +124,15 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
     """A table of what ideal-trained policies bear in a task's own units, and the map of all losses."""
     rows = []
     for task in SECONDS:
-        step, force = find_task(task).step_duration, find_task(task).max_force
-        rows.append([f"{TITLES[task]}: {1000 * step:g} ms, {force:g} {_unit(task)}"])
+        rows.append([f"{TITLES[task]}: {size(task)}"])
         for name, axis in AXES.items():
             known = [(dose, one.outcome) for dose in axis.doses[1:] if (one := evidence.loss(task, name, dose))]
             borne = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].spared, known)]
             hurt = next(((dose, one) for dose, one in known if one.hurt), None)
-            scale, of = _scale(task, name)
-            text = f"≤{_short(scale * borne[-1] if borne else 0.0)}"
+            factor, of = scale(task, name)
+            text = f"≤{short(factor * borne[-1] if borne else 0.0)}"
             if hurt is not None:
-                text += f", ≥{_short(scale * hurt[0])} {of} ({round(hurt[1].failed * len(hurt[1].lost))})"
+                text += f", ≥{short(factor * hurt[0])} {of} ({round(hurt[1].failed * len(hurt[1].lost))})"
             else:
                 text += f" {of}"
             rows[-1].append(text if known else "–")
@@ -150,39 +149,6 @@ time, under a loop with anti-windup: without it 35 % ruins four of 20 policies o
 
 {markdown_table(["task: policy step, largest force", *THINGS.values()], rows)}
 {_figure(drawn, "losses", "What ideal-trained policies lose, by task and dose")}"""
-
-
-THINGS: Mapping[str, str] = {
-    "lag": "lag",
-    "weakness": "missing force",
-    "supply": "missing voltage",
-    "delay": "delay",
-    "friction": "friction",
-    "noise": "noise",
-}
-"""What the doses of each axis are of, in the order of `AXES`."""
-
-
-def _unit(task: str) -> str:
-    """Of a task's force."""
-    return "N" if task in ("cartpole", "mountain_car", "mountain_car_continuous") else "N·m"
-
-
-def _scale(task: str, axis: str) -> tuple[float, str]:
-    """What a dose is to be multiplied by, and its unit then."""
-    if axis in ("lag", "delay"):
-        return 1000.0 * find_task(task).step_duration, "ms"
-    return (100.0, "%") if axis in ("weakness", "supply") else (find_task(task).max_force, _unit(task))
-
-
-def _short(value: float) -> str:
-    return f"{float(f'{value:.2g}'):g}"
-
-
-def dose_text(task: str, axis: str, dose: float) -> str:
-    """A dose in the units of a task."""
-    scale, unit = _scale(task, axis)
-    return f"{_short(scale * dose)} {unit}"
 
 
 def _insured(drawn: Mapping[str, Path]) -> str:

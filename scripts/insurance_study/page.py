@@ -11,14 +11,13 @@ from actuator_study.arms import DRAWN
 from actuator_study.figures import dots
 from actuator_study.page import (
     HYPOTHESES,
-    THINGS,
     TRIALS,
     decided_table,
-    dose_text,
     effect_text,
     p_text,
     write_tables,
 )
+from actuator_study.units import THINGS, dose_text
 from codrl_mj.study.doses import AXES, FLOORS, at_home, ideal
 from codrl_mj.study.pages import COLOURS, TITLES, conclusions, legend, markdown_table, save, write_csv, write_page
 from codrl_mj.study.questions import MARGIN, Scores, Verdict, judge
