@@ -282,6 +282,8 @@ def test_what_is_no_trajectory_is_refused(tmp_path):
     np.savez(tmp_path / "other.npz", time=np.zeros(3))
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "pickle.npz").write_bytes(pickle.dumps({"time": 1}))
-    for name in ("other.npz", "cut.npz", "pickle.npz"):
+    within = whole.index(b"observation.npy") + 400  # compressed numbers
+    (tmp_path / "flipped.npz").write_bytes(whole[:within] + bytes([whole[within] ^ 255]) + whole[within + 1 :])
+    for name in ("other.npz", "cut.npz", "pickle.npz", "flipped.npz"):
         with pytest.raises(ValueError, match=name):
             load_episode(tmp_path / name)

@@ -127,7 +127,7 @@ class Test:
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task(f"on {self.target}", total=self.episodes)
             given = self.folder, self.target, self.episodes, self.seed, link, self.loop, self.actuator
-            done = board_test(*given, on_step=lambda _, ended: bar.update(row, completed=ended))
+            done = board_test(*given, on_episode=lambda ended: bar.update(row, completed=ended))
         board, python = done.returns.mean(axis=0)
         taken = "not counted here" if done.instructions is None else "{} and {}".format(*done.instructions)
         rows = [

@@ -139,7 +139,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         self.contract, self.link = Contract.read(folder), link or Link()
         self.random = np.random.default_rng(seed)
         self.frames, self.refused, self.stopped, self.unanswered = 0, 0, 0, 0
-        self._last = np.array(self.contract.late["command"])
+        self._safe = self._last = np.array(self.contract.late["command"])
         self.loop = self.contract.controller["loop"] if loop else None
         self.env = EnvConfig.from_mapping(self.contract.assumed)
         trained = type(self.env.actuators[0])
@@ -176,6 +176,24 @@ class Board(contextlib.AbstractContextManager["Board"]):
         """Samples of the current loop that the board computed."""
         return int(self._samples[0])
 
+    def episodes(self, count: int, seed: int = 0, on_episode: Callable[[int], None] = lambda _: None) -> list[Episode]:
+        """Whole episodes, one after another: a late answer leaves the command before, which is an episode's own.
+
+        Args:
+            count: how many.
+            seed: that of the first; each of the others has the next one.
+            on_episode: called with how many are finished.
+
+        Raises:
+            ValueError: `seed` is below 0.
+        """
+        done: list[Episode] = []
+        for place in range(count):
+            self._last = self._safe
+            done += run_episodes(self, self.rig.make, 1, seed + place)
+            on_episode(len(done))
+        return done
+
     def predict(
         self,
         observation: np.ndarray,
@@ -190,19 +208,18 @@ class Board(contextlib.AbstractContextManager["Board"]):
     def command(self, observation: np.ndarray) -> np.ndarray:
         """The command for an observation, in the units of the contract; that for safety if no good answer comes."""
         self.frames += 1
-        safe = np.array(self.contract.late["command"])
         observation = self.link.encoded(self.contract, observation)
         frame = bytearray(self._wire.frame(self.frames, self.frames * round(1e6 / self.contract.rate), observation))
         if self.random.random() < self.link.lost:
             self.unanswered += 1
-            return safe
+            return self._safe
         if self.random.random() < self.link.damaged:
             bit = int(self.random.integers(16, 8 * len(frame)))  # its start is found again in any case
             frame[bit // 8] ^= 1 << bit % 8
         answer = self._wire.asked(bytes(frame), self.frames)
         if answer is None:
             self.unanswered += 1
-            return safe
+            return self._safe
         self.refused += bool(answer.status & REFUSED)
         self.stopped += bool(answer.status & BEYOND)
         command, self._last = (
@@ -270,7 +287,7 @@ def board_test(
     link: Link | None = None,
     loop: bool = True,
     actuator: Any = None,
-    on_step: Callable[[int, int], None] | None = None,
+    on_episode: Callable[[int], None] = lambda _: None,
 ) -> BoardTest:
     """Run the exported C as the controller of the simulation, and the exported ONNX model beside it.
 
@@ -282,7 +299,7 @@ def board_test(
         link: what stands between board and simulation; None for nothing.
         loop: whether the C closes the current loop too, where it has one.
         actuator: as for `Board`.
-        on_step: called with (episodes running, episodes finished) after every step on the board.
+        on_episode: called with how many are finished on the board.
 
     Raises:
         FileNotFoundError: the folder has no contract or no C.
@@ -292,7 +309,7 @@ def board_test(
     with Board(folder, target, link, seed, loop, actuator) as board:
         env = board.env
         began = time.perf_counter()
-        on_board = run_episodes(board, board.rig.make, episodes, seed, on_step=on_step)
+        on_board = board.episodes(episodes, seed, on_episode)
         rate = (board.frames + board.samples) / (time.perf_counter() - began)
         counts = board.frames, board.samples, board.refused, board.stopped, board.unanswered
     in_python = run_episodes(OnnxPolicy(folder), env.make, episodes, seed)

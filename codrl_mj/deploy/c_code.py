@@ -1,4 +1,4 @@
-"""A policy, and the current loop behind it, as C99 for a microcontroller: no malloc, and of libm tanh alone."""
+"""A policy, and the current loop behind it, as C99 for a microcontroller: no malloc, of libm tanh, atan2 and fabs."""
 
 from collections.abc import Callable
 from typing import Any
@@ -102,9 +102,10 @@ def check_board(board: str, network: Network | Tiles, double: bool = False) -> N
     if avr and double:
         raise ValueError(f"board {board}: its double has 4 bytes: leave out --float64, or name a larger board")
     needs = ("flash", size * network.size + CODE, flash), ("RAM", size * (network.working + avr * network.size), ram)
+    smaller = "tilings 4" if isinstance(network, Tiles) else "hidden 32 32"
     for what, needed, there in needs:
         if needed > there:
             raise ValueError(
                 f"board {board}: the policy needs about {needed} bytes of {what}, must be at most {there}: train a "
-                "smaller network (--agent.hidden 32 32), or name a larger board"
+                f"smaller one (--agent.{smaller}), or name a larger board"
             )

@@ -72,10 +72,17 @@ def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: A
     starts = np.arange(0, len(time), length)
     tried = env if actuator is None else dataclasses.replace(env, actuator=dict.fromkeys(env.driven, actuator))
     if env.action == "force" and interface.levels is None:
-        forces = np.array(
-            [_per_ampere(new) / _per_ampere(old) for new, old in zip(tried.actuators, env.actuators, strict=True)]
-        )
-        commands = commands * forces
+        constants = [  # force at the joint for an ampere; 0 of what has no motor, whose commands stay as they are
+            [one.motor.torque_constant / one.arm_radius if hasattr(one, "motor") else 0.0 for one in side]
+            for side in (tried.actuators, env.actuators)
+        ]
+        commands = commands * [new / old if new and old else 1.0 for new, old in zip(*constants, strict=True)]
+        most = np.array([one["most"] for one in interface.actions])
+        if beyond := int((np.abs(commands) > most * (1.0 + 1e-6)).any(axis=1).sum()):
+            raise ValueError(
+                f"{path}: in {beyond} rows this motor gives more than the simulation takes, {most.tolist()}: simulate "
+                "the motor of the training"
+            )
     simulated, actions = [], interface.actions_of(commands)
     with contextlib.closing(tried.make()) as made:
         moved: Any = made.unwrapped
@@ -90,12 +97,6 @@ def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: A
             observation = moved.step(action)[0]
     names, units = ([one[key] for one in interface.observations] for key in ("name", "unit"))
     return RigComparison(names, units, time, observed, np.array(simulated), starts)
-
-
-def _per_ampere(actuator: Any) -> float:
-    """Force [N] or torque [N*m] at the joint for an ampere; 1 of what has no motor."""
-    motor = getattr(actuator, "motor", None)
-    return 1.0 if motor is None else float(motor.torque_constant / actuator.arm_radius)
 
 
 def _state_of(task: Any, observed: np.ndarray, near: np.ndarray) -> np.ndarray:

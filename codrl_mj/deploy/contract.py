@@ -29,6 +29,8 @@ FORMAT = "codrl_mj contract 1"
 FILE = "contract.json"
 GOLDEN = 200
 """Observations of episodes that are kept with their actions, for whoever computes them elsewhere."""
+CLOSE = 1e-5
+"""Share of the largest golden command, and at least of 1, that those of others may be off."""
 LATE = 1.5
 """Periods after which a command that has not come is late."""
 _PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "stable-baselines3", "torch")
@@ -162,6 +164,7 @@ class Contract(Interface):
             entry |= {"scale": float(network.factors[place]), "offset": 0.0}
             entry["seen"] = [float(seen[:, place].min()), float(seen[:, place].max())]
         acted = policy.predict(chosen, deterministic=True)[0]
+        largest = max(1.0, float(np.abs(between.commands(acted)).max()))
         return cls(
             **vars(between),
             agent=agent,
@@ -170,7 +173,7 @@ class Contract(Interface):
             controller={"real": "double" if double else "float", "loop": current_loop(env)},
             limits=_limits([one["name"] for one in between.observations], limits or {}),
             late={"after": LATE / between.rate, "unit": "s", "command": [0.0] * len(between.actions)},
-            golden={"observations": chosen.tolist(), "actions": acted.tolist(), "tolerance": 1e-5},
+            golden={"observations": chosen.tolist(), "actions": acted.tolist(), "tolerance": CLOSE * largest},
             versions={
                 "python": platform.python_version(),
                 **{one: importlib.metadata.version(one) for one in _PACKAGES},

@@ -90,8 +90,10 @@ def read_rows(interface: Interface, path: Path) -> tuple[np.ndarray, np.ndarray,
         ValueError: the table cannot be read, or its observations are not those of the policy: permuted, missing,
             unknown, of another unit, at another rate.
     """
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
         header, *rows = list(csv.reader(file)) or [[]]
+    while rows and not rows[-1]:
+        rows.pop()
     told = [(name.strip(), unit.strip() or None) for name, _, unit in (one.partition(":") for one in header)]
     names = [name for name, _ in told]
     where = {name: place for place, name in enumerate(names)}  # of equal names the last

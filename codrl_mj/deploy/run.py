@@ -75,8 +75,9 @@ def run_board(
                 if answer is not None:
                     if answer.status & NO_SENSORS:
                         raise RuntimeError(f"{port}: the board has no sensors: give it wire_sense (docs/deploy.md)")
-                    rows, late = rows + 1, late + bool(answer.status & LATE)
+                    late += bool(answer.status & LATE)
                     if not answer.status & DAMAGED:  # whose bytes are no observation
+                        rows += 1
                         table.writerow([now, *answer.observation, *answer.command, *answer.motors.ravel()])
                     if on_answer is not None:
                         on_answer(answer)

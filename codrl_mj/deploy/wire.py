@@ -30,8 +30,6 @@ class Answer(NamedTuple):
     """That of the frame, modulo 256."""
     status: int
     """Bits of `DAMAGED` and so on."""
-    stamp: int
-    """Time [us] of the frame, modulo 2^32."""
     observation: np.ndarray
     """That which the policy took, shape (k,)."""
     command: np.ndarray
@@ -49,7 +47,7 @@ class Wire:
         self._sizes = len(contract.observations), len(contract.actions)
         self._request = struct.Struct(f"<BBI{self._sizes[0]}{kind}")
         self._answer = struct.Struct(f"<BBI{self._sizes[0] + 4 * self._sizes[1]}{kind}")
-        self._to, self._back = to, back
+        self._to, self._back, self._got = to, back, bytearray()
 
     def frame(self, sequence: int, stamp: int, observation: np.ndarray, kind: int = ASK) -> bytes:
         """A frame with an observation (k,), at a time [us]."""
@@ -70,22 +68,30 @@ class Wire:
 
     def _read(self, sequence: int, within: float) -> Answer | None:
         """The next answer."""
-        size, got = self._answer.size + 4, b""
+        size, got, damaged = self._answer.size + 4, self._got, False
         until = time.monotonic() + within
-        while len(got) < size:
-            ready = select.select([self._back], [], [], max(0.0, until - time.monotonic()))[0]
-            more = os.read(self._back, size - len(got)) if ready else b""
-            if ready and not more:
-                raise RuntimeError(f"the board's program ended at frame {sequence}")
-            if not ready:
+        while True:
+            begin = got.find(_START)
+            del got[: begin if begin >= 0 else len(got) - got.endswith(_START[:1])]  # noise before it
+            if len(got) >= size:
+                content = bytes(got[2 : size - 2])
+                damaged = got[:size] != _framed(content)
+                del got[: 1 if damaged else size]  # within what is damaged may be the start of one that is not
+                if not damaged:
+                    break
+            elif damaged and not got:
                 return None
-            got += more
-            got = got[max(got.find(_START[0]), 0) :] if got[:1] != _START[:1] else got  # noise before it
-        if got != _framed(got[2:-2]):
-            return None
-        answered, status, stamp, *numbers = self._answer.unpack(got[2:-2])
+            else:
+                ready = select.select([self._back], [], [], max(0.0, until - time.monotonic()))[0]
+                if not ready:
+                    return None
+                more = os.read(self._back, size)
+                if not more:
+                    raise RuntimeError(f"the board's program ended at frame {sequence}")
+                got += more
+        answered, status, _, *numbers = self._answer.unpack(content)
         seen, command, motors = np.split(np.array(numbers), np.cumsum(self._sizes))
-        return Answer(answered, status, stamp, seen, command, motors.reshape(-1, 3))
+        return Answer(answered, status, seen, command, motors.reshape(-1, 3))
 
 
 def _framed(content: bytes) -> bytes:

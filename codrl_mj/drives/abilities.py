@@ -157,7 +157,8 @@ def torque_limits(drive: Drive, speeds: Any, current: float = math.inf) -> tuple
     """
     speeds = np.asarray(speeds, dtype=float)
     back_emf = drive.motor.back_emf_constant * drive.motor.gear_ratio * speeds
-    lowest, highest = -_highest_current(drive, -back_emf), _highest_current(drive, back_emf)
+    winding = drive.motor.resistance, drive.voltage_limit, _resistance(drive) - drive.motor.resistance
+    lowest, highest = -highest_current(*winding, -back_emf), highest_current(*winding, back_emf)
     low, high = (np.clip(bound, lowest, highest) for bound in (-current, current))
     return _at_output(drive.motor, low, speeds), _at_output(drive.motor, high, speeds)
 
@@ -167,10 +168,8 @@ def _resistance(drive: Drive) -> float:
     return drive.motor.resistance + (0.0 if drive.supply is None else drive.supply.resistance)
 
 
-def _highest_current(drive: Drive, back_emf: np.ndarray) -> np.ndarray:
-    """Highest steady current [A]: that of u = max(V - Rs*|i|, 0), as the drive has it; at u = 0 it is -b/R."""
-    resistance, voltage = drive.motor.resistance, drive.voltage_limit
-    sag = _resistance(drive) - resistance
+def highest_current(resistance: float, voltage: float, sag: float, back_emf: np.ndarray) -> np.ndarray:
+    """Highest steady current [A] of a winding R: that of u = max(V - Rs*|i|, 0), Rs the sag; at u = 0 it is -b/R."""
     against = max(resistance - sag, 1e-9 * resistance)  # where i < 0, beyond the no-load speed
     driven = (voltage - back_emf) / np.where(back_emf > voltage, against, resistance + sag)
     return np.maximum(driven, -back_emf / resistance)

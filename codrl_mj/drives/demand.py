@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -86,7 +87,7 @@ def demands_of(what: str | Path, episodes: int = EPISODES, seed: int = 0, trust:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 found = recorded(archive["time"], archive["torque"], archive["speed"], f"the recording {path.name}")
-        except (KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        except (KeyError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
             raise ValueError(f"{path}: no recording of the arrays time, torque and speed: {error}") from None
         return {"": found}
     from codrl_mj.envs.config import EnvConfig

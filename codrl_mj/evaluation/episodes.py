@@ -5,6 +5,7 @@ import copy
 import dataclasses
 import json
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -161,7 +162,7 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
             motors=tuple(arrays["motors"].tolist()) if "motors" in arrays else (),
             succeeded=bool(arrays["succeeded"]) if "succeeded" in arrays else None,
         )
-    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (KeyError, TypeError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path} is not the trajectory of an episode: {error}") from None
 
 

@@ -21,7 +21,7 @@ _LIMITS = {"voltage_saturated": SATURATED, "current_saturated": "#E69F00", "temp
 def draw_text(text: str, width: int, height: int, colour: str = "#22313F") -> np.ndarray:
     """One line of bold text, centred: an image, shape (height, width, 3), uint8."""
     figure = _figure(width, height)
-    figure.text(0.5, 0.5, text, ha="center", va="center", fontsize=12, color=colour, weight="bold")
+    figure.text(0.5, 0.5, text.replace("$", r"\$"), ha="center", va="center", fontsize=12, color=colour, weight="bold")
     return _pixels(figure)
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import Actuator, ActuatorModel, Drive, Ideal, Inputs, TorqueSpeed, parameters_type
+from codrl_mj.actuators import Actuator, ActuatorModel, Drive, Ideal, Inputs, Supply, TorqueSpeed, parameters_type
 from codrl_mj.drives import LoopDesign, Looped, Response, abilities, closed_loop, design, open_loop, small_step
-from codrl_mj.drives.abilities import diagram_limits, torque_limits
+from codrl_mj.drives.abilities import diagram_limits, highest_current, torque_limits
 from codrl_mj.drives.loop import Steps
 from codrl_mj.pages.plots import Curve, Plot
 
@@ -71,7 +71,7 @@ def envelope(
 
 
 def episode_diagram(lines: Sequence[Any]) -> Plot | None:
-    """The points of episodes in the plane of speed and torque, within what the motors (`episode.MotorLine`) can do."""
+    """The points of episodes in the plane of speed and torque, within what the motors (`episode._MotorLine`) can do."""
     curves: list[Curve] = []
     highest = 0.0
     own = [line for line in lines if not isinstance(line.actuator, Ideal)]
@@ -111,12 +111,14 @@ def limits(actuator: Any, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray] |
         low, high = (np.clip(end, -actuator.max_torque, actuator.max_torque) for end in ends)
         return low, high
     if isinstance(actuator, Actuator) and actuator.voltage_limit is not None:
-        motor, volts = actuator.motor, actuator.voltage_limit
-        low, high = (
-            motor.torque_constant * (side * volts - motor.back_emf_constant * speeds) / motor.resistance
-            for side in (-1, 1)
-        )
-        return low, high
+        motor, supply, most = actuator.motor, actuator.supply or Supply(), actuator.controller.max_voltage
+        limited = (most, 0.0), (supply.voltage if math.isfinite(supply.voltage) else most, supply.resistance)
+        ends = []
+        for side in (-1.0, 1.0):
+            back_emf = side * motor.back_emf_constant * speeds
+            currents = [highest_current(motor.resistance, *one, back_emf) for one in limited]
+            ends.append(side * motor.torque_constant * np.minimum(*currents))
+        return ends[0], ends[1]
     return None
 
 

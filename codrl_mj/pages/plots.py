@@ -210,7 +210,7 @@ def save(several: Plot | Sequence[Plot], path: Path, size: tuple[float, float] |
     panels = figure.subplots(rows, columns, squeeze=False)
     for plot, axes in zip(drawn, panels.T.flat, strict=True):
         _draw(plot, axes, "#22313f", POINTS)
-        axes.set_title(plot.title, fontsize="medium", color="#22313f")
+        axes.set_title(plot.title.replace("$", r"\$"), fontsize="medium", color="#22313f")
         beside = min(len(plot.curves), 3 if columns == 1 else 2)
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=beside, fontsize="small", frameon=False)
     with writing(path) as temporary:
@@ -220,6 +220,7 @@ def save(several: Plot | Sequence[Plot], path: Path, size: tuple[float, float] |
 def _draw(plot: Plot, axes: Any, ink: str, points: int) -> None:
     """Draw a plot's first twelve curves, each of at most so many points, on matplotlib's axes."""
     for index, curve in enumerate(plot.curves[:12]):
+        label = curve.label.replace("$", r"\$")  # a name, and no formula
         colour = ink if curve.reference else _PALETTE[(index if curve.colour is None else curve.colour) % 6]
         x, y = thinned(curve.x, _drawable(curve.y, plot.y_log), points)
         dots = curve.style in ("dots", "trail")
@@ -233,7 +234,7 @@ def _draw(plot: Plot, axes: Any, ink: str, points: int) -> None:
             marker="." if dots or few else "",
             markersize=9.0 if dots and few else 5.0 if few else 3.0,
             drawstyle="steps-post" if curve.style == "step" else "default",
-            label=curve.label if curve.label not in axes.get_legend_handles_labels()[1] else None,
+            label=label if label not in axes.get_legend_handles_labels()[1] else None,
         )
         if curve.filled:
             other = thinned(curve.x, _drawable(plot.curves[index - 1].y, plot.y_log), points)[1]

@@ -59,20 +59,24 @@ def motion(
     Args:
         model: the model.
         states: one for each instant; what `show` takes, or else rows that begin with `qpos`.
-        time: instants [s], ascending, shape (T,).
+        time: instants [s], ascending, shape (T,); the motion begins at the first.
         camera: of the model, from which it is first seen.
         show: brings a simulation of the model into a state.
 
     Raises:
-        ValueError: `states` and `time` do not fit each other or the model, or the model has no such camera.
+        ValueError: `states` and `time` do not fit each other or the model, `time` does not ascend, or the model has no
+            such camera.
     """
+    time = np.asarray(time, dtype=float)
     if len(states) != len(time) or not len(time):
         raise ValueError(f"states: there are {len(states)} for {len(time)} instants: must be one for each, and some")
+    if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
+        raise ValueError("time: must be finite, and ascend from each instant to the next")
     cameras = [model.camera(index).name for index in range(model.ncam)]
     if camera is not None and camera not in cameras:
         raise ValueError(f"camera = {camera!r}: the model's cameras are {', '.join(cameras) or 'none'}")
-    if show is None and np.shape(states)[1] < model.nq:
-        have = f"a row has {np.shape(states)[1]} entries"
+    if show is None and np.shape(states)[-1] < model.nq:
+        have = f"a row has {np.shape(states)[-1]} entries"
         raise ValueError(f"states: {have}: must begin with the model's {model.nq} of qpos")
     data = mujoco.MjData(model)
 
@@ -81,7 +85,7 @@ def motion(
         mujoco.mj_kinematics(model, data)
         return data
 
-    seen, show, time = shapes(model), show or by_positions, np.asarray(time)
+    seen, show, time = shapes(model), show or by_positions, time - time[0]
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     stride = max(1, int(1.0 / (_MOST_PER_SECOND * step) + 1e-9))
     chosen = np.unique([*range(0, len(time), stride), len(time) - 1])  # the last, and as many others as are needed

@@ -15,6 +15,7 @@ from codrl_mj.cli import main
 from codrl_mj.deploy import Board, Contract, Link, OnnxPolicy, board_test, check_log, export, instructions
 from codrl_mj.deploy import board as boards
 from codrl_mj.deploy.board import TARGETS, missing_tools
+from codrl_mj.deploy.wire import Wire
 from codrl_mj.envs.config import EnvConfig
 from tests.deploy.test_export import trained
 from tests.matrix import but
@@ -158,6 +159,10 @@ def test_encoders_and_late_answers_come_between(folder):
         given = [prompt.command(one) for one in rows]
     np.testing.assert_array_equal(held[1:], given[:-1])
     assert not held[0].any()
+    python = OnnxPolicy(folder)
+    for one in board_test(folder, episodes=2, link=Link(late=1.0)).on_board:  # the command before, of that episode
+        assert not one.action[0].any()
+        np.testing.assert_allclose(one.action[1:], python.predict(one.observation[:-2])[0], atol=1e-5)
 
 
 @of_furuta
@@ -212,6 +217,25 @@ def test_lost_and_damaged_frames_are_answered_for_safety(folder):
         for row in Contract.read(folder).golden["observations"]:
             assert not board.command(np.array(row)).any()
         assert board.refused == board.frames
+
+
+@of_cartpole
+@pytest.mark.parametrize("noise", [b"\xa5", b"\xa5\x5a" + bytes(21), b"\x00\xa5\xa5"])
+def test_an_answer_is_found_again_behind_noise(folder, noise):
+    contract = Contract.read(folder)
+    numbers = np.full(len(contract.observations) + 4 * len(contract.actions), struct.unpack("<d", b"\xa5\x5a" * 4)[0])
+    (to, sent), (back, said) = os.pipe(), os.pipe()
+    wire = Wire(contract, sent, back)
+    os.write(said, noise)
+    for sequence in range(1, 21):
+        content = struct.pack(f"<BBI{len(numbers)}d", sequence, OK, 0, *numbers)
+        os.write(said, b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF)))
+        answer = wire.asked(b"", sequence, 0.2)
+        assert answer is not None
+        assert (answer.sequence, answer.status) == (sequence, OK)
+        np.testing.assert_array_equal(answer.observation, numbers[: len(contract.observations)])
+    for one in (to, sent, back, said):
+        os.close(one)
 
 
 def kind_of(folder):
@@ -417,6 +441,9 @@ def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(
         log.write_text("\n".join(",".join(row) for row in (table[0], *table[1])))
         with pytest.raises(ValueError, match=says):
             check_log(folder, log)
+    text = "\r\n".join(",".join(row) for row in (header, *rows))
+    log.write_text("\ufeff" + text + "\r\n\r\n", encoding="utf-8")  # as a spreadsheet saves it
+    assert check_log(folder, log) == found
     for row in rows:
         row[sent] = str(float(row[sent]) + 0.01)
     log.write_text("\n".join(",".join(row) for row in (header, *rows)))
@@ -468,7 +495,6 @@ def test_a_wrong_weight_fails_the_golden_check_and_fast_math_does_not_compile(fo
     sources = [str(spoilt), str(folder / "main.c")]
     subprocess.run(["cc", "-std=c99", f"-I{folder}", *sources, "-lm", "-o", str(program)], check=True)
     assert subprocess.run([program], check=False, capture_output=True).returncode == 1
-    fast = subprocess.run(
-        ["cc", "-ffast-math", "-c", f"-I{folder}", sources[1], "-o", str(program)], capture_output=True
-    )
-    assert b"without -ffast-math" in fast.stderr
+    for flag in ("-ffast-math", "-ffinite-math-only"):
+        refused = subprocess.run(["cc", flag, "-c", f"-I{folder}", sources[1], "-o", str(program)], capture_output=True)
+        assert b"without -ffast-math" in refused.stderr

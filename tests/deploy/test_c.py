@@ -237,5 +237,7 @@ def test_a_policy_that_does_not_fit_is_refused_with_both_sizes():
         check_board("arduino-uno", small)  # whose constants are copied there
     with pytest.raises(ValueError, match="double has 4 bytes"):
         check_board("arduino-uno", small, double=True)
+    with pytest.raises(ValueError, match=r"train a smaller one \(--agent.tilings 4\), or name a larger"):
+        check_board("arduino-uno", network_of(trained("acrobot", "sarsa")[0]))
     with pytest.raises(ValueError, match="did you mean arduino-uno"):
         check_board("arduino-un", network)

@@ -85,6 +85,11 @@ def test_from_the_command_line(logged, tmp_path, capsys):
     told = json.loads(capsys.readouterr().out)
     assert [one["name"] for one in told] == ["cos_arm", "sin_arm", "cos_rod", "sin_rod", "arm_velocity", "rod_velocity"]
     assert all(one["error"] < 0.01 * one["if_nothing_changed"] for one in told)
+    assert (
+        main([*line, "--actuator", "ideal", "--json"]) == 0
+    )  # whose torque is what was asked for, as the rig's is soon
+    for one, other in zip(json.loads(capsys.readouterr().out), told, strict=True):
+        assert one["error"] < 0.2 * other["if_nothing_changed"]
     picture = tmp_path / "compared.png"
     assert main([*line, "--actuator", "ideal", "--out", str(picture)]) == 0
     assert "arm_velocity" in capsys.readouterr().out
@@ -105,6 +110,9 @@ def test_what_cannot_be_compared_is_said(logged, tmp_path, capsys):
     capsys.readouterr()
     with pytest.raises(ValueError, match="the policy knows none"):
         compare(EnvConfig("cartpole"), log)
+    (drive,) = FURUTA.driven.values()
+    with pytest.raises(ValueError, match=r"rows this motor gives more than the simulation takes, \["):
+        compare(FURUTA, log, actuator=drive.replaced({"motor.torque_constant": 1e3}))
 
 
 def test_identify_reads_what_a_board_logged(tmp_path):

@@ -237,6 +237,18 @@ def test_an_edited_contract_is_refused(exported, tmp_path):
         Contract.read(tmp_path)
 
 
+@pytest.mark.parametrize("agent", ["sac", "td3"])
+def test_large_commands_may_be_off_by_more(agent, tmp_path):
+    env = EnvConfig("pendulum", {"name": "paper", "controller": {"max_voltage": 200.0}}, action="voltage")
+    policy, _ = trained("pendulum", agent)
+    policy.action_space = policy.actor.action_space = env.make().action_space
+    export(policy, env, agent, tmp_path / "out", 1)
+    golden = Contract.read(tmp_path / "out").golden
+    largest = np.abs(golden["actions"]).max()
+    assert largest > 100.0
+    assert golden["tolerance"] == pytest.approx(1e-5 * largest)
+
+
 def test_a_folder_that_holds_something_is_left_alone(exported):
     folder, policy = exported
     with pytest.raises(FileExistsError, match="is no empty folder"):

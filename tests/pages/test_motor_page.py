@@ -1,9 +1,12 @@
 """A motor's page: the numbers of its datasheet with their sources, and its loop."""
 
+import itertools
+import math
 import re
 
 import numpy as np
 
+from codrl_mj.actuators import Actuator, CurrentLoop, Inputs, Motor, Supply, parameters_type
 from codrl_mj.cli import main
 from codrl_mj.drives import abilities, explain, find_drive
 from codrl_mj.pages.diagrams import limits, no_load_speed, torque_speed_diagram
@@ -45,3 +48,23 @@ def test_limits_before_friction_end_at_the_no_load_speed():
     assert high[0] == np.float64(motor.torque_constant * drive.voltage_limit / motor.resistance)
     assert abs(high[1]) < 1e-12
     assert low[0] == -high[0]
+
+
+def test_limits_behind_a_supply_are_where_the_motor_settles():
+    """The simulation is asked for far more than it can give, at a speed that is held."""
+    motor = Motor(resistance=1.0, inductance=1e-3, torque_constant=0.1, back_emf_constant=0.1)
+    speeds = np.array([-100.0, 0.0, 50.0, 100.0, 200.0])
+    for supply, most in (
+        (Supply(24.0, 1.0), math.inf),
+        (Supply(24.0, 1.0), 9.0),
+        (Supply(math.inf, 0.5), 12.0),
+        (None, 12.0),
+    ):
+        actuator = Actuator(motor, CurrentLoop(kp=10.0, max_voltage=most, substeps=20), supply)
+        settled = []
+        for asked, speed in itertools.product((-1e3, 1e3), speeds):
+            parameters, state, torque = parameters_type(Actuator)(*actuator.numbers), actuator.State(0.0, 0.0, 0.0), 0.0
+            for _ in range(200):
+                state, torque, _ = actuator.advance(parameters, 1e-3, state, Inputs(asked, 0.0, speed, 0.0, 0.0))
+            settled.append(torque)
+        np.testing.assert_allclose(np.ravel(limits(actuator, speeds)), settled, rtol=1e-6)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from codrl_mj.pages.plots import POINTS, Curve, Plot, Shade, as_json, description, spans, still, thinned
+from codrl_mj.pages.plots import POINTS, Curve, Plot, Shade, as_json, description, save, spans, still, thinned
 
 
 def read(plot):
@@ -73,6 +73,13 @@ def test_names_cannot_end_the_script_that_holds_the_data():
     )
     assert "<" not in as_json(plot)
     assert read(plot)[0]["title"] == "</script><b>"
+
+
+def test_names_are_no_formulas(tmp_path):
+    names = "$KP_$KD", "cost_$10_to_$20"
+    plot = Plot(names[0], "x", "y", tuple(Curve(name, np.arange(3), np.arange(3)) for name in names))
+    assert all(name in still(plot) for name in names)
+    save(plot, tmp_path / "plot.png")
 
 
 def test_words_say_what_the_picture_shows():

@@ -74,6 +74,11 @@ def test_only_as_many_instants_are_kept_as_are_needed_and_the_last(arm):
     assert np.diff(made.time)[:-1] == pytest.approx(0.032)  # the largest number of steps not above 1/30 s
     slow = motion(arm, positions(arm, 5), np.arange(5) * 0.2)
     assert len(slow.time) == 5
+    later = motion(arm, positions(arm, 5), 100.0 + np.arange(5) * 0.2)
+    np.testing.assert_allclose(later.time, slow.time, atol=1e-12)
+    for times in ([0.0, 0.1, 0.1], [0.2, 0.1, 0.0], [0.0, 0.1, np.nan]):
+        with pytest.raises(ValueError, match="time: must be finite, and ascend"):
+            motion(arm, positions(arm, 3), times)
 
 
 def test_shapes_are_what_mujoco_shows(arm):
