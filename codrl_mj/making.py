@@ -10,7 +10,7 @@ from gymnasium.vector import VectorEnv
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.serial import SerialVectorEnv
-from codrl_mj.envs.worlds import find_world, patterns_of
+from codrl_mj.envs.worlds import by_pattern, find_world
 from codrl_mj.foreign import environments
 
 
@@ -38,7 +38,7 @@ def make(
         ValueError: names or arguments that are unknown, or do not go with each other; the message has the remedy.
     """
     if hasattr(env, "make"):
-        return env.make(**arguments)
+        return env.make(**arguments, **({} if actuator is None else {"actuator": actuator}))
     env_id = find_world(env).env_id if isinstance(env, str) else ""
     if env_id:
         given = {} if actuator is None else {"actuator": actuator}
@@ -48,8 +48,7 @@ def make(
         limit = arguments.pop("max_episode_steps", None)
         config = EnvConfig.of(env, "default" if actuator is None else actuator, arguments)
         return dataclasses.replace(config, max_episode_steps=limit).make(**view)
-    by_pattern = patterns_of(actuator) or {".*": "ideal" if actuator is None else actuator}
-    return environments.make(env, by_pattern, **arguments)
+    return environments.make(env, by_pattern("default" if actuator is None else actuator), **arguments)
 
 
 def make_vec(
@@ -65,8 +64,8 @@ def make_vec(
         env: as for `make`.
         num_envs: how many, >= 1.
         actuator: as for `make`.
-        **arguments: as for `make`; of an `EnvConfig` those of the vector, such as `num_threads` and
-            `max_episode_steps`.
+        **arguments: as for `make`; of an `EnvConfig`, fields to set otherwise, and those of the vector, such as
+            `num_threads`.
 
     Raises:
         ValueError: see `make`; or more than memory holds.
@@ -77,5 +76,7 @@ def make_vec(
         limit = {name: arguments.pop(name) for name in ("max_episode_steps",) if name in arguments}
         chosen = find_world(env).default_actuator if actuator is None else actuator
         env, arguments = EnvConfig.of(env, chosen, arguments), limit
+    elif actuator is not None:
+        arguments["actuator"] = actuator
     vector: VectorEnv[Any, Any, Any] = env.world.vector(env, num_envs, **arguments)
     return vector

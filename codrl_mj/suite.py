@@ -4,6 +4,7 @@ Dynamics, rewards and ends are the Gymnasium environment's, bit for bit. Needs t
 """
 
 import copy
+import dataclasses
 import operator
 from collections.abc import Mapping
 from typing import Any
@@ -22,7 +23,7 @@ from codrl_mj.tasks import TASKS
 
 TASK_NAME = "gym"
 _DEFAULT = object()
-"""The actuator where none is given: `paper`, or a configuration's own."""
+"""The actuator where none is given: the task's, or a configuration's own."""
 
 
 def __getattr__(name: str) -> Any:
@@ -176,7 +177,7 @@ def load(
     Args:
         domain_name: task name, such as `pendulum`; or an environment's whole configuration.
         task_name: `gym`.
-        actuator: as for `codrl_mj.envs.ActuatedEnv`, `paper` unless given; over a configuration's.
+        actuator: as for `codrl_mj.envs.ActuatedEnv`, the task's own unless given; over a configuration's.
         task_kwargs: `random`, as for `DmEnvironment`.
         environment_kwargs: `flat_observation`, as for `DmEnvironment`.
         **options: the other fields of `codrl_mj.envs.config.EnvConfig`, and the task's own options, over a
@@ -188,7 +189,9 @@ def load(
     if given.keys() - {"random"}:
         raise ValueError(f"task_kwargs = {dict(given)!r}: may only hold 'random'")
     if isinstance(domain_name, str):
+        limit = options.pop("max_episode_steps", None)
         config: Any = EnvConfig.of(domain_name, "default" if actuator is _DEFAULT else actuator, options)
+        config = dataclasses.replace(config, max_episode_steps=limit)
     else:
         over = options if actuator is _DEFAULT else {"actuator": actuator, **options}
         config = type(domain_name).from_mapping(over, domain_name)

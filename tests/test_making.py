@@ -72,6 +72,40 @@ def test_many_are_as_one_by_one(given, options, kind):
     envs.close()
 
 
+@pytest.mark.parametrize("limit", [3, 1003], ids=["shorter", "longer"])
+def test_a_time_limit_that_is_given_is_the_one_that_holds(limit):
+    faces = (
+        codrl_mj.make_vec("HalfCheetah-v5", 1, "lag", max_episode_steps=limit),
+        codrl_mj.make_vec(codrl_mj.EnvConfig("HalfCheetah-v5", "lag"), 1, max_episode_steps=limit),
+        codrl_mj.make_sb3_vec_env("HalfCheetah-v5", 1, actuator="lag", max_episode_steps=limit),
+    )
+    for env in faces:
+        env.reset()
+        action = np.zeros((1, 6), np.float32)
+        ended = [(env.step(action)[2 if env is faces[2] else 3]).any() for _ in range(limit)]
+        assert ended == [False] * (limit - 1) + [True]
+        env.close()
+
+
+@pytest.mark.parametrize("view", [{}, {"render_mode": "rgb_array"}], ids=["blind", "seen"])
+def test_what_is_given_beside_a_configuration_is_set_over_it(view):
+    config = codrl_mj.EnvConfig("pendulum", max_episode_steps=5)
+    with codrl_mj.make(config, "weak", max_episode_steps=7, **view) as env:
+        assert env.unwrapped.actuator == codrl_mj.EnvConfig("pendulum", "weak").actuator
+        assert env.spec.max_episode_steps == 7
+    envs = codrl_mj.make_vec(config, 2, "weak", max_episode_steps=7, **view)
+    envs.reset()
+    assert [envs.step(np.zeros((2, 1), np.float32))[3].all() for _ in range(7)] == [False] * 6 + [True]
+    envs.close()
+
+
+@pytest.mark.parametrize("made", [codrl_mj.make, lambda env, one: codrl_mj.make_vec(env, 1, one)], ids=["one", "many"])
+def test_one_and_many_take_the_same_actuators(made):
+    with pytest.raises(ValueError, match=r"actuator = \{\}: must be one for all, or what drives what"):
+        made("Reacher-v5", {})
+    made("Reacher-v5", "default").close()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -84,6 +84,9 @@ def test_options_are_set_over_a_configuration():
     assert suite.load(config, actuator=None).setup.config.actuator == IDEAL
     over.reset(), same.reset()
     assert [sum(not env.step(0).last() for _ in range(7)) for env in (over, same)] == [6, 6]
+    limited = suite.load("pendulum", "gym", max_episode_steps=5)
+    limited.reset()
+    assert [limited.step([0.0]).last() for _ in range(5)] == [False] * 4 + [True]
     with pytest.raises(ValueError, match=r"unknown key env\.innersteps; did you mean env\.inner_steps"):
         suite.load(config, innersteps=2)
 

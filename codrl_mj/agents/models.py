@@ -45,7 +45,8 @@ class UnitActionPolicy(ActorCriticPolicy):
         if not isinstance(self.action_space, spaces.Box):
             raise ValueError(f"unit_actions = True: must be False for discrete actions, which {self.action_space} has")
         super()._build(lr_schedule)
-        self.register_buffer("largest", torch.as_tensor(self.action_space.high), persistent=False)
+        largest = np.maximum(np.abs(self.action_space.low), np.abs(self.action_space.high))
+        self.register_buffer("largest", torch.as_tensor(largest), persistent=False)
 
     def _get_action_dist_from_latent(self, latent_pi: torch.Tensor) -> Any:
         mean = self.action_net(latent_pi) * self.largest

@@ -239,12 +239,13 @@ class CompiledEpisodes:
 
     @staticmethod
     def can_run(env: Any) -> bool:
-        """Whether the environment is ours, in MuJoCo, of one motor, not randomised, and has a time limit."""
+        """Whether the environment is ours, in MuJoCo, of one motor, as it was configured, and has a time limit."""
         return (
             type(env) is ActuatedVecEnv
             and isinstance(env.env, ActuatedVectorEnv)
             and env.num_envs == 1
             and not env.env.setup.randomization.distributions
+            and not env.env.looks
             and len(env.env.task.motors) == 1
             and env.env.max_episode_steps is not None
         )

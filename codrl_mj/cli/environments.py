@@ -98,15 +98,16 @@ def environment_fields(defaults: EnvConfig, name: str | None, task: str) -> list
 
 
 def scan(arguments: Sequence[str], *names: str) -> argparse.Namespace:
-    """The values of some flags, None where they are not there, `task` and `trust`: what decides on other flags."""
+    """The values of some flags, None where they are not there, `task`, `options`, `trust`: what decides on others."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in (*names, "task"):
         parser.add_argument(f"--{name}")
+    parser.add_argument("--env.options", dest="options", nargs="*")
     parser.add_argument("--trust", action="store_true")
     try:
         chosen, _ = parser.parse_known_args(arguments)
     except argparse.ArgumentError:  # a flag without its value: the real parser says so better
-        chosen = argparse.Namespace(**dict.fromkeys((*names, "task")), trust=False)
+        chosen = argparse.Namespace(**dict.fromkeys((*names, "task", "options")), trust=False)
     behind = itertools.pairwise(["", *arguments])
     chosen.task = chosen.task or next(
         (word for flag, word in behind if is_world(word) and not flag.startswith("--")), None

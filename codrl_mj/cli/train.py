@@ -228,6 +228,8 @@ def _base(chosen: argparse.Namespace) -> TrainConfig:
         given = {name: getattr(chosen, name) for name in ("task", "agent", "settings")}
         return read_config(Path(chosen.config), chosen.trust, **given)
     task = chosen.task or "cartpole"
-    agent = chosen.agent if chosen.agent in AGENTS or ":" in str(chosen.agent) else default_agent(task)
+    world = find_world(task)
+    options = world.options_of({"options": chosen.options}) if chosen.options else {}
+    agent = chosen.agent if chosen.agent in AGENTS or ":" in str(chosen.agent) else default_agent(task, options)
     settings = chosen.settings if chosen.settings in SETTINGS else "default"
-    return TrainConfig.preset(task, agent, settings, find_world(task).default_actuator)
+    return TrainConfig.preset(task, agent, settings, world.default_actuator, {"options": options} if options else {})

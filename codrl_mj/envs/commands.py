@@ -231,9 +231,9 @@ class ControlCommands:
 
     def controls(self, action: Any) -> Any:
         """The environment's own action for one of `action_space`, as it arrives in a step; loads go to the joints."""
+        if (self._scales is not None or self._disturber.on) and np.shape(action) != self.action_space.shape:
+            raise ValueError(f"action has shape {np.shape(action)}: must be {self.action_space.shape}")
         if self._scales is not None:
-            if np.shape(action) != self.action_space.shape:
-                raise ValueError(f"action has shape {np.shape(action)}: must be {self.action_space.shape}")
             action = np.asarray(action, dtype=np.float64) * self._scales
         if not self._disturber.on:
             return action

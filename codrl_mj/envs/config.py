@@ -168,12 +168,13 @@ class EnvConfig:
 
         Args:
             **view: `render_mode`, and what else it takes for its rendering; of a task `width`, `height`, `camera` and
-                `pretty`, as for `codrl_mj.envs.ActuatedEnv`.
+                `pretty`, as for `codrl_mj.envs.ActuatedEnv`. Or fields to set otherwise.
 
         Raises:
             ValueError: fields do not go with each other, or with the model.
         """
-        made = self.world.make(self, **view)
+        fields = {name: view.pop(name) for name in self.world.fields if name in view}
+        made = self.world.make(dataclasses.replace(self, **fields), **view)
         if not isinstance(made, gymnasium.Env):
             raise ValueError(f"{self.task}: its `make` returned {made!r}: must be a gymnasium.Env")
         return made

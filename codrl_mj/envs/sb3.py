@@ -31,8 +31,8 @@ class ActuatedVecEnv(VecEnv):
                 f"observations are {seen}: must be a vector, which our agents' networks take: flatten them with a "
                 "wrapper of Gymnasium's (FlattenObservation), and register that environment"
             )
-        elif not isinstance(acts, spaces.Box | spaces.Discrete):
-            wrong = f"actions are {acts}: must be a vector (Box) or a choice (Discrete)"
+        elif not isinstance(acts, spaces.Box | spaces.Discrete) or getattr(acts, "start", 0) != 0:
+            wrong = f"actions are {acts}: must be a vector (Box), or a choice (Discrete) that counts from 0"
         if wrong:
             env.close()
             raise ValueError(wrong)
@@ -46,9 +46,16 @@ class ActuatedVecEnv(VecEnv):
         super().__init__(env.num_envs, seen, acts)
 
     def reset(self) -> np.ndarray:
-        """Start an episode in every environment, with the seeds given to `seed` since the last reset."""
-        observations, _ = self.env.reset(seed=self._seeds)
-        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        """Start an episode in every environment, with the seeds and options given since the last reset."""
+        options = self._options[0]
+        if any(one != options for one in self._options):
+            raise ValueError(f"set_options: {self._options}: the environments share them: give one mapping")
+        observations, _ = self.env.reset(seed=self._seeds, options=options or None)
+        drawn = self.env.randomization
+        self.reset_infos: list[dict[str, Any]] = [
+            {"randomization": {name: values[row] for name, values in drawn.items()}} if drawn else {}
+            for row in range(self.num_envs)
+        ]
         self._reset_seeds()
         self._reset_options()
         self._returns[:], self._lengths[:] = 0.0, 0
@@ -154,7 +161,7 @@ class ActuatedVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """The attribute of the vector environment, once for each environment asked for, or else their own."""
-        shared = hasattr(self.env, attr_name)
+        shared = isinstance(self.env, SerialVectorEnv) and hasattr(self.env, attr_name)
         values = [getattr(self.env, attr_name)] * self.num_envs if shared else self.env.get_attr(attr_name)
         return [values[index] for index in self._get_indices(indices)]
 

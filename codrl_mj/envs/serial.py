@@ -57,7 +57,6 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
             raise ValueError(f"actuator: {len(each)} actuators for {num_envs} environments: there must be one for each")
         makers = [functools.partial(_limited, max_episode_steps, make, {**arguments, **one}) for one in each]
         super().__init__(makers, autoreset_mode=AutoresetMode.SAME_STEP)
-        self.max_episode_steps = max_episode_steps
         self.signals: Signals | None = None  # of the last step, each an array of shape (N,) or (N, motors)
         self._signal_names = self.get_attr("signal_names")[0]
         self.arm_radii = np.array([one.arm_radius for one in self.get_attr("motors")[0].values()])
@@ -117,6 +116,8 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         Raises:
             ValueError: the snapshot is of another number of environments, another task or other arguments.
         """
+        if self._env_obs[0] is None:  # Gymnasium's wrappers insist on a reset
+            self.reset()
         check_snapshot(snapshot, self.snapshot())
         own = {name: values for name, values in snapshot.items() if name not in ("elapsed", "observations")}
         begun = [

@@ -120,7 +120,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             check_view(self.physics.model, width, height, camera)
         self._renderer: OffscreenRenderer | None = None
         self._kernels: tuple[Kernels, Array] | None = None
-        self._looks: dict[str, Array] = {}  # fields of the models, where attributes were written
+        self.looks: dict[str, Array] = {}  # fields of the models, where attributes were written
         self._offer_attributes(self.task)
 
     @property
@@ -169,7 +169,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             raise ValueError(f"{name} = {value!r}: must be one number, or {self.num_envs}, one for each environment")
         fields = {field: self.physics.field(field).copy() for field in VARIED}
         looks = {field: np.array([field_of(self.physics.model, field)] * self.num_envs) for field in SHOWN}
-        looks |= {field: rows.copy() for field, rows in self._looks.items() if field in SHOWN}
+        looks |= {field: rows.copy() for field, rows in self.looks.items() if field in SHOWN}
         numbers = np.broadcast_to(value, self.num_envs).tolist()
         for row, (model, number) in enumerate(zip(self.physics.models(), numbers, strict=True)):
             write_fields(model, looks, row)
@@ -179,7 +179,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         kept = self.physics.snapshot()
         self.physics.set_model(np.arange(self.num_envs), fields)
         self.physics.restore(kept)
-        self._looks = fields | looks
+        self.looks = fields | looks
 
     @property
     def randomization(self) -> dict[str, Array]:
@@ -376,7 +376,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         if self._renderer is None:
             self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
         write_fields(self.physics.model, self._draws.model_fields(np.array([row]), shown=True))
-        write_fields(self.physics.model, self._looks, row)
+        write_fields(self.physics.model, self.looks, row)
         self.physics.show(row)
         return self._renderer.render(self.physics.data)
 

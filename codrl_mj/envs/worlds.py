@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import importlib
 import json
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -59,8 +60,6 @@ class World(abc.ABC):
     """The actuators of its motors of which `paper`, `weak` and so on are variations; none where there are none."""
     preset: str | None = None
     """The task for which settings of agents are known; None for what suits environments of any kind."""
-    posed: tuple[str, ...] = ("max_episode_steps",)
-    """Fields that an evaluation leaves at their defaults, whatever a training had."""
     goal_hold: float = 0.0
     """How long an episode that succeeds has been at the goal when it ends [s]."""
     timed: bool = False
@@ -88,15 +87,20 @@ class World(abc.ABC):
         Args:
             config: their `EnvConfig`.
             num_envs: how many, >= 1.
-            **arguments: what else the vector takes, such as `max_episode_steps`.
+            **arguments: fields of the configuration to set otherwise, such as `max_episode_steps`.
 
         Raises:
             ValueError: see `make`.
         """
         serial = importlib.import_module("codrl_mj.envs.serial")
-        return serial.SerialVectorEnv(num_envs, functools.partial(self.make, config), **arguments)
+        return serial.SerialVectorEnv(num_envs, functools.partial(self.make, dataclasses.replace(config, **arguments)))
 
     # -- what is known without making one --------------------------------------------------------------------
+
+    @property
+    def posed(self) -> tuple[str, ...]:
+        """Fields that an evaluation leaves at their defaults, whatever a training had: a time limit of its own."""
+        return () if self.time_limit is None else ("max_episode_steps",)
 
     @property
     def reference(self) -> str:
@@ -105,8 +109,9 @@ class World(abc.ABC):
 
     def code(self, options: Any) -> set[str | Path]:
         """Modules, by name, and files that decide on what it does: those among its options; others are not known."""
-        given = (Path(value) for value in self.changed(options).values() if isinstance(value, str))
-        return {type(self).__module__, *(path.resolve() for path in given if path.is_file())}
+        given = [value for value in self.changed(options).values() if isinstance(value, str)]
+        files = (Path(value).resolve() for value in given if os.path.isfile(value))  # noqa: PTH113 - or a long text
+        return {type(self).__module__, *files}
 
     def options(self, given: Any) -> Any:
         """Options of its own, as a configuration keeps them: here keyword arguments that JSON can hold.
@@ -160,10 +165,7 @@ class World(abc.ABC):
         """
         from codrl_mj.engine.specs import resolve_patterns
 
-        if given in ({}, []) or isinstance(given, list | tuple):
-            raise ValueError(f"actuator = {given!r}: must be one for all, or what drives what, such as {{'.*': 'lag'}}")
-        one = {EVERY: self.default_actuator if given == "default" else given}
-        return resolve_patterns(patterns_of(given) or one, f"the environment {self.name}")
+        return resolve_patterns(by_pattern(given, self.default_actuator), f"the environment {self.name}")
 
     def driven(self, kept: Any) -> dict[str, ActuatorModel]:
         """Pattern -> actuator, of what `actuators` returned."""
@@ -272,6 +274,13 @@ def _own_actions(world: World, options: str) -> "spaces.Space[Any]":
     config = importlib.import_module("codrl_mj.envs.config").EnvConfig(world.reference, options=json.loads(options))
     with contextlib.closing(world.make(config)) as env:
         return env.action_space
+
+
+def by_pattern(given: Any, default: str = "ideal") -> Mapping[str, Any]:
+    """What a user wrote for the actuators of an environment, as pattern of motors -> what drives them."""
+    if given in ({}, []) or isinstance(given, list | tuple):
+        raise ValueError(f"actuator = {given!r}: must be one for all, or what drives what, such as {{'.*': 'lag'}}")
+    return patterns_of(given) or {EVERY: default if given == "default" else given}
 
 
 def patterns_of(given: Any) -> Mapping[str, Any] | None:

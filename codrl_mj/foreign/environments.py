@@ -111,14 +111,19 @@ class Motorised:
 
     def __call__(self, **options: Any) -> gymnasium.Env:
         """Make it."""
-        creator, building = self.creator, Building(self.settings.simulated, self.settings.allow_unstable)
-        ours = isinstance(creator, type) and issubclass(creator, MujocoEnv)
+        building = Building(self.settings.simulated, self.settings.allow_unstable)
         with building.motorising():
-            env = _with_motors(creator)(**options) if ours else creator(**options)
+            env = self.creator(**options)
         building.check(self.env_id)
-        if ours:
-            env.remade = functools.partial(self, **options)
+        base: Any = env.unwrapped
+        kind: Any = type(base)
+        if issubclass(kind, MujocoEnv):
+            base.__class__, base.remade = _with_motors(kind), functools.partial(self.base, **options)
         return env
+
+    def base(self, **options: Any) -> gymnasium.Env:
+        """Make it, without wrappers around it."""
+        return self(**options).unwrapped
 
 
 @functools.cache
@@ -291,4 +296,7 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, in this or another process; as with all of Gymnasium's, the copy has to be reset."""
         self.__dict__.update(state, _begun=False)
+        base = self.unwrapped
+        if base.model is not base.data.model:  # type: ignore[attr-defined]  # MuJoCo copies data with its model
+            base.model = base.data.model  # type: ignore[attr-defined]
         self._bind()

@@ -47,11 +47,6 @@ class GymnasiumWorld(World):
         """That which it was registered with."""
         return self.spec.max_episode_steps
 
-    @property
-    def posed(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Its own time limit, if it has one."""
-        return () if self.time_limit is None else ("max_episode_steps",)
-
     def code(self, options: Any) -> set[str | Path]:
         """Modules of what makes it, and the one that registers it; files among its options."""
         modules = getattr(self._creator, "__module__", ""), self.name.rpartition(":")[0]

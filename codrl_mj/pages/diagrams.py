@@ -113,12 +113,12 @@ def limits(actuator: Any, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray] |
     if isinstance(actuator, Actuator) and actuator.voltage_limit is not None:
         motor, supply, most = actuator.motor, actuator.supply or Supply(), actuator.controller.max_voltage
         limited = (most, 0.0), (supply.voltage if math.isfinite(supply.voltage) else most, supply.resistance)
-        ends = []
+        sides = []
         for side in (-1.0, 1.0):
             back_emf = side * motor.back_emf_constant * speeds
             currents = [highest_current(motor.resistance, *one, back_emf) for one in limited]
-            ends.append(side * motor.torque_constant * np.minimum(*currents))
-        return ends[0], ends[1]
+            sides.append(side * motor.torque_constant * np.minimum(*currents))
+        return sides[0], sides[1]
     return None
 
 

@@ -94,7 +94,7 @@ class TrainConfig(Checked):
         Raises:
             ValueError: there are no such settings, or a field is out of bounds.
         """
-        posed = EnvConfig(task)
+        posed = EnvConfig(task, options=(env or {}).get("options"))
         check_fits(agent, posed)
         preset = find_preset(agent, posed.world.preset or ELSEWHERE, settings)
         names = {field.name for field in dataclasses.fields(cls)} - {"env"}
@@ -146,21 +146,22 @@ class TrainConfig(Checked):
             raise ValueError("not a training configuration: it has no task")
         task = env["task"]
         if isinstance(agent, str) or agent is None:
-            agent = {"name": agent or default_agent(task)}
+            agent = {"name": agent or default_agent(task, env.get("options"))}
         if not isinstance(agent, Mapping) or "name" not in agent:
             raise ValueError(f"agent = {agent!r}: must be an agent's name, or a mapping with its name and settings")
-        base = cls.preset(task, agent["name"], settings, env.get("actuator", "default"))
+        own = {"options": env["options"]} if env.get("options") else {}
+        base = cls.preset(task, agent["name"], settings, env.get("actuator", "default"), own)
         check_names(agent, base.agent.as_mapping(), "key", "agent.")
         agent = agent_from_mapping(base.agent.as_mapping() | dict(agent))
         return dataclasses.replace(base, env=EnvConfig.from_mapping(env, base.env), agent=agent, **given)
 
 
-def default_agent(task: str) -> str:
+def default_agent(task: str, options: Any = None) -> str:
     """The agent that is trained on a task unless another is named; of the five tasks the paper's.
 
-    In environments of others, SAC for continuous actions and PPO for others.
+    In environments of others, SAC for continuous actions and PPO for others; their `options` may decide on that.
     """
-    posed = EnvConfig(task)
+    posed = EnvConfig(task, options=options)
     return posed.world.default_agent(posed)
 
 

@@ -59,6 +59,8 @@ class Watcher(BaseCallback):
     def _on_training_start(self) -> None:
         """Continue from the last checkpoint, now that the model has set itself up to start from nothing."""
         self._arms = self.training_env.arm_radii  # type: ignore[attr-defined]
+        if any(path.endswith("arm_radius") for path in self._config.env.distributions):
+            self._arms = np.full_like(self._arms, math.nan)  # none is that of all episodes
         state = self._resumed = load_checkpoint(self._out / CHECKPOINTS, self._identity)
         rows: dict[str, np.ndarray | None] = {"episodes": None, "reports": None}
         if state is not None:

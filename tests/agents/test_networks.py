@@ -1,5 +1,6 @@
 """The networks have the paper's layers, and nothing else about a policy depends on how it was made."""
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -140,6 +141,13 @@ def test_unit_actions_are_those_of_a_plain_actor_times_the_largest(command, larg
     ours, theirs = units.get_distribution(seen).distribution, plain.get_distribution(seen).distribution
     torch.testing.assert_close(ours.mean, largest * theirs.mean)
     torch.testing.assert_close(ours.stddev, torch.full_like(ours.stddev, largest * np.exp(-0.5)))
+
+
+def test_the_largest_action_may_be_a_negative_one():
+    envs, space = make_envs("furuta"), gymnasium.spaces.Box(-2.0, 0.0, (1,), np.float32)
+    policy = PPOConfig(log_std_init=0.0, unit_actions=True).make_policy(envs.observation_space, space)
+    spread = policy.get_distribution(torch.as_tensor(observations("furuta"))).distribution.stddev
+    torch.testing.assert_close(spread, torch.full_like(spread, 2.0))
 
 
 def test_unit_actions_are_refused_where_they_mean_nothing():

@@ -297,6 +297,18 @@ def test_compiled_episodes_are_those_taken_step_by_step(settings, arguments):
         )
 
 
+def test_episodes_on_a_hill_that_was_rewritten_are_not_those_of_a_simulation_of_its_own():
+    tables = []
+    for compiled in (False, True):
+        env = _car(max_episode_steps=300)
+        env.set_attr("gravity", 1e-4)
+        model = SARSAConfig(epsilon=0.2).make_model(env, 0)
+        model.compiled = compiled
+        model.learn(10**9, [StopTrainingOnMaxEpisodes(3)])
+        tables.append(_table(model))
+    np.testing.assert_array_equal(*tables)
+
+
 class _Record(BaseCallback):
     def __init__(self, into):
         super().__init__()

@@ -144,6 +144,26 @@ def test_an_attribute_reaches_environments_that_are_stepped_one_by_one():
     np.testing.assert_array_equal(env.get_attr("state"), [[0.1, 0.2]] * 2)
 
 
+def test_attributes_of_a_batch_are_each_environments_own():
+    env = batched("pendulum", 3)
+    env.reset()
+    np.testing.assert_array_equal(env.get_attr("state"), env.env.state)
+    assert env.get_attr("g") == [10.0] * 3
+
+
+@pytest.mark.parametrize("physics", ["mujoco", "analytic"])
+def test_options_reach_the_next_reset_and_its_infos_say_what_was_drawn(physics):
+    env = batched("cartpole", 2, physics=physics, randomize={"motor.resistance": "uniform(0.5, 2)"})
+    env.set_options({"low": -1e-6, "high": 1e-6})
+    assert np.abs(env.reset()).max() <= 1e-6
+    drawn = [info["randomization"]["motor.resistance"] for info in env.reset_infos]
+    np.testing.assert_array_equal(drawn, env.randomization["motor.resistance"])
+    assert np.abs(env.reset()).max() > 1e-6  # they are used once
+    env.set_options([{"low": -0.1, "high": 0.1}, {}])
+    with pytest.raises(ValueError, match="the environments share them: give one mapping"):
+        env.reset()
+
+
 def test_attributes_and_methods():
     env = batched("pendulum", 3)
     env.reset()

@@ -61,7 +61,6 @@ def test_without_a_time_limit_episodes_do_not_end():
     env.reset(seed=0)
     ended = [env.step(np.zeros((2, 1), np.float32))[3].any() for _ in range(250)]
     assert ended == [False] * 250
-    assert env.max_episode_steps is None
     assert env.task is TASKS["pendulum"]
 
 
@@ -75,6 +74,15 @@ def test_a_copy_goes_on_alike(duplicate):
     for _ in range(15):
         actions = random_actions(env, generator)
         assert_same(twin.step(actions), env.step(actions))
+
+
+def test_a_snapshot_goes_into_environments_that_were_never_reset():
+    envs = [codrl_mj.make_vec("pendulum", 2, render_mode="rgb_array") for _ in range(2)]
+    envs[0].reset(seed=0)
+    actions = random_actions(envs[0], np.random.default_rng(0))
+    envs[0].step(actions)
+    envs[1].restore(envs[0].snapshot())
+    assert_same(envs[1].step(actions), envs[0].step(actions))
 
 
 def test_each_can_have_an_actuator_of_its_own():

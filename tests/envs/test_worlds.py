@@ -70,6 +70,18 @@ def test_a_world_without_what_every_world_has_is_refused_in_a_sentence():
             config.make()
 
 
+def test_an_evaluation_keeps_the_time_limit_of_a_world_without_one():
+    config = TrainConfig.preset(NAME, "sac", env={"max_episode_steps": 9, "options": {"target": 0.5}})
+    assert RIG.time_limit is None or config.evaluation_env.time_limit == RIG.time_limit
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(RIG), "time_limit", None)
+        assert config.evaluation_env.time_limit == 9
+
+
+def test_a_long_text_among_the_options_is_no_file():
+    assert EnvConfig(NAME, options={"target": "x" * 9000}).code == EnvConfig(NAME).code
+
+
 def test_what_makes_no_environment_is_refused():
     from tests.envs.rig import RigEnv
 

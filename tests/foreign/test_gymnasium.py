@@ -10,6 +10,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
@@ -238,6 +239,10 @@ def test_environments_that_do_not_reset_all_data_have_motors_at_rest_too(bare_id
     assert_same(run(env, inputs, seed=0), first)
     with pytest.raises(ValueError, match="has no dt"):
         codrl_mj.make(bare_id, {".*": "lag"}, disturbances={"command_rate": 1.0})
+    delayed = codrl_mj.make("HalfCheetah-v5", {".*": "lag"}, disturbances={"command_delay": 0.05})
+    delayed.reset()
+    with pytest.raises(ValueError, match=r"action has shape \(1,\): must be \(6,\)"):
+        delayed.step(np.zeros(1))
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
@@ -248,6 +253,23 @@ def test_copies_have_the_motors(copied):
     inputs = actions(env, 10)
     assert_same(run(other, inputs, seed=1), run(env, inputs, seed=1))
     assert copied(env.unwrapped).model.nplugin == 6
+
+
+def cheetah(**options):
+    """Somebody's function."""
+    return gym.wrappers.TimeLimit(HalfCheetahEnv(**options), 500)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("creator", [cheetah, HalfCheetahEnv, BareEnv])
+def test_copies_of_what_a_function_makes_have_the_motors_and_their_draws(creator, copied):
+    env = codrl_mj.make(creator, {".*": "lag"}, randomize={"time_constant": "loguniform(0.01, 1)"})
+    other = copied(env)
+    inputs = actions(env, 10)
+    both = [np.array([row[0] for seed in (1, 2) for row in run(one, inputs, seed)]) for one in (env, other)]
+    np.testing.assert_array_equal(*both)
+    assert not np.array_equal(both[0][:11], both[0][11:])
+    assert other.step(inputs[0])[4]["desired_force"].shape == inputs[0].shape
 
 
 def test_a_spec_makes_the_environment_again():

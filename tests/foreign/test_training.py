@@ -15,7 +15,7 @@ import yaml
 
 import codrl_mj
 from codrl_mj.actuators import IDEAL, Drive, Lag
-from codrl_mj.agents import SACConfig
+from codrl_mj.agents import PPOConfig, SACConfig
 from codrl_mj.catalogue import motor_entry
 from codrl_mj.cli import main
 from codrl_mj.drives import demand_of, demands_of
@@ -159,6 +159,42 @@ def test_dictionaries_of_observations_are_refused():
             train(config(EnvConfig("ForeignDict-v0", {".*": "lag"})), Path("run"))
     finally:
         gym.registry.pop("ForeignDict-v0")
+
+
+def test_choices_that_do_not_count_from_0_are_refused():
+    gym.register("ForeignOne-v0", lambda: _FromOne(), max_episode_steps=50)
+    try:
+        with pytest.raises(ValueError, match=r"a choice \(Discrete\) that counts from 0"):
+            train(TrainConfig(EnvConfig("ForeignOne-v0"), PPOConfig(), total_steps=8), Path("run"))
+    finally:
+        gym.registry.pop("ForeignOne-v0")
+
+
+class _FromOne(BareEnv):
+    action_space = gym.spaces.Discrete(2, start=1)
+
+
+@pytest.fixture
+def switched():
+    gym.register("ForeignSwitched-v0", _Switched, max_episode_steps=50)
+    yield "ForeignSwitched-v0"
+    gym.registry.pop("ForeignSwitched-v0")
+
+
+class _Switched(BareEnv):
+    def __init__(self, *, discrete):
+        super().__init__()
+        self.action_space = gym.spaces.Discrete(2) if discrete else BareEnv.action_space
+
+
+def test_the_options_of_an_environment_decide_who_can_act_in_it(switched):
+    posed = {"task": switched, "env": {"options": {"discrete": True}}}
+    assert [TrainConfig.from_mapping(posed | one).agent.name for one in ({}, {"agent": "dqn"})] == ["ppo", "dqn"]
+    assert TrainConfig.from_mapping({"task": switched, "env": {"options": {"discrete": False}}}).agent.name == "sac"
+    options = TrainConfig.preset(switched, "dqn", env={"options": {"discrete": True}}).env.options
+    assert options == {"discrete": True}
+    line = ["train", switched, "--env.options", "discrete=true", "--agent", "dqn", "--total-steps", "8"]
+    assert main([*line, "--num-envs", "1", "--agent.learning-starts", "4", "--evaluation-episodes", "1"]) == 0
 
 
 class _WithDictionaries(BareEnv):

@@ -356,3 +356,6 @@ def test_the_torque_error_of_compiled_episodes_is_that_of_all_their_steps(tmp_pa
         errors.append([float(row["torque_error"]) for row in read_csv(out / "progress.csv")])
     assert errors[0] == pytest.approx(errors[1], rel=1e-9)
     assert errors[0][0] > 0.1
+    drawn = dataclasses.replace(config.env, randomize={"motor.arm_radius": "choice(2.0)"})  # whose is it?
+    out = train(dataclasses.replace(config, env=drawn, total_episodes=1), tmp_path / "drawn")
+    assert all(row["torque_error"] == "nan" for row in read_csv(out / "progress.csv"))
