@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.fields import Checked, factors
+from codrl_mj.fields import Checked, check_names, factors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,10 +70,7 @@ class AgentConfig(Checked):
         Raises:
             ValueError: a field is unknown or out of bounds.
         """
-        known = [field.name for field in dataclasses.fields(cls)]
-        for key in mapping:
-            if key not in known:
-                raise ValueError(f"agent.{key}: {cls.name} has no such setting; it has {', '.join(known)}")
+        check_names(mapping, (field.name for field in dataclasses.fields(cls)), "key", "agent.")
         return cls(**mapping)
 
 

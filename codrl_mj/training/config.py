@@ -151,7 +151,6 @@ class TrainConfig(Checked):
             raise ValueError(f"agent = {agent!r}: must be an agent's name, or a mapping with its name and settings")
         own = {"options": env["options"]} if env.get("options") else {}
         base = cls.preset(task, agent["name"], settings, env.get("actuator", "default"), own)
-        check_names(agent, base.agent.as_mapping(), "key", "agent.")
         agent = agent_from_mapping(base.agent.as_mapping() | dict(agent))
         return dataclasses.replace(base, env=EnvConfig.from_mapping(env, base.env), agent=agent, **given)
 

@@ -151,7 +151,7 @@ def test_settings_survive_json(agent, task, settings):
 
 
 def test_an_unknown_setting_or_agent_is_named():
-    with pytest.raises(ValueError, match=r"^agent\.momentum: dqn has no such setting; it has .*learning_rate"):
+    with pytest.raises(ValueError, match=r"^unknown key agent\.momentum; known: .*learning_rate"):
         agent_from_mapping({"name": "dqn", "momentum": 1})
     with pytest.raises(ValueError, match=r"^unknown agent 'reinforce': Known: ppo, ddpg, dqn"):
         find_agent("reinforce")
