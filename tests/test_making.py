@@ -77,13 +77,17 @@ def test_a_time_limit_that_is_given_is_the_one_that_holds(limit):
     faces = (
         codrl_mj.make_vec("HalfCheetah-v5", 1, "lag", max_episode_steps=limit),
         codrl_mj.make_vec(codrl_mj.EnvConfig("HalfCheetah-v5", "lag"), 1, max_episode_steps=limit),
-        codrl_mj.make_sb3_vec_env("HalfCheetah-v5", 1, actuator="lag", max_episode_steps=limit),
+        codrl_mj.make_sb3_vec_env(
+            "HalfCheetah-v5", 1, actuator="lag", max_episode_steps=limit, render_mode="rgb_array", width=64, height=48
+        ),
     )
     for env in faces:
         env.reset()
         action = np.zeros((1, 6), np.float32)
         ended = [(env.step(action)[2 if env is faces[2] else 3]).any() for _ in range(limit)]
         assert ended == [False] * (limit - 1) + [True]
+        if env is faces[2]:
+            assert env.render().shape == (48, 64, 3)
         env.close()
 
 

@@ -77,11 +77,11 @@ def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: A
             for side in (tried.actuators, env.actuators)
         ]
         commands = commands * [new / old if new and old else 1.0 for new, old in zip(*constants, strict=True)]
-        most = np.array([one["most"] for one in interface.actions])
+        most = np.array([one["most"] for one in interface.actions], dtype=float)  # None is nan: nothing is above it
         if beyond := int((np.abs(commands) > most * (1.0 + 1e-6)).any(axis=1).sum()):
             raise ValueError(
-                f"{path}: in {beyond} rows this motor gives more than the simulation takes, {most.tolist()}: simulate "
-                "the motor of the training"
+                f"{path}: in {beyond} rows the command, as this motor gives it, is beyond the simulation's bound, "
+                f"{most.tolist()}: simulate the motor of the training, or convert the log"
             )
     simulated, actions = [], interface.actions_of(commands)
     with contextlib.closing(tried.make()) as made:

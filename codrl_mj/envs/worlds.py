@@ -87,13 +87,13 @@ class World(abc.ABC):
         Args:
             config: their `EnvConfig`.
             num_envs: how many, >= 1.
-            **arguments: fields of the configuration to set otherwise, such as `max_episode_steps`.
+            **arguments: those of `EnvConfig.make`.
 
         Raises:
             ValueError: see `make`.
         """
         serial = importlib.import_module("codrl_mj.envs.serial")
-        return serial.SerialVectorEnv(num_envs, functools.partial(self.make, dataclasses.replace(config, **arguments)))
+        return serial.SerialVectorEnv(num_envs, functools.partial(config.make, **arguments))
 
     # -- what is known without making one --------------------------------------------------------------------
 

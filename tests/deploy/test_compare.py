@@ -111,7 +111,7 @@ def test_what_cannot_be_compared_is_said(logged, tmp_path, capsys):
     with pytest.raises(ValueError, match="the policy knows none"):
         compare(EnvConfig("cartpole"), log)
     (drive,) = FURUTA.driven.values()
-    with pytest.raises(ValueError, match=r"rows this motor gives more than the simulation takes, \["):
+    with pytest.raises(ValueError, match=r"as this motor gives it, is beyond the simulation's bound, \["):
         compare(FURUTA, log, actuator=drive.replaced({"motor.torque_constant": 1e3}))
 
 
