@@ -75,6 +75,8 @@ class PPOConfig(DeepAgentConfig):
         Raises:
             ValueError: the rollout is not a multiple of the environments, or of the minibatch.
         """
+        from stable_baselines3 import PPO
+
         from codrl_mj.agents.fast_ppo import FastPPO
         from codrl_mj.agents.models import TwoRatePPO
 
@@ -101,7 +103,8 @@ class PPOConfig(DeepAgentConfig):
             "device": "cpu",
         }
         if self.critic_learning_rate is None:
-            return FastPPO(self._policy_class(), env, **arguments)
+            kind = FastPPO if isinstance(env.action_space, spaces.Box | spaces.Discrete) else PPO
+            return kind(self._policy_class(), env, **arguments)
         return TwoRatePPO(
             self._policy_class(),
             env,
