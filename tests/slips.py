@@ -125,14 +125,16 @@ TASKS = [
     *itertools.product(("motor_inner_steps", "ideal_inner_steps"), (0, -1, 2.0, "2", None, True)),
     *itertools.product(("max_episode_steps",), (0, -1, 2.0, "2", True)),
     *itertools.product(("max_force",), (0.0, -1.0, np.nan, np.inf, "2", None, (1.0, 1.0), ())),
-    *itertools.product(("forces",), ((), (1.0, np.nan), ("a",), 3.0, "ab", ((1.0, 2.0), (3.0, 4.0)), (1.0, (2.0,)))),
+    *itertools.product(
+        ("forces",), ((), (1.0, np.nan), ("a",), 3.0, "ab", ((1.0, 2.0), (3.0, 4.0)), (1.0, (2.0,)), (-2.1, 2.0))
+    ),
     *itertools.product(("qpos",), ((1,), (0, 4), (0, 0), (1, 0), ("a", "b"), 3, (0, 1, 2))),
     *itertools.product(("wrapped",), ((4,), (-1,), ("a",), 3)),
     *itertools.product(
         ("observation_space",),
         (spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (4,)), spaces.Box(-1, 1, (3,), np.float64), spaces.Discrete(3), 3),
     ),
-    *itertools.product(("action_space",), (spaces.Box(-1, 1, (2,)), spaces.Discrete(3), 3)),
+    *itertools.product(("action_space",), (spaces.Box(-1, 1, (1,)), spaces.Box(-2, 2, (2,)), spaces.Discrete(3), 3)),
     *itertools.product(("options",), (Undefaulted, Worded, dict, 3)),
     *itertools.product(("paper", "name", "env_id"), (3,)),
     *itertools.product(("trials",), (Trials((1.0,) * 4, ((0.0,),) * 4, (0.0,) * 3, 2, 1),)),

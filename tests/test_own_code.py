@@ -134,6 +134,23 @@ def test_a_models_joints_and_integrator_are_compared_with_the_task(tmp_path):
             " has 5 positions and 4 velocities, and slip",
         ),
         ("<worldbody>", "<worldbdy>", ": XML parse error"),
+        ('joint="shoulder"/', 'joint="shoulder" gear="5"/', ": actuator 'shoulder': leave out its gear; "),
+        ('joint="shoulder"/', 'joint="shoulder" forcerange="-1 1"/', ": actuator 'shoulder': leave out its forcerange"),
+        (
+            'joint="shoulder"/',
+            'joint="shoulder" delay="0.1" nsample="9"/',
+            ": actuator 'shoulder': leave out its delay",
+        ),
+        (
+            '<joint name="shoulder"',
+            '<joint actuatorfrcrange="-1 1" name="shoulder"',
+            ": actuator 'shoulder': leave out the actuatorfrcrange of joint 'shoulder'",
+        ),
+        (
+            "<option",
+            '<option actuatorgroupdisable="0"',
+            ": actuator 'shoulder': leave out its group, which <option> dis",
+        ),
     ):
         path.write_text(model.replace(good, bad))
         task = codrl_mj.register(slips.task(asset=str(path)))

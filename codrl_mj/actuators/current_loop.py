@@ -265,7 +265,7 @@ class Actuator(ActuatorModel):
         driven = VoltageDriven(self.motor, through, self.supply)
         return {
             "current": Command("A", self, torque, None, fixed),
-            "voltage": Command("V", driven, torque, self.controller.max_voltage, driven_fixed),
+            "voltage": Command("V", driven, torque, self.voltage_limit, driven_fixed),
         }
 
     def check(self, timestep: float) -> None:

@@ -310,6 +310,10 @@ class Drive(ActuatorModel):
         # what `GearMotor` and `SampledLoop` refuse of fields together
         possible &= columns.max_temperature > columns.ambient_temperature
         possible &= columns.bandwidth <= columns.sample_rate / (2.0 * math.pi)
+        possible &= np.isinf(columns.max_temperature) | (
+            columns.thermal_resistance_winding + columns.thermal_resistance_housing > 0.0
+        )
+        possible &= 1.0 + columns.resistance_coefficient * (columns.ambient_temperature - 25.0) > 0.0
         return np.where(possible, _radii(cls, numbers), np.inf)
 
 

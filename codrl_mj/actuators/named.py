@@ -260,7 +260,7 @@ def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
     Raises:
         ValueError: a field is unknown or out of bounds, or set over the ideal actuator, which has none.
     """
-    given = {name: value for name, value in changes.items() if value not in ({}, None)}
+    given = {name: value for name, value in changes.items() if value != {}}
     family = given.pop("family", family_name(type(base)))
     if family != family_name(type(base)):
         raise ValueError(

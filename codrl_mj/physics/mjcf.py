@@ -105,6 +105,7 @@ def task_model(plant: Plant) -> mujoco.MjModel:
         joint_driven = spec.joint(motor.target) if motor.trntype == mujoco.mjtTrn.mjTRN_JOINT else None
         if joint_driven is None or joint_driven.type not in _ALONG:
             raise ValueError(f"{task.asset}: actuator {name!r} must drive a hinge or a slide joint")
+        _check_plain(task.asset, spec.option, motor, joint_driven)
         drive(motor, actuator, limit)
         for added in (joint, actuator.additions):
             joint_driven.armature += added.armature
@@ -123,6 +124,22 @@ def task_model(plant: Plant) -> mujoco.MjModel:
             f"{len(task.qpos)} and {len(task.qvel)} of them: {', '.join(task.state_names)}"
         )
     return model
+
+
+def _check_plain(asset: str, option: mujoco.MjOption, motor: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
+    """Refuse what stands between a motor's force and the joint without being the actuator's: it would go unreported."""
+    between = {
+        "its gear": list(motor.gear) != [1, 0, 0, 0, 0, 0] and tuple(motor.userdata)[:2] != SIGNATURE,
+        "its forcerange": any(motor.forcerange),
+        "its delay": motor.delay,
+        "its group, which <option> disables": option.disableactuator >> motor.group & 1,
+        f"the actuatorfrcrange of joint {joint.name!r}": any(joint.actfrcrange),
+    }
+    for what in (what for what, there in between.items() if there):
+        raise ValueError(
+            f"{asset}: actuator {motor.name!r}: leave out {what}; gear and limits are the actuator's, such as "
+            "gear_ratio, arm_radius and max_current, and Task.max_force"
+        )
 
 
 _ALONG = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)

@@ -181,10 +181,10 @@ class Task(fields.Checked):
             ValueError: both were given, the number is below 1, or the timestep does not divide the environment step.
         """
         if inner_steps is not None and timestep is not None:
-            raise ValueError(f"inner_steps = {inner_steps} and timestep = {timestep:g}: give one of them, not both")
+            raise ValueError(f"inner_steps = {inner_steps} and timestep = {timestep}: give one of them, not both")
         if timestep is not None:
-            if not (math.isfinite(timestep) and timestep > 0):
-                raise ValueError(f"timestep = {timestep}: must be a finite number > 0 [s]")
+            if not (isinstance(timestep, numbers.Real) and math.isfinite(timestep) and timestep > 0):
+                raise ValueError(f"timestep = {timestep!r}: must be a finite number > 0 [s]")
             count = round(self.step_duration / timestep)
             if count < 1 or not math.isclose(count * timestep, self.step_duration, rel_tol=1e-9):
                 raise ValueError(
@@ -233,12 +233,14 @@ class Task(fields.Checked):
         """`initial_bounds` under a reset's options.
 
         Raises:
-            ValueError: the task asks for no option of such a name.
+            ValueError: the task asks for no option of such a name, or bounds are not finite or not in order.
         """
         asked = None if options is None else _Asked(options)
         low, high = self.initial_bounds(asked)  # type: ignore[arg-type]
         if asked is not None:
             fields.check_names(asked.data, sorted(map(str, asked.names)), "reset option", every=True)
+            if not (np.isfinite([low, high]).all() and np.less_equal(low, high).all()):
+                raise ValueError(f"reset options = {options}: ask for {low} to {high}; must be finite, in order")
         return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
 
     def initial(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:

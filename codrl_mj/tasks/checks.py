@@ -29,7 +29,9 @@ def check_fields(task: Any) -> None:
     fine = _are_numbers(task.max_force, (), (motors,)) and np.min(task.max_force) > 0.0
     _require(task, "max_force", fine, "a finite number > 0" + f", or {motors} of them" * (motors > 1))
     fine = forces is None or (forces and _are_numbers(forces, (len(forces), motors)[: 1 + (motors > 1)]))
-    _require(task, "forces", fine, "a tuple of finite numbers" + f", or of tuples of {motors}" * (motors > 1))
+    fine = fine and (forces is None or (np.abs(forces) <= task.max_force).all())
+    what = "a tuple of finite numbers" + f", or of tuples of {motors}" * (motors > 1)
+    _require(task, "forces", fine, f"{what}, within max_force = {task.max_force}")
 
 
 def check_layout(task: Any) -> None:
@@ -45,9 +47,9 @@ def check_layout(task: Any) -> None:
     wanted: Any = spaces.Box(-np.inf, np.inf, (len(task.observation_names),), np.float32)
     fine = isinstance(box, spaces.Box) and (box.shape, box.dtype) == (wanted.shape, wanted.dtype)
     _require(task, "observation_space", fine, f"such as {wanted}, by observation_names")
-    wanted = spaces.Box(-1.0, 1.0, (len(task.motors),)) if task.forces is None else spaces.Discrete(len(task.forces))
-    fine = isinstance(task.action_space, spaces.Box) and task.action_space.shape == wanted.shape
-    _require(task, "action_space", fine if task.forces is None else task.action_space == wanted, f"such as {wanted}")
+    limits = task.max_forces.astype(np.float32)
+    wanted = spaces.Box(-limits, limits) if task.forces is None else spaces.Discrete(len(task.forces))
+    _require(task, "action_space", task.action_space == wanted, f"{wanted}, by max_force or forces; None makes it")
 
 
 def check_functions(task: Any) -> None:

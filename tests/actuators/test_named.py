@@ -453,10 +453,11 @@ def test_single_fields_are_set_over_anothers():
     changed = actuator_over(base, {"controller": {"kp": 5.0}, "motor": {"inductance": 0.3}})
     assert changed == Actuator(Motor(resistance=2.0, inductance=0.3), CurrentLoop(kp=5.0, ki=4.0))
     assert actuator_over(base, {"supply": {"voltage": 12.0}}).supply == Supply(voltage=12.0)
+    assert actuator_over(Actuator(supply=Supply(12.0)), {"supply": None}) == Actuator()
     assert actuator_over(changed, {}) is changed
     assert actuator_over(Lag(0.1, 0.2), {"delay": 0.3}) == Lag(0.1, 0.3)
     assert actuator_over(TorqueSpeed(), {"max_torque": 2.0}) == TorqueSpeed(max_torque=2.0)
-    assert actuator_over(IDEAL, {"motor": {}, "controller": None}) is IDEAL
+    assert actuator_over(IDEAL, {"motor": {}}) is IDEAL
 
 
 def test_what_cannot_be_set_is_refused():

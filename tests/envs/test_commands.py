@@ -13,7 +13,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor, Supply
+from codrl_mj.envs import ActuatedEnv
 from codrl_mj.own_code import asset_path
 from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
@@ -341,6 +342,12 @@ REFUSED = {
         "action = 'voltage': needs a finite controller.max_voltage, it is inf",
     ),
 }
+
+
+def test_a_voltage_is_commanded_up_to_what_the_supply_has():
+    for most in (24.0, math.inf):
+        actuator = Actuator(controller=CurrentLoop(max_voltage=most), supply=Supply(12.0))
+        assert ActuatedEnv("pendulum", actuator, action="voltage").action_space.high == 12.0
 
 
 @pytest.mark.parametrize("case", REFUSED)

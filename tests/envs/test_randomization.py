@@ -13,7 +13,7 @@ import scipy.stats
 
 import codrl_mj
 from codrl_mj import Choice, LogUniform, Uniform
-from codrl_mj.actuators import Actuator, CurrentLoop, Supply, actuator_over, spectral_radius
+from codrl_mj.actuators import Actuator, CurrentLoop, Drive, GearMotor, Supply, actuator_over, spectral_radius
 from codrl_mj.actuators.stability import spectral_radii, stability_radii
 from codrl_mj.engine.families import HEAD
 from codrl_mj.envs import ActuatedEnv
@@ -401,6 +401,22 @@ def test_unstable_draws_are_rejected_whole_and_counted():
     for row in range(0, 300, 50):
         first = _recount(row, 1)[0]
         np.testing.assert_allclose([infos[name][row] for name in (*randomize, "rejected")], first, rtol=1e-14)
+
+
+def test_what_a_motors_fields_refuse_together_is_rejected_too():
+    """Though each would do alone; in one simulation as in many."""
+    motor = {"max_temperature": 90.0, "thermal_resistance_winding": 5.0, "thermal_resistance_housing": 5.0}
+    nominal = Drive(GearMotor(**motor))
+    for several in (
+        {f"motor.{name}": "choice(0.0, 5.0)" for name in list(motor)[1:]},
+        {"motor.ambient_temperature": "choice(25.0, -75.0)", "motor.resistance_coefficient": "choice(0.0, 0.02)"},
+    ):
+        many = batched("pendulum", 20, actuator=nominal, randomize=several).reset(seed=0)[1]["randomization"]
+        assert any(many["rejected"])
+        env = ActuatedEnv("pendulum", nominal, randomize=several)
+        for row in range(20):
+            one = env.reset(seed=row)[1]["randomization"]
+            assert one == {name: many[name][row] for name in one}
 
 
 def test_a_winding_too_fast_for_its_supply_is_rejected():

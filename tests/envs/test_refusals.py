@@ -27,6 +27,7 @@ BAD = {
     "integrator": ({"integrator": "rk45"}, "integrator = 'rk45': cartpole has euler, semi-implicit"),
     "inner_steps": ({"inner_steps": 0}, "inner_steps = 0: must be an integer >= 1"),
     "timestep": ({"timestep": -0.01}, "timestep = -0.01: must be a finite number > 0"),
+    "timestep text": ({"timestep": "1e-3"}, "timestep = '1e-3': must be a finite number > 0"),
     "timestep ratio": ({"timestep": 0.015}, "timestep = 0.015 s does not divide cartpole's environment step of 0.02 s"),
     "both": ({"inner_steps": 2, "timestep": 0.01}, "inner_steps = 2 and timestep = 0.01: give one of them, not both"),
     "option": ({"centre_radius": 0.1}, "unknown option 'centre_radius' of cartpole: it has center_radius"),

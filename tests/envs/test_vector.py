@@ -2,7 +2,9 @@
 
 import copy
 import itertools
+import math
 import pickle
+import re
 
 import gymnasium
 import numpy as np
@@ -132,6 +134,13 @@ def test_other_commands_and_observed_currents(task, command):
 def test_every_option_of_the_single_environment(task, arguments):
     arguments = {"max_episode_steps": 15, **arguments}
     assert_equal_episodes(batched(task, 4, **arguments), looped(task, 4, **arguments), 40)
+
+
+@pytest.mark.parametrize("value", [-1.0, math.nan])
+def test_reset_options_out_of_order_are_refused(value):
+    for env in (ActuatedEnv("pendulum"), batched("pendulum", 2)):
+        with pytest.raises(ValueError, match=re.escape(f"reset options = {{'x_init': {value}}}: ask for [")):
+            env.reset(seed=0, options={"x_init": value})
 
 
 @pytest.mark.parametrize("task", but(["pendulum", "cartpole", "mountain_car"], TASKS))
