@@ -16,10 +16,13 @@ import codrl_mj
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.physics import PHYSICS
+from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import read_run
+from codrl_mj.study.advice import measurement
 from codrl_mj.tasks import OURS, TASKS, find_task, reference_of
 from codrl_mj.tasks.attributes import Fixed
 from codrl_mj.tasks.twin import Trials
+from codrl_mj.training.config import TrainConfig
 from codrl_mj.validation import try_mutations, validate
 from tests.matrix import but
 from tests.own_project import arm, series_elastic, slow_motion
@@ -205,6 +208,14 @@ def test_every_command_takes_the_arm_and_loads_it_when_it_is_trusted(tmp_path, c
     assert main(["evaluate", str(run), "--episodes", "1"]) == 2
     assert "--trust" in capsys.readouterr().err
     assert "tests.own_project.arm" in sys.modules
+
+
+def test_advice_for_a_run_of_the_arm_is_measured_when_it_is_trusted(tmp_path):
+    config = TrainConfig.preset("tests.own_project.arm:TASK", AGENT, total_steps=64)
+    write_json(tmp_path / "run" / "config.json", {"train": config.as_mapping()})
+    with pytest.raises(ValueError, match="--trust"):
+        measurement("lag", str(tmp_path / "run"), 2, tmp_path)
+    assert measurement("lag", str(tmp_path / "run"), 2, tmp_path, trust=True).home.env.task == config.task
 
 
 def test_a_training_of_the_arm_that_was_stopped_comes_to_the_same_weights(tmp_path):

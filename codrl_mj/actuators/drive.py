@@ -213,6 +213,11 @@ class Drive(ActuatorModel):
         return 24.0 if self.supply is None else self.supply.voltage
 
     @property
+    def sag(self) -> float:
+        """The supply's resistance [ohm], by which its voltage sags under a current."""
+        return 0.0 if self.supply is None else self.supply.resistance
+
+    @property
     def assumed(self) -> str:
         """As `ActuatorModel.assumed`: the supply, the largest current, the inertia of the rotor."""
         missing = {

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.parsing import AsJson
+from codrl_mj.cli.parsing import AsJson, Trust
 from codrl_mj.cli.terminal import print_table, say
 from codrl_mj.fields import did_you_mean
 
@@ -61,6 +61,7 @@ class Advise:
     """Trainings at once; -1 for one on each CPU."""
     evidence: Path | None = None
     """The study's runs.csv, unless that of the installation is meant."""
+    trust: Trust = False
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
@@ -99,7 +100,7 @@ class Advise:
             from codrl_mj.study.parallel import Workers
             from codrl_mj.study.program import compute
 
-            asked = measurement(named, self.task, self.measure, self.root)
+            asked = measurement(named, self.task, self.measure, self.root, trust=self.trust)
             compute(asked.grid, Workers(self.jobs))
             options = asked.judged(asked.grid.collect())
             measured = {"options": options, "verdict": decide(options)}

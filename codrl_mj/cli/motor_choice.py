@@ -11,6 +11,7 @@ from rich.text import Text
 from codrl_mj.cli.motor import save_plot
 from codrl_mj.cli.parsing import AsJson, Trust
 from codrl_mj.cli.terminal import print_table, say
+from codrl_mj.runs import told_apart
 
 Asked = Annotated[
     tyro.conf.Positional[str],
@@ -165,8 +166,9 @@ class Choose:
             if about and (choice.lacks or place < len(shown)):
                 say(f"{at}: {about}" if alone else f"{name}: {at}: {about}")
         if self.out is not None:
-            for name, choice in shown:
-                picture = Path(choice.name).stem if alone else name
+            motors = told_apart([Path(choice.name).with_suffix("") for _, choice in shown])
+            for (name, choice), motor in zip(shown, motors, strict=True):
+                picture = motor.replace("/", "-") if alone else name
                 _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")
             with writing(self.out / "actuators.yaml") as temporary:
                 chosen = actuators_of({name: (found[0], demands[name]) for name, found in ranked.items()})

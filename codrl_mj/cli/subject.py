@@ -73,6 +73,8 @@ class Source:
             config = load_config(path, self.trust)
             if self.task not in (None, config.task):
                 raise ValueError(f"--task {self.task}: {path} was trained for {config.task}: leave --task out")
+            if self.agent not in (None, config.agent.name, config.agent.known_as()):
+                raise ValueError(f"--agent {self.agent}: {path} was trained by {config.agent.name}: leave --agent out")
             if self.which == "last" and not finished(path):
                 raise FileNotFoundError(
                     f"{path} is not finished and has no last policy yet: continue it with codrl-mj train --resume "

@@ -29,7 +29,6 @@ def current_loop(env: EnvConfig) -> dict[str, Any] | None:
         "amperes": first.arm_radius / motor.torque_constant if forced else 1.0,
         "most": None,
         "voltage": min(first.voltage_limit, 1e30),
-        "sag": 0.0 if first.supply is None else first.supply.resistance,
         "servo": None,
     }
     if type(first) is Actuator:
@@ -42,6 +41,7 @@ def current_loop(env: EnvConfig) -> dict[str, Any] | None:
         kp, ki = sampled.designed_gains(motor.resistance, motor.inductance, 1.0 / loop.sample_rate, bandwidth)
     return shared | {
         "kind": "sampled",
+        "sag": first.sag,
         "rate": loop.sample_rate,
         "most": loop.max_current if np.isfinite(loop.max_current) else None,
         "kp": kp,

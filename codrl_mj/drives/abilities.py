@@ -90,7 +90,7 @@ ABILITY_UNITS = dict(zip(Abilities._fields, ("W", "N*m", "N*m", "A", "rad/s", "A
 
 def abilities(drive: Drive) -> Abilities:
     """What a drive can do."""
-    motor, resistance = drive.motor, _resistance(drive)
+    motor, resistance = drive.motor, drive.motor.resistance + drive.sag
     passed = motor.torque_constant * motor.gear_efficiency  # [N*m/A]
     per_torque = resistance / passed  # [V/(N*m)]
     slope = motor.back_emf_constant + per_torque * motor.viscous_friction
@@ -112,10 +112,10 @@ def abilities(drive: Drive) -> Abilities:
 
 
 def most_power(drive: Drive) -> float:
-    """The most mechanical power [W] that a motor makes at its supply, i (V - R i) kT/kE; infinite without back-EMF."""
-    motor, limit = drive.motor, drive.voltage_limit
-    current = min(limit / motor.resistance / 2, drive.controller.max_current)
-    power = current * (limit - motor.resistance * current) * motor.torque_constant
+    """The most mechanical power [W], i (V - R i) kT/kE, R of winding and supply; infinite without back-EMF."""
+    motor, limit, resistance = drive.motor, drive.voltage_limit, drive.motor.resistance + drive.sag
+    current = min(limit / resistance / 2, drive.controller.max_current)
+    power = current * (limit - resistance * current) * motor.torque_constant
     return power / motor.back_emf_constant if motor.back_emf_constant else math.inf
 
 
@@ -157,15 +157,10 @@ def torque_limits(drive: Drive, speeds: Any, current: float = math.inf) -> tuple
     """
     speeds = np.asarray(speeds, dtype=float)
     back_emf = drive.motor.back_emf_constant * drive.motor.gear_ratio * speeds
-    winding = drive.motor.resistance, drive.voltage_limit, _resistance(drive) - drive.motor.resistance
+    winding = drive.motor.resistance, drive.voltage_limit, drive.sag
     lowest, highest = -highest_current(*winding, -back_emf), highest_current(*winding, back_emf)
     low, high = (np.clip(bound, lowest, highest) for bound in (-current, current))
     return _at_output(drive.motor, low, speeds), _at_output(drive.motor, high, speeds)
-
-
-def _resistance(drive: Drive) -> float:
-    """Of winding and supply [ohm]."""
-    return drive.motor.resistance + (0.0 if drive.supply is None else drive.supply.resistance)
 
 
 def highest_current(resistance: float, voltage: float, sag: float, back_emf: np.ndarray) -> np.ndarray:

@@ -56,7 +56,6 @@ def operation(demand: Demand, drive: Drive) -> Operation:
     speed, current = demand.speed / arm, torque / motor.torque_constant
     terminal = motor.resistance * current + motor.back_emf_constant * speed
     changing = terminal + motor.inductance * np.diff(current, prepend=current[:1]) / demand.duration
-    supply = 0.0 if drive.supply is None else drive.supply.resistance
     mean_speed = speed + demand.acceleration * demand.duration / (2.0 * arm)
     power = (motor.resistance * current + motor.back_emf_constant * mean_speed) * current
     square = float(current**2 @ demand.duration)
@@ -64,7 +63,7 @@ def operation(demand: Demand, drive: Drive) -> Operation:
         torque=torque,
         speed=speed,
         current=current,
-        voltage=np.maximum(np.abs(terminal), np.abs(changing)) + supply * np.abs(current),
+        voltage=np.maximum(np.abs(terminal), np.abs(changing)) + drive.sag * np.abs(current),
         rms_current=math.sqrt(square / float(demand.duration.sum())),
         copper_loss=motor.resistance * square / demand.episodes,
         energy_drawn=float(np.maximum(power, 0.0) @ demand.duration) / demand.episodes,
@@ -202,7 +201,7 @@ def _conditions(
         yield "heat", "i, rms", asked.rms_current, continuous, "A", (SURELY, TRY_IT), remedy
     power = demand.torque * demand.speed
     driving = float(np.abs(demand.torque[power >= 0.0]).max(initial=0.0))
-    current = min(limit / motor.resistance, most)
+    current = min(limit / (motor.resistance + drive.sag), most)
     still = motor.torque_constant * motor.gear_efficiency * current / drive.arm_radius - drive.additions.friction
     still -= motor.stribeck_friction / drive.arm_radius
     verdicts = TRY_IT, unmet if still > 0.0 else SURELY_NOT
@@ -212,6 +211,7 @@ def _conditions(
     torque, speed, least = abs(float(demand.torque[at])) / motor.gear_efficiency, abs(float(demand.speed[at])), 0.0
     if torque * speed * motor.back_emf_constant > 0.0:  # what the largest power takes at any gear [V]
         least = 2.0 * float(best_ratio(torque, speed, motor)) * motor.back_emf_constant * speed
+        least *= math.sqrt(1.0 + drive.sag / motor.resistance)
     needed = float(power.max(initial=0.0)) / motor.gear_efficiency
     remedy = f"no gear helps: raise the supply to {least:.4g} V and the largest current, or take a stronger motor"
     yield "power", "tau omega / eta, largest", needed, most_power(drive), "W", (TRY_IT, unmet), remedy

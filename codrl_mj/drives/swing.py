@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import Drive, Supply
+from codrl_mj.drives.abilities import highest_current
 
 _ANGLES = np.linspace(-np.pi, np.pi, 1001)
 _STEP = _ANGLES[1] - _ANGLES[0]
@@ -42,10 +43,11 @@ class Swing(NamedTuple):
         """The most torque [N*m] in the direction of motion, friction taken off.
 
         min(tau_max, N eta kT min((V - N kE omega)/R, i_max)): negative beyond the no-load speed, where nothing but a
-        higher voltage keeps the current from braking.
+        higher voltage keeps the current from braking. R: with the supply's.
         """
         motor, ratio, added = drive.motor, 1.0 / drive.arm_radius, drive.additions
-        current = (drive.voltage_limit - ratio * motor.back_emf_constant * speed) / motor.resistance
+        back_emf = ratio * motor.back_emf_constant * np.asarray(speed)
+        current = highest_current(motor.resistance, drive.voltage_limit, drive.sag, back_emf)
         current = np.minimum(current, drive.controller.max_current)
         torque = np.minimum(self.largest, ratio * motor.torque_constant * motor.gear_efficiency * current)
         return torque - self.friction - added.friction - (self.damping + added.damping) * speed
@@ -93,7 +95,7 @@ def least_voltage(swing: Swing, drive: Drive, energy: Callable[[Swing, Drive], f
     """The supply [V] from which `least_pumped` or `least_gain` is positive; infinite where no supply makes it so."""
 
     def enough(voltage: float) -> bool:
-        return energy(swing, dataclasses.replace(drive, supply=Supply(voltage))) > 0.0
+        return energy(swing, dataclasses.replace(drive, supply=Supply(voltage, drive.sag))) > 0.0
 
     low, high = 0.0, 1.0
     while not enough(high):

@@ -150,7 +150,6 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
         locked = locked or excitation.locked
         excitation = excitation.voltage(sample_times(drive, excitation.duration))
     commanded = np.clip(excitation, -limit, limit)
-    sag = 0.0 if drive.supply is None else drive.supply.resistance
     shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
     winding = motor.resistance, motor.inductance, motor.back_emf_constant * motor.gear_ratio
     inertia = motor.rotor_inertia * motor.gear_ratio**2 + load.inertia
@@ -161,7 +160,7 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
         )
     numbers = {**vars(motor), "inertia": inertia, "mgl": load.gravity, "constant_torque": load.against}
     parts = winding, moved(numbers, motor.torque_constant * motor.gear_ratio)
-    states = driven(period, shares, float(limit), float(sag), parts, locked, float(position))
+    states = driven(period, shares, float(limit), float(drive.sag), parts, locked, float(position))
     names = "voltage", "current", "velocity", "position", "bus"
     signals = dict(zip(names, states.T, strict=True))
     return Log("course", period * np.arange(len(shares)), {**signals, "command": commanded})

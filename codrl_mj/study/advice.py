@@ -230,16 +230,18 @@ class Measurement(NamedTuple):
         return options
 
 
-def measurement(actuator: Any, subject: str, seeds: int, root: Path, episodes: int = 50) -> Measurement:
+def measurement(
+    actuator: Any, subject: str, seeds: int, root: Path, episodes: int = 50, trust: bool = False
+) -> Measurement:
     """What there is to be trained and tested.
 
     `subject` is a task, the Gymnasium id of an environment of others, or the folder of a run, whose environment, agent
     and budget are taken; `actuator` whatever an `EnvConfig` takes; of every kind there are so many runs as `seeds`, in
-    folders below `root`.
+    folders below `root`. With `trust` modules are imported that a run's folder names, which executes them.
     """
     if seeds < 2:
         raise ValueError(f"seeds = {seeds}: an interval needs at least 2")
-    base = _ideal_arm(subject)
+    base = _ideal_arm(subject, trust)
     untouched = base.config.env  # and its reward: it is what policies were trained for
     here = dataclasses.replace(untouched, actuator=actuator)
     if all(one == IDEAL_ACTUATOR for one in here.actuators):
@@ -257,12 +259,12 @@ def measurement(actuator: Any, subject: str, seeds: int, root: Path, episodes: i
     return Measurement(Grid(root, (home, *options.values()), lambda _: range(seeds), episodes), home, options)
 
 
-def _ideal_arm(subject: str) -> Arm:
+def _ideal_arm(subject: str, trust: bool = False) -> Arm:
     """The training on ideal forces: the study's, that of a run, or the default one of a world."""
     if subject in SECONDS:
         return ideal(subject)
     if (Path(subject) / "config.json").is_file():
-        config = load_config(Path(subject))
+        config = load_config(Path(subject), trust)
     else:
         env = EnvConfig(subject)
         config = TrainConfig.preset(subject, env.world.default_agent(env))

@@ -194,6 +194,19 @@ def test_a_motor_that_one_can_buy_swings_up_a_little_above_the_supply_that_is_pr
     assert swings_up(dataclasses.replace(motor, supply=Supply(1.1 * least)))
 
 
+def test_behind_a_supply_that_sags_a_motor_can_what_one_of_more_resistance_can(pendulum):
+    """Below the no-load speed: power, stall, energy of a swing. What supply it takes is found."""
+    sagging = Drive(PAPER, SampledLoop(), Supply(7.5, 0.5))
+    stiff = drive(dataclasses.replace(PAPER, resistance=1.5), 7.5)
+    ours, theirs = (bounds(feasibility(one, pendulum)) for one in (sagging, stiff))
+    for name in ("voltage", "stall", "power", "pumping", "swing"):
+        assert ours[name].available == pytest.approx(theirs[name].available, rel=1e-12)
+        assert ours[name].needed == pytest.approx(theirs[name].needed, rel=1e-12)
+    least = least_voltage(pendulum.swing, sagging, least_gain)
+    assert not swings_up(dataclasses.replace(sagging, supply=Supply(0.97 * least, 0.5)))
+    assert swings_up(dataclasses.replace(sagging, supply=Supply(1.1 * least, 0.5)))
+
+
 def test_friction_and_damping_make_a_swing_up_harder(pendulum):
     light = least_gain(pendulum.swing, drive(voltage=5.5))
     rough = dataclasses.replace(PAPER, coulomb_friction=0.1)
@@ -397,6 +410,10 @@ def test_ones_own_motors_are_ranked_among_themselves(tmp_path, capsys, monkeypat
     ):
         assert main(["motor", "choose", *words]) == 2
         assert said in capsys.readouterr().err
+    Path("other").mkdir()
+    Path("other/a.toml").write_text(sheet)
+    assert main(["motor", "choose", "a.toml", "other/a.toml", "joint.npz", "--out", "found"]) == 0
+    assert len(list(Path("found").glob("*-a.png"))) == 2
 
 
 def test_runs_count_where_they_were_trained_on_the_ideal_actuator(tmp_path, capsys):

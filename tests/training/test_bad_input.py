@@ -275,6 +275,10 @@ def test_a_task_that_the_run_was_not_trained_for_is_refused(capsys, finished):
     assert "run was trained for cartpole" in refused(capsys, "evaluate run --task pendulum")
 
 
+def test_an_agent_that_did_not_train_the_run_is_refused(capsys, finished):
+    assert "run was trained by ppo: leave --agent out" in refused(capsys, "evaluate run --agent dqn")
+
+
 @pytest.mark.parametrize("which", ["last", "best"])
 @pytest.mark.parametrize("name", ["policy.safetensors", "policy.json"])
 def test_a_pickle_in_place_of_a_policy_is_not_executed(capsys, finished, which, name):
