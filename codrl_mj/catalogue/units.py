@@ -123,7 +123,9 @@ def in_si(number: Any, unit: str, kind: str | None, of: str = "this quantity", w
     if quantity.dimensionality != wanted:
         raise ValueError(f"{unit!r} is no unit of {of}, which is in {kind or 'no unit'}")
     units = {name for name, _ in quantity.unit_items()}
-    if any(name.endswith("hertz") for name in units) or (kind.startswith("rad") and not units & _ANGLES):
+    if any(name.endswith("hertz") for name in units) or (
+        kind.startswith("rad") and not any(name.endswith(tuple(_ANGLES)) for name in units)
+    ):
         raise ValueError("turns or radians? Hz and 1/s leave it open")
     return quantity.to(kind or "dimensionless").magnitude
 

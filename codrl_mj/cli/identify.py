@@ -189,9 +189,9 @@ class CheckLogs:
         motor = None if self.motor is None else find_drive(self.motor).motor
         if not self.logs:
             raise ValueError("no log is given: name one or more files")
-        logs = [read_log(path, self.columns) for path in self.logs]
-        found = {path: check(log, motor, self.rig) for path, log in zip(self.logs, logs, strict=True)}
-        for log, findings in zip(logs, found.values(), strict=True):
+        logs = {path: read_log(path, self.columns) for path in self.logs}
+        found = {path: check(log, motor, self.rig) for path, log in logs.items()}
+        for log, findings in zip(logs.values(), found.values(), strict=True):
             title = f"{log.name}: {len(log.time)} rows, {log.time[-1]:.4g} s, a row every {1e3 * log.step:.4g} ms"
             print_findings(title, findings)
         failed = any(one.severity == "error" for findings in found.values() for one in findings)
@@ -338,6 +338,8 @@ class SimulateLog:
         clock = 4.0 * drive.motor.electrical_time_constant if self.clock is None else self.clock
         frequency = (2.0 if self.kind == "square" else 0.5) if self.frequency is None else self.frequency
         amplitude = 0.5 * drive.voltage_limit if self.amplitude is None else self.amplitude
+        if abs(amplitude) > drive.voltage_limit:
+            raise ValueError(f"amplitude = {amplitude:g}: must be at most the supply's {drive.voltage_limit:g} V")
         excitation = Excitation(self.kind, amplitude, self.duration, frequency, clock=clock)
         load, sampler = Load(**vars(self.load)), Sampler(**vars(self.sampler))
         log = simulate(drive, excitation, load, _sensors(self.sensor), sampler, self.seed)
@@ -353,6 +355,8 @@ def _sensors(texts: Sequence[str]) -> dict[str, Any]:
     known, found = [field.name for field in dataclasses.fields(Sensor)], {}
     for text in texts:
         signal, _, rest = text.partition(":")
+        if signal in found:
+            raise ValueError(f"sensor = {text!r}: {signal} is given twice; give its fields once, with commas")
         pairs = [pair.partition("=") for pair in rest.split(",")]
         check_names([name for name, *_ in pairs], known, "field of a sensor")
         try:

@@ -96,7 +96,8 @@ def plan(
     for name, value in (("max_current", max_current), ("continuous_current", continuous_current)):
         if not value > 0.0:
             raise ValueError(f"{name} = {value!r}: must be above 0 A; leave it out if there is no limit")
-    motor, rates = drive.motor, [rate for rate in RATES if rate <= drive.controller.sample_rate]
+    motor, fastest = drive.motor, drive.controller.sample_rate
+    rates = [rate for rate in RATES if rate <= fastest] or [fastest]
     truth = {**vars(motor), "inertia": motor.rotor_inertia + load.inertia / motor.gear_ratio**2}
     options = [
         _option(drive, kind, rate, duration, load, sensing or Sensing(), (limit, continuous_current), truth)
@@ -115,7 +116,7 @@ def write_excitation(path: Path, option: Option) -> None:
     time = np.arange(round(option.excitation.duration * option.rate) + 1) / option.rate
     table = np.column_stack([time, option.excitation.voltage(time + 1e-9 / option.rate)])
     with writing(path) as temporary:
-        np.savetxt(temporary, table, fmt="%.7g", delimiter=",", header="time,voltage", comments="")
+        np.savetxt(temporary, table, fmt="%.10g", delimiter=",", header="time,voltage", comments="")
 
 
 def _option(

@@ -17,7 +17,7 @@ import numpy as np
 from codrl_mj.identify.columns import KINDS, Column, parse_columns
 from codrl_mj.identify.log import SIGNALS, Finding, Log, find_resolution
 
-_WORDS = {"": np.nan, "nan": np.nan, "none": np.nan, "null": np.nan, "true": 1.0, "false": 0.0}
+_WORDS = {"": np.nan, "nan": np.nan, "none": np.nan, "null": np.nan, "na": np.nan, "true": 1.0, "false": 0.0}
 STAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d")  # seconds since 1970, or since midnight
 _MOST_UNUSABLE = 0.2  # share of rows that may be left out as unreadable or out of order
 
@@ -86,6 +86,7 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
 
 def _log(name: str, table: Cells, mapping: Mapping[str, Column]) -> Log:
     count = len(next(iter(table.columns.values()), ()))
+    numbers = np.setdiff1d(np.arange(1, count + len(table.ragged) + 1), table.ragged)  # of the rows, in the file
     needed = set().union(*(one.names for one in mapping.values())) & table.columns.keys()
     read = {**dict.fromkeys(table.columns), **table.constants, **{one: table.numbers(one) for one in needed}}
     signals = {one: np.broadcast_to(np.asarray(made.value(read), float), (count,)) for one, made in mapping.items()}
@@ -94,32 +95,35 @@ def _log(name: str, table: Cells, mapping: Mapping[str, Column]) -> Log:
     rows = np.flatnonzero(wanted & finite)
     forward = time[rows] > np.append(-np.inf, np.maximum.accumulate(time[rows])[:-1])
     findings = [
-        *_unsigned(read, mapping),
-        *_left_out(np.flatnonzero(wanted & ~finite), "missing", "have no number in some column, and are left out"),
-        *_left_out(rows[~forward], "stamps", "have a time that is not after the rows before, and are left out"),
+        *_unsigned(read, mapping, numbers),
+        *_left_out(numbers[wanted & ~finite], "missing", "have no number in some column, and are left out"),
+        *_left_out(
+            numbers[rows[~forward]], "stamps", "have a time that is not after the rows before, and are left out"
+        ),
         *(
             Finding("info", "units", None, f"{one.text}: no unit is given, taken as {SIGNALS[one.signal]}", "")
             for one in mapping.values()
             if one.unit is None and SIGNALS.get(one.signal)
         ),
-        *_left_out(np.array(table.ragged, int) - 1, "missing", "are incomplete, and are left out"),
+        *_left_out(np.array(table.ragged), "missing", "have not as many cells as there are columns, and are left out"),
     ]
     unusable = int((wanted & ~finite).sum() + (~forward).sum())
     rows = rows[forward]
     if rows.size < 2 or unusable > _MOST_UNUSABLE * max(int(wanted.sum()), 1):
         raise ValueError(
-            f"{unusable} of {int(wanted.sum())} rows cannot be used, must be at most {_MOST_UNUSABLE:.0%} and leave 2: "
-            + ("; ".join(one.message for one in findings if one.severity != "info") or "it is empty")
+            f"{rows.size} of {int(wanted.sum())} rows can be used, must be 2 or more, and {1.0 - _MOST_UNUSABLE:.0%}: "
+            + ("; ".join(one.message for one in findings if one.severity != "info") or "there are no more")
             + "; check the columns"
         )
     kept = {signal: np.ascontiguousarray(values[rows]) for signal, values in signals.items()}
     resolution = {signal: find_resolution(values) for signal, values in kept.items()}
     mean = "voltage" in mapping and mapping["voltage"].mean
-    numbers = np.setdiff1d(np.arange(1, count + len(table.ragged) + 1), table.ragged)[rows]
-    return Log(name, time[rows] - time[rows[0]], kept, resolution, mean, table.constants, numbers, tuple(findings))
+    return Log(
+        name, time[rows] - time[rows[0]], kept, resolution, mean, table.constants, numbers[rows], tuple(findings)
+    )
 
 
-def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> Iterator[Finding]:
+def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column], numbers: np.ndarray) -> Iterator[Finding]:
     """Columns that look like registers with a sign that is read without it: the highest and lowest quarter are used."""
     unsigned = (one for one in mapping.values() if "twos_complement" not in one.formula)
     for name in sorted(set().union(*(one.names for one in unsigned))):
@@ -127,19 +131,20 @@ def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column]) -> Itera
         for bits in (8, 16, 32):
             whole = 2.0**bits
             high, low = column >= 0.75 * whole, column < 0.25 * whole
-            within = np.all((column >= 0.0) & (column < whole) & (column == np.round(column)))
-            if within and high.any() and low.any() and np.all(high | low):
-                row = int(np.flatnonzero(high)[0]) + 1
+            within = (column >= 0.0) & (column < whole) & (column == np.round(column)) & (high | low)
+            if high.any() and low.any() and np.all(within | np.isnan(column)):
+                row = int(numbers[np.flatnonzero(high)[0]])
                 text = f"{name} is below {whole / 4:.0f} or above {3 * whole / 4:.0f}: has it {bits} bits and a sign?"
                 yield Finding("error", "register", row, text, f"write twos_complement({name}, {bits})")
 
 
 def _left_out(rows: np.ndarray, check: str, what: str) -> Iterator[Finding]:
+    """What is said of rows, by their numbers in the file, from 1."""
     if rows.size:
-        text = f"{rows.size} row{'s' if rows.size > 1 else ''}, the first one {rows[0] + 1}, {what}"
+        text = f"{rows.size} row{'s' if rows.size > 1 else ''}, the first one {rows[0]}, {what}"
         remedy = "find out why the logger wrote them; sort the file, or cut it, if its clock was set back"
         severity, remedy = ("error", remedy) if check == "stamps" else ("warning", "")
-        yield Finding(severity, check, int(rows[0]) + 1, text, remedy)
+        yield Finding(severity, check, int(rows[0]), text, remedy)
 
 
 def read_table(path: Path) -> Cells:
@@ -190,7 +195,7 @@ def _csv(text: str) -> Cells:
     if len(above) > 1 and len(above[-1]) == len(above[-2]) == width and all(len(one) < 12 for one in above[-1]):
         units = above.pop()
     names = above[-1] if above else []
-    if len(set(names)) < len(names) or not any(names):
+    if len(named := [one for one in names if one]) > len({*named}) or not named:
         raise ValueError(f"a line must name the columns, each once, above the numbers; it is {separator.join(names)!r}")
     rows = cells[first:]
     ragged = [place for place, (_, row) in enumerate(rows, 1) if len(row) != len(names)]
@@ -271,7 +276,9 @@ def propose_columns(path: Path | str) -> Proposal:
     for name in table.columns:
         words = [one for one in re.split(r"[\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()) if one]
         bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]", name)
-        stated = [table.units.get(name, "").strip("[]() "), *([bracket[1]] if bracket else []), *reversed(words[1:])]
+        ends = re.split(r"[\W_]+", name.lower() if name.isupper() else name)[1:]  # mA is one, and none of two words
+        stated = [table.units.get(name, "").strip("[]() "), *([bracket[1]] if bracket else []), *reversed(ends)]
+        stated += reversed(words[1:])
         named = [one for one, known in _NAMES.items() if {*known.split()} & {*words}]
         fitting = [one for one in named if any(text and _valid(one, text) for text in stated[: 1 + bool(bracket)])]
         signal = next((one for one in (*fitting, *named) if one not in entries), None)
@@ -282,12 +289,12 @@ def propose_columns(path: Path | str) -> Proposal:
         if unit is None:
             unit, doubt = _guessed(signal, name, table)
             doubts.append(f"{name}: {doubt}")
-        plain = name.isidentifier() and not keyword.iskeyword(name)
+        plain = name.isascii() and name.isidentifier() and not keyword.iskeyword(name)
         entries[signal] = f"{name if plain else json.dumps(name, ensure_ascii=False)}:{unit}"
     if "voltage" not in entries and {"duty", "bus"} <= entries.keys():
-        duty, bus = (entries[one].rpartition(":")[0] for one in ("duty", "bus"))
+        duty, bus = entries["duty"].rpartition(":")[0], entries["bus"].rpartition(":")
         part = "/100" if entries["duty"].endswith("percent") else ""
-        entries["voltage"] = f"{duty}{part}*{bus}:V"
+        entries["voltage"] = f"{duty}{part}*{bus[0]}:{bus[2]}"
         doubts.append("voltage: taken as the duty's share of the bus")
     if "time" not in entries or len(entries) < 2:
         known = ", ".join(table.columns)
@@ -297,7 +304,7 @@ def propose_columns(path: Path | str) -> Proposal:
 
 def _valid(signal: str, unit: str) -> str | None:
     """A unit as the mapping takes it, if it is one of the signal."""
-    for one in (_UNITS.get(unit, unit), unit.upper() if len(unit) == 1 else unit, f"m{unit[1:].upper()}"):
+    for one in (_UNITS.get(unit, unit), unit.upper() if len(unit) == 1 else unit, unit[:1] + unit[1:].upper()):
         try:
             Column(signal, "x", one)
         except ValueError:

@@ -108,7 +108,7 @@ def closed_loop_error(fit: Fit, log: Log) -> float | None:
     """Mean absolute error [rad] of a whole log under its own command, by a proportional law found in the log.
 
     The law is the straight line through the origin from the command's error to the input, where the input is not at
-    its limit: `bus`, or the largest that the log has. None where the log has no command that explains its input.
+    its limit: a voltage's `bus`, or the largest that the log has. None where the log has no command that explains it.
     """
     from codrl_mj.identify.simulation import served
 
@@ -117,7 +117,11 @@ def closed_loop_error(fit: Fit, log: Log) -> float | None:
         return None
     wanted, given = log.signals["command"], log.signals[model.driven_by]
     error = wanted - log.signals["position"]
-    limits = log.signals["bus"] if log.has("bus") else np.full(len(error), np.abs(given).max())
+    limits = (
+        log.signals["bus"]
+        if log.has("bus") and model.driven_by == "voltage"
+        else np.full(len(error), np.abs(given).max())
+    )
     free = np.abs(given) < 0.98 * limits
     if not np.any(error[free]):
         return None

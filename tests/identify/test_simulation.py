@@ -1,9 +1,13 @@
 """The winding and the shaft against scipy's integrators, closed forms and MuJoCo."""
 
+import types
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from codrl_mj.identify.log import Log
+from codrl_mj.identify.result import closed_loop_error
 from codrl_mj.identify.simulation import Moved, moving, served, winding
 
 STILL = Moved(0.2, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
@@ -79,3 +83,16 @@ def test_a_servo_holds_what_its_law_says():
     targets, limits = np.full(4001, 0.5), np.full(4001, 5.0)
     position = served(times, targets, limits, 4.0, 0.0, 0.0, moved)[-1]
     assert 4.0 * (0.5 - position) == pytest.approx(np.sin(position), rel=1e-6)
+
+
+def test_a_supply_limits_what_a_servo_commands_only_where_that_is_a_voltage():
+    """Of a torque of more N*m than the supply has volts the same is foretold with the supply and without."""
+    times = np.linspace(0.0, 20.0, 4001)
+    targets, moved = 20.0 * np.sign(np.sin(times)), STILL._replace(viscous=1.0)
+    position = served(times, targets, np.full(4001, 100.0), 4.0, 0.0, 0.0, moved)
+    signals = {"command": targets, "position": position, "torque": np.clip(4.0 * (targets - position), -100.0, 100.0)}
+    model = types.SimpleNamespace(driven_by="torque", output="position", moved=lambda _: moved)
+    logs = Log("plain", times, signals), Log("of a bus", times, signals | {"bus": np.full(4001, 12.0)})
+    errors = [closed_loop_error(types.SimpleNamespace(model=model, values=()), log) for log in logs]
+    assert errors[0] == errors[1]
+    assert errors[0] < 0.01

@@ -24,6 +24,8 @@ def value(entry):
         ("voltage=a*b", [10.0, -21.0]),  # of a formula the unit may be left out
         ("current=a:mA", [0.002, -0.003]),
         ("position=a:deg", np.deg2rad([2.0, -3.0])),
+        ("position=a:mrad", [0.002, -0.003]),
+        ("velocity=b:krpm", np.array([5.0, 7.0]) * 2000.0 * math.pi / 60.0),
         ("position=a:turn", [4.0 * math.pi, -6.0 * math.pi]),
         ("velocity=b:rpm", np.array([5.0, 7.0]) * 2.0 * math.pi / 60.0),
         ("torque=a:mNm", [0.002, -0.003]),
@@ -120,6 +122,18 @@ def test_a_column_that_is_not_there_is_named():
             "time=t:s,duty=duty:1,bus=vbus:V,voltage=duty*vbus:V",
             "share of the bus",
         ),
+        (
+            "t_s,current_mA,bus_mV,duty_percent,pos_mrad,größe\n0,1,2,3,4,5\n1,2,3,4,5,6",
+            "time=t_s:s,current=current_mA:mA,bus=bus_mV:mV,duty=duty_percent:percent,position=pos_mrad:mrad,"
+            "voltage=duty_percent/100*bus_mV:mV",
+            "größe: not known",
+        ),
+        (
+            "T_S,VOLTAGE_KV,I_UA,Größe der Position\n0,1,2,3\n1,2,3,4",
+            'time=T_S:s,voltage=VOLTAGE_KV:kV,current=I_UA:uA,position="Größe der Position":rad',
+            "rad is a guess",
+        ),
+        ("t,i,,\n0,1,,\n0.1,2,,\n", "time=t:s,current=i:A", ": not known"),
     ],
 )
 def test_columns_are_proposed_by_names_units_and_values(tmp_path, lines, columns, doubt):

@@ -37,6 +37,12 @@ def test_a_simulated_log_is_checked_by_the_columns_that_are_printed(capsys, tmp_
     assert "error" not in text
 
 
+def test_a_log_that_is_named_twice_is_checked_once(capsys):
+    said(capsys, "simulate quanser-qube-servo-2 --out log.csv --duration 1")
+    line = "check log.csv {} --columns time=time:s,voltage=voltage:V,current=current:A"
+    assert said(capsys, line.format("log.csv")) == said(capsys, line.format(""))
+
+
 def test_a_log_that_is_there_is_simulated_anew_and_a_folder_is_refused(capsys, tmp_path):
     for _ in range(2):
         said(capsys, "simulate quanser-qube-servo-2 --out log.csv --duration 1")
@@ -94,6 +100,11 @@ def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path, monkeypa
         ("simulate quanser-qube-servo-2 --out log.csv --sensor current:nois=1", "did you mean noise"),
         ("simulate quanser-qube-servo-2 --out log.csv --sensor current:noise=a", "SIGNAL:FIELD=NUMBER"),
         ("simulate quanser-qube-servo-2 --out log.csv --sensor currant:noise=1", "did you mean current"),
+        (
+            "simulate quanser-qube-servo-2 --out log.csv --sensor current:noise=1 current:bias=1",
+            "current is given twice",
+        ),
+        ("simulate quanser-qube-servo-2 --out log.csv --amplitude -19", "must be at most the supply's 18 V"),
         ("simulate quanser-qube-servo-2 --out log.csv --rate 0", "rate"),
     ],
 )

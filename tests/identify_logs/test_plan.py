@@ -101,6 +101,19 @@ def test_what_is_written_is_what_was_planned(planned, tmp_path):
     assert voltage[-1] == 0.0
 
 
+def test_a_long_plan_is_written_row_by_row(planned, tmp_path):
+    """Hours of it: no two rows have the same time."""
+    excitation = dataclasses.replace(planned.best.excitation, kind="square", duration=7200.0)
+    write_excitation(tmp_path / "long.csv", planned.best._replace(excitation=excitation, rate=100.0))
+    time = np.loadtxt(tmp_path / "long.csv", delimiter=",", skiprows=1, usecols=0)
+    np.testing.assert_allclose(np.diff(time), 0.01, rtol=1e-6)
+
+
+def test_a_drive_of_few_samples_is_planned_at_its_rate():
+    slow = dataclasses.replace(DRIVE, controller=SampledLoop(sample_rate=0.9 * min(RATES)))
+    assert {one.rate for one in plan(slow, duration=4.0).options} == {0.9 * min(RATES)}
+
+
 def test_what_the_datasheet_leaves_at_zero_is_named():
     bare = dataclasses.replace(DRIVE, motor=dataclasses.replace(MOTOR, viscous_friction=0.0, coulomb_friction=0.0))
     found = at_rates(2e3, kinds=["prbs"], drive=bare, duration=1.0)

@@ -80,7 +80,7 @@ def test_constants_of_a_file_count_in_formulas(tmp_path):
 
 def test_rows_that_cannot_be_used_are_left_out_and_named(tmp_path):
     lines = ["t,i"] + [f"{k},{k}" for k in range(20)]
-    lines[4], lines[8], lines[12] = "3,", "5.5,7", "11"  # a value is missing; the clock goes back; the row is cut
+    lines[4], lines[8], lines[12] = "3", "5.5,7", "11,NA"  # the row is cut; the clock goes back; a value is missing
     log = read_log(write(tmp_path, "\n".join(lines)), COLUMNS)
     np.testing.assert_array_equal(np.setdiff1d(np.arange(1, 21), log.row_numbers), [4, 8, 12])
     np.testing.assert_array_equal(log.row_numbers, log.time + 1.0)
@@ -99,7 +99,12 @@ def test_a_register_with_a_sign_is_seen(tmp_path):
     numbers = np.round(100.0 * np.sin(np.arange(60.0))).astype(np.int16)
     path = write(tmp_path, "\n".join(["t,i"] + [f"{k},{n.astype(np.uint16)}" for k, n in enumerate(numbers)]))
     (found,) = read_log(path, COLUMNS).findings
-    assert (found.check, found.row) == ("register", 1 + int(np.argmax(numbers < 0)))
+    first = 1 + int(np.argmax(numbers < 0))
+    assert (found.check, found.row) == ("register", first)
+    lines = path.read_text().splitlines()
+    lines[1:1] = ["-2,", "-1"]  # a value is missing; the row is cut
+    found, *_ = read_log(write(tmp_path, "\n".join(lines), "less.csv"), COLUMNS).findings
+    assert (found.check, found.row) == ("register", first + 2)
     log = read_log(path, "time=t:s,current=twos_complement(i, 16):A")
     assert log.findings == ()
     np.testing.assert_array_equal(log.signals["current"], numbers)
@@ -111,8 +116,8 @@ def test_a_register_with_a_sign_is_seen(tmp_path):
         ("t,i\n1,2\n2,a\n", "column i in line 3 is 'a'"),
         ('t,i\n1,"2,5"\n2,"3,5"\n', "decimal point"),
         ("t,t\n1,2\n", "name the columns"),
-        ("t,i\n1,2\n", "cannot be used"),
-        ("t,i\n3,2\n2,2\n1,2\n", "2 of 3 rows"),
+        ("t,i\n1,2\n", "1 of 1 rows can be used, must be 2 or more, and 80%: there are no more"),
+        ("t,i\n3,2\n2,2\n1,2\n", "1 of 3 rows"),
         ("t,j\n1,2\n2,2\n", "unknown column i"),
         ("", "name the columns"),
     ],
