@@ -134,7 +134,7 @@ TASKS = [
         ("observation_space",),
         (spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (4,)), spaces.Box(-1, 1, (3,), np.float64), spaces.Discrete(3), 3),
     ),
-    *itertools.product(("action_space",), (spaces.Box(-1, 1, (1,)), spaces.Box(-2, 2, (2,)), spaces.Discrete(3), 3)),
+    *itertools.product(("action_space",), (spaces.Box(-1, 1, (2,)), spaces.Discrete(3), 3)),
     *itertools.product(("options",), (Undefaulted, Worded, dict, 3)),
     *itertools.product(("paper", "name", "env_id"), (3,)),
     *itertools.product(("trials",), (Trials((1.0,) * 4, ((0.0,),) * 4, (0.0,) * 3, 2, 1),)),

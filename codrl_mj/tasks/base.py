@@ -106,7 +106,8 @@ class Task(fields.Checked):
     qvel: tuple[int, ...] = ()
     """Which state entries are MuJoCo's `qvel`, in order; the second half unless told otherwise."""
     action_space: spaces.Space[Any] = None  # type: ignore[assignment]
-    """The action space, Gymnasium's; unless told otherwise up to `max_force`, or which of `forces`."""
+    """The action space, Gymnasium's; unless told otherwise up to `max_force`, or which of `forces`. A copy of another
+    force keeps it, as Gymnasium's Pendulum does where `max_torque` is written; with None it gets its own."""
     observation_space: spaces.Box = None  # type: ignore[assignment]
     """The observation space, Gymnasium's; without bounds unless told otherwise."""
     render_fps: int = fields.integer(0, least=0)

@@ -47,9 +47,9 @@ def check_layout(task: Any) -> None:
     wanted: Any = spaces.Box(-np.inf, np.inf, (len(task.observation_names),), np.float32)
     fine = isinstance(box, spaces.Box) and (box.shape, box.dtype) == (wanted.shape, wanted.dtype)
     _require(task, "observation_space", fine, f"such as {wanted}, by observation_names")
-    limits = task.max_forces.astype(np.float32)
-    wanted = spaces.Box(-limits, limits) if task.forces is None else spaces.Discrete(len(task.forces))
-    _require(task, "action_space", task.action_space == wanted, f"{wanted}, by max_force or forces; None makes it")
+    wanted = spaces.Box(-1.0, 1.0, (len(task.motors),)) if task.forces is None else spaces.Discrete(len(task.forces))
+    fine = isinstance(task.action_space, spaces.Box) and task.action_space.shape == wanted.shape
+    _require(task, "action_space", fine if task.forces is None else task.action_space == wanted, f"such as {wanted}")
 
 
 def check_functions(task: Any) -> None:
