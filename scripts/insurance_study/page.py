@@ -136,8 +136,8 @@ def _things(collected: Collected, scores: Scores) -> str:
 actions; how many of {PLANNED} policies fail, by losing more than {FAILED:g}; how often episodes succeed. The highest
 mean is bold. *Random* actuators draw strength, lag and delay for every episode, and push; they reach as far as is said
 in brackets, or twice as far. *The very dose* is what it is tested on; *drawn* is that one thing alone, from none
-to twice as much, of forces and voltages at most 70 %. Forces are shares of the largest one, or N·m; voltages are shares of [what the task
-needs](plan.md#doses)."""
+to twice as much, of forces and voltages at most 70 %. Forces are shares of the largest one, or N·m; voltages are shares
+of [what the task needs](plan.md#doses)."""
     return f"""## What each kind of training comes to
 
 {textwrap.fill(" ".join(text.split()), 120, break_long_words=False)}
