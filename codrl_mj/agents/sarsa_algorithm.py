@@ -149,12 +149,13 @@ def run_episode(
     forces: np.ndarray,
     observation: np.ndarray,
     record: np.ndarray,
-    arguments: tuple[Any, ...],
+    row: np.ndarray,
+    arguments: tuple[int, int],
 ) -> tuple[float, int, bool, bool]:
     """Learn from an episode of an environment's compiled `step`, from its first observation (k,), which gets the last.
 
-    `record`, as long as the time limit, gets the trace's last row of each step. Sum of the rewards, steps, whether the
-    task ended the episode, and whether the simulation was fine throughout.
+    `record`, as long as the time limit, gets the trace's last `row` of each step. Sum of the rewards, steps, whether
+    the task ended the episode, and whether the simulation was fine throughout.
     """
     action = begin(learner, generator, observation)
     total, length, terminated = 0.0, 0, False
@@ -163,8 +164,7 @@ def run_episode(
         reward, terminated, fine = step(force, observation, *arguments)
         if not fine:
             return total, length, False, False
-        trace = arguments[-1]
-        record[length] = trace[-1, 0]
+        record[length] = row
         record[length, 0] = force  # as it was asked for, before anything disturbed it
         total, length = total + reward, length + 1
         seen_reward = float(np.float32(reward))  # what Stable-Baselines3's environments hand out
@@ -265,7 +265,9 @@ class CompiledEpisodes:
         self._physics.memory[:] = start.get("disturbances", np.zeros((1, 0)))[0]
         observation = start["observations"][0].copy()
         total, length, terminated, fine = run_episode(
-            learner, generator, self._step, self._forces, observation, self._record, self._arguments
+            *(learner, generator, self._step, self._forces, observation, self._record),
+            self._physics.trace[-1, 0],
+            self._arguments,
         )
         if not fine:
             self._physics.check_finite()

@@ -33,19 +33,20 @@ from numba import types
 
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.engine.families import compiled_function
-from codrl_mj.engine.memory import floats, internal, on_stack
+from codrl_mj.engine.memory import f64, floats, internal, on_stack
 from codrl_mj.envs.setup import Setup
 from codrl_mj.kept import njit
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
-from codrl_mj.physics.rows import BROKEN, CLAIMED, DONE, Lane, Rows, load, store, tallied
-from codrl_mj.physics.stepping import Stepping
+from codrl_mj.physics.rows import Lane, Rows, load, store
+from codrl_mj.physics.sharing import Shared, shared
+from codrl_mj.physics.stepping import Stepping, simulation_at
 
 NEEDS_KEY, FIRST_OPTION = 0, 1
 """In `options`: whether an episode's disturbances or sensors need a key, and the first of the task's options."""
 
 
 class VectorStep(NamedTuple):
-    """One environment step of many environments: what it is given, and what it fills."""
+    """Environment steps of many environments: what each is given, and what it fills."""
 
     forces: np.ndarray
     """Desired [N or N*m], shape (N,) or (N, motors)."""
@@ -61,26 +62,27 @@ class VectorStep(NamedTuple):
     """Shape (N,), bool."""
     elapsed: np.ndarray
     """Steps of the present episodes, shape (N,)."""
-    limit: float
-    """Steps after which an episode is truncated."""
+    limit: np.ndarray
+    """Steps after which an episode is truncated, shape (1,)."""
     signals: np.ndarray
     """The last row of the trace but for its ends, shape (columns, N, motors)."""
 
 
 class Kernels(NamedTuple):
-    """Compiled functions; `arguments` are (options, *those of `codrl_mj.physics.stepping`)."""
+    """Compiled functions.
+
+    Their `arguments` are addresses: of the options, and of the simulation, the `where` of `codrl_mj.physics.stepping`.
+    """
 
     step: Compiled
     """(force, observation (k,) float32, *arguments) -> (reward, terminated, fine): takes one environment step under a
     desired force [N or N*m], or several, an array (n,), and fills the observation. `fine` says whether the simulation
-    is still one of numbers; if not, the environment must be reset. What the actuators did is in the trace, the last of
-    the arguments; columns as in `codrl_mj.physics.trace_names`."""
+    is still one of numbers; if not, the environment must be reset. What the actuators did is in the trace."""
     reset: Compiled
     """(generator, low, high, observation, *arguments) -> nothing: starts an episode from a state that the numpy
     `Generator` draws between `low` and `high` (see `Task.bounds`), and fills the observation."""
-    step_rows: Compiled
-    """(tally, rows at once, lane, rows, options, `VectorStep`) -> nothing: `step` for every row; see
-    `codrl_mj.physics.rows.share`."""
+    step_rows: Shared
+    """`step` for every row; its arguments are (rows, options, `VectorStep`)."""
     observe_rows: Compiled
     """(which (m,), lane, rows, observations (N, k)) -> nothing: observes rows where episodes start."""
 
@@ -92,8 +94,10 @@ class CompiledEnv(NamedTuple):
     """See `Kernels.step`."""
     reset: Compiled
     """See `Kernels.reset`."""
-    arguments: tuple[Any, ...]
+    arguments: tuple[int, int]
     """The last arguments of both."""
+    trace: np.ndarray
+    """What the actuators did in the last step, shape (motors, columns): live; see `codrl_mj.physics.trace_names`."""
     forces: np.ndarray | None
     """Forces [N or N*m] of the discrete actions; None where the action space is a box."""
     low: np.ndarray
@@ -115,12 +119,19 @@ def compiled_env(env: Any) -> CompiledEnv | None:
     kernels, task = compiled_kernels(setup, physics), setup.task
     compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])
     low, high = setup.initial_bounds
-    return CompiledEnv(kernels.step, kernels.reset, arguments(setup, physics), setup.commands.action_forces, low, high)
+    parts = kernels.step, kernels.reset, arguments(setup, physics), physics.trace[-1]
+    return CompiledEnv(*parts, setup.commands.action_forces, low, high)
 
 
-def arguments(setup: Setup, physics: Any) -> tuple[Any, ...]:
+def arguments(setup: Setup, physics: Any) -> tuple[int, int]:
     """The last arguments of an environment's kernels, of a simulation whose steps are compiled."""
-    return (np.array([setup.random, *setup.config.options], dtype=np.float64), *physics.arguments)
+    return _options(float(setup.random), *setup.config.options).ctypes.data, physics.where
+
+
+@functools.cache
+def _options(*numbers: float) -> np.ndarray:
+    """A vector of options, kept for the process's life: compiled code knows it by its address."""
+    return np.array(numbers, dtype=np.float64)
 
 
 def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
@@ -128,7 +139,8 @@ def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
     task = setup.task
     sensors = len(setup.plant.family.OBSERVED) if setup.sensors else 0
     single, size = len(task.motors) == 1, len(task.state_names)
-    return _kernels(physics.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors)
+    options = len(setup.config.options)
+    return _kernels(physics.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors, options)
 
 
 @functools.cache
@@ -139,6 +151,7 @@ def _kernels(
     size: int,
     single: bool,
     sensors: int,
+    options_count: int,
 ) -> Kernels:
     advance, start, read, observed = stepping
     observe, rewarded, ended = outcomes.observe, outcomes.reward, outcomes.terminated
@@ -146,40 +159,29 @@ def _kernels(
     initial_entries = internal(initial_state)
 
     @internal
-    def look(
-        row: np.ndarray, observation: np.ndarray, state: np.ndarray, model: int, data: int, settings: np.ndarray
-    ) -> None:
-        read(state, data)
+    def look(row: np.ndarray, observation: np.ndarray, state: np.ndarray, where: int) -> None:
+        read(state, where)
         observe(state, observation)
         if sensors > 0:
             seen = numba.carray(on_stack(len(row) * sensors), (len(row), sensors))
-            observed(row, seen, model, data, settings)
+            observed(row, seen, where)
             first = len(observation) - seen.size
             for motor in range(len(row)):
                 for entry in range(sensors):
                     observation[first + motor * sensors + entry] = seen[motor, entry]
 
     @compiled
-    def step(
-        force: Any,
-        observation: np.ndarray,
-        options: np.ndarray,
-        model: int,
-        data: int,
-        settings: np.ndarray,
-        memory: np.ndarray,
-        trace: np.ndarray,
-    ) -> tuple[float, bool, bool]:
+    def step(force: Any, observation: np.ndarray, options: int, where: int) -> tuple[float, bool, bool]:
         before, after = numba.carray(on_stack(size), size), numba.carray(on_stack(size), size)
-        read(before, data)
-        fine = advance(force, model, data, settings, memory, trace)
+        read(before, where)
+        fine = advance(force, where)
+        trace = simulation_at(where)[4]
         last = trace[len(trace) - 1]
-        look(last, observation, after, model, data, settings)
+        look(last, observation, after, where)
+        own = numba.carray(f64(options + 8 * FIRST_OPTION), options_count)
         if single:  # decided where it is compiled: one is a number, several are an array
-            reward = rewarded(before, last[0, 1], after, options[FIRST_OPTION:])
-        else:
-            reward = rewarded(before, last[:, 1], after, options[FIRST_OPTION:])
-        return reward, ended(after), fine
+            return rewarded(before, last[0, 1], after, own), ended(after), fine
+        return rewarded(before, last[:, 1], after, own), ended(after), fine
 
     @compiled
     def reset(
@@ -187,12 +189,8 @@ def _kernels(
         low: np.ndarray,
         high: np.ndarray,
         observation: np.ndarray,
-        options: np.ndarray,
-        model: int,
-        data: int,
-        settings: np.ndarray,
-        memory: np.ndarray,
-        trace: np.ndarray,
+        options: int,
+        where: int,
     ) -> None:
         draws, state = np.empty(len(low)), np.empty(size)
         for entry in range(len(low)):
@@ -200,45 +198,35 @@ def _kernels(
         entries = floats(initial_entries(draws))
         for entry in range(size):
             state[entry] = entries[entry]
-        key = generator.random() * LARGEST_KEY if options[NEEDS_KEY] != 0.0 else 0.0
-        start(state, key, model, data, settings, memory)
-        nothing = np.zeros((trace.shape[1], trace.shape[2]))
-        look(nothing, observation, state, model, data, settings)
+        key = generator.random() * LARGEST_KEY if f64(options)[NEEDS_KEY] != 0.0 else 0.0
+        start(state, key, where)
+        look(np.zeros(simulation_at(where)[4].shape[1:]), observation, state, where)
 
-    @compiled
-    def step_rows(tally: np.ndarray, at_once: int, lane: Any, rows: Any, options: np.ndarray, steps: Any) -> None:
-        steps, lane, rows = VectorStep(*steps), Lane(*lane), Rows(*rows)
+    @internal
+    def step_some(first: int, end: int, lane: Any, rows: Any, options: int, steps: Any) -> int:
+        steps, lane, rows, broken = VectorStep(*steps), Lane(*lane), Rows(*rows), 0
         stepping, observations, signals, elapsed = steps.stepping, steps.observations, steps.signals, steps.elapsed
-        model, data, settings, trace = lane.model, lane.data, lane.settings, lane.trace
-        last, count = trace[len(trace) - 1], len(stepping)
-        first = tallied(tally, CLAIMED, at_once)
-        while first < count:
-            end = min(first + at_once, count)
-            for row in range(first, end):
-                load(rows, row, lane)
-                reward, over, fine = step(
-                    steps.forces[row], observations[row], options, model, data, settings, rows.memory[row], trace
-                )
-                store(rows, row, lane)
-                elapsed[row] += 1
-                steps.rewards[row] = reward if stepping[row] else 0.0
-                steps.terminated[row] = over and stepping[row]
-                steps.truncated[row] = elapsed[row] >= steps.limit and stepping[row]
-                if not fine:
-                    tallied(tally, BROKEN, 1)
-                for motor in range(len(last)):
-                    for column in range(len(signals)):
-                        signals[column, row, motor] = last[motor, 1 + column]
-            tallied(tally, DONE, end - first)
-            first = tallied(tally, CLAIMED, at_once)
+        where, last = lane.places.ctypes.data, lane.trace[len(lane.trace) - 1]
+        for row in range(first, end):
+            load(rows, row, lane)
+            reward, over, fine = step(steps.forces[row], observations[row], options, where)
+            store(rows, row, lane)
+            elapsed[row] += 1
+            steps.rewards[row] = reward if stepping[row] else 0.0
+            steps.terminated[row] = over and stepping[row]
+            steps.truncated[row] = elapsed[row] >= steps.limit[0] and stepping[row]
+            broken += not fine
+            for motor in range(len(last)):
+                for column in range(len(signals)):
+                    signals[column, row, motor] = last[motor, 1 + column]
+        return broken
 
     @compiled
     def observe_rows(which: np.ndarray, lane: Any, rows: Any, observations: np.ndarray) -> None:
         lane, rows = Lane(*lane), Rows(*rows)
-        _, _, model, data, settings, _, trace = lane
-        nothing, state = np.zeros((trace.shape[1], trace.shape[2])), np.empty(size)
+        nothing, state = np.zeros(lane.trace.shape[1:]), np.empty(size)
         for row in which:
             load(rows, row, lane)
-            look(nothing, observations[row], state, model, data, settings)
+            look(nothing, observations[row], state, lane.places.ctypes.data)
 
-    return Kernels(step, reset, step_rows, observe_rows)
+    return Kernels(step, reset, shared(step_some), observe_rows)

@@ -18,7 +18,7 @@ from codrl_mj.engine.specs import matched_by, names_of
 from codrl_mj.envs.commands import ControlCommands, command_of
 from codrl_mj.envs.distributions import paths_of
 from codrl_mj.envs.randomization import Draws, Randomization, put_into
-from codrl_mj.physics.base import diverged, named_signals
+from codrl_mj.physics.base import diverged, namer
 from codrl_mj.physics.variation import without_motors, write_fields
 
 _POSITION = int(mujoco.mjtWarning.mjWARN_BADQPOS)  # followed by those of speeds, accelerations and controls
@@ -112,7 +112,7 @@ class Motors:
     def signals(self) -> dict[str, Any]:
         """The motors' signals after the last step, as `info` has them, units as `Readout` has them."""
         table, alone = self.readout.table(self.data), len(self.present) == 1
-        return named_signals(self.readout.names, table[:, 0].tolist() if alone else table)
+        return namer(self.readout.names)(table[:, 0].tolist() if alone else table)
 
     def seen(self) -> np.ndarray:
         """What the sensors say now, shape (k,), float64, entries as in `sensors`."""

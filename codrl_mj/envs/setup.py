@@ -16,8 +16,8 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.motors import longer, sensor_names
 from codrl_mj.envs.randomization import Randomization
 from codrl_mj.own_code import look_up
-from codrl_mj.physics import PHYSICS, Physics, Plant, Signals
-from codrl_mj.physics.base import named_signals
+from codrl_mj.physics import PHYSICS, Physics, Plant, Signals, trace_names
+from codrl_mj.physics.base import namer
 from codrl_mj.physics.compiled_task import Outcomes, compiled_outcomes
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.variation import bare_model
@@ -159,15 +159,18 @@ class Setup:
         return float(reward), bool(outcomes.terminated(after))
 
     @functools.cached_property
-    def _columns(self) -> tuple[str, ...]:
-        return ("desired_force", "actual_force", *self.plant.family.Signals._fields)  # all but the trace's last
+    def _named(self) -> Callable[[Any], Signals]:
+        return namer(trace_names(self.plant.family)[:-1])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_named"}  # which nothing pickles
 
     def signals(self, columns: Sequence[Any] | np.ndarray, desired: Any) -> Signals:
         """A trace's columns, numbers or arrays, as signals: the force [N or N*m] that the agent `desired` is theirs.
 
         Where an actuator tracks no force, what was delivered counts as desired.
         """
-        signals = named_signals(self._columns, columns)
+        signals = self._named(columns)
         signals["desired_force"] = desired if self.commands.tracks else signals["actual_force"]
         return signals
 

@@ -90,8 +90,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """What the agent commands."""
         self.signal_names, self.trace_names = signal_names(family := self.setup.plant.family), trace_names(family)
         """Of the actuators' signals in `info`; of the columns of `trace`."""
-        self._observation_shape = self.observation_space.shape
-        self._compiled: tuple[Any, tuple[Any, ...], np.ndarray] | None = None  # step, its arguments, trace's last row
+        self._compiled: tuple[Any, ...] | None = None
         self._offer_attributes(self.task)
 
     @property
@@ -167,7 +166,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     def _write_attribute(self, name: str, value: Any) -> None:
         physics = self.physics
         kept = physics.snapshot()
-        self.setup = written(name, value, self.setup, self._model())
+        self.setup, self._compiled = written(name, value, self.setup, self._model()), None
         physics.set_model({})
         physics.restore(kept)
 
@@ -201,21 +200,26 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             ValueError: the action is not in the action space, or not a number.
             SimulationDivergedError: the simulation left the finite numbers.
         """
-        force = self.setup.commands.force(action)
         if self._compiled is None:
             if self.physics.stepping is None:
-                return self._step_apart(force)
-            kernels, row = compiled_kernels(self.setup, self.physics), self.physics.trace[-1]
-            self._compiled = kernels.step, arguments(self.setup, self.physics), row.T if len(row) > 1 else row[0]
-        step, simulation, columns = self._compiled
-        observation = np.empty(self._observation_shape, np.float32)
-        reward, terminated, fine = step(force, observation, *simulation)
+                return self._step_apart(self.setup.commands.force(action))
+            self._compiled = self._parts()
+        force_of, step, seen, options, where, columns, signals = self._compiled
+        force = force_of(action)
+        reward, terminated, fine = step(force, seen, options, where)
         if not fine:
             self.physics.check_finite()
         if self.render_mode == "human":
             self.render()
-        row = columns.tolist() if columns.ndim == 1 else columns.copy()
-        return observation, reward, terminated, False, self.setup.signals(row, force)
+        return seen.copy(), reward, terminated, False, signals(columns(), force)
+
+    def _parts(self) -> tuple[Any, ...]:
+        """What a step takes: from action to force, the compiled step with its arguments, and from trace to signals."""
+        setup, row = self.setup, self.physics.trace[-1]
+        seen = np.empty(self.observation_space.shape or (), np.float32)
+        columns = row[0].tolist if len(row) == 1 else row.T.copy
+        compiled = compiled_kernels(setup, self.physics).step, seen, *arguments(setup, self.physics)
+        return setup.commands.force, *compiled, columns, setup.signals
 
     def _step_apart(self, force: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """What the compiled step does, in parts, for a physics that is Python."""

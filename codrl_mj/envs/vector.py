@@ -119,7 +119,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         if render_mode is not None:
             check_view(self.physics.model, width, height, camera)
         self._renderer: OffscreenRenderer | None = None
-        self._kernels: tuple[Kernels, Array] | None = None
+        self._kernels: tuple[Kernels, int, VectorStep] | None = None
         self.looks: dict[str, Array] = {}  # fields of the models, where attributes were written
         self._offer_attributes(self.task)
 
@@ -267,11 +267,13 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 "call reset(options={'reset_mask': terminated | truncated})"
             )
         stepping = ~self._ended  # in NEXT_STEP mode, environments that ended are reset instead
-        steps = self._steps(forces, stepping)
-        kernels, options = self._compiled()
+        kernels, options, steps = self._compiled()
+        steps.forces[:], steps.stepping[:] = forces, stepping
+        steps.limit[0] = np.inf if self.max_episode_steps is None else self.max_episode_steps
         broken = self.physics.step(kernels.step_rows, options, steps)
-        rewards, terminated, truncated = steps.rewards, steps.terminated, steps.truncated
-        self.signals = signals = self.setup.signals([forces, *steps.signals.reshape(-1, *forces.shape)], forces)
+        rewards, terminated, truncated = steps.rewards.copy(), steps.terminated.copy(), steps.truncated.copy()
+        columns = steps.signals.reshape(-1, *forces.shape).copy()
+        self.signals = signals = self.setup.signals([forces, *columns], forces)
         if broken:
             self._ended |= terminated | truncated  # what is to be reset still is
             self.physics.check_finite(self.physics.state, stepping)
@@ -283,27 +285,24 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             infos = self._finish(infos)
         return self._observations.copy(), rewards, terminated, truncated, infos
 
-    def _steps(self, forces: Array, stepping: Array) -> VectorStep:
-        """Where a step of all environments goes to."""
-        count, columns = self.num_envs, 1 + len(self.setup.plant.family.Signals._fields)
-        limit = np.inf if self.max_episode_steps is None else float(self.max_episode_steps)
-        return VectorStep(
-            forces,
-            stepping,
-            self._observations,
-            np.empty(count),
-            np.empty(count, dtype=bool),
-            np.empty(count, dtype=bool),
-            self._elapsed,
-            limit,
-            np.empty((columns, count, len(self.task.motors))),
-        )
-
-    def _compiled(self) -> tuple[Kernels, Array]:
-        """The compiled functions, and the options that they are given."""
+    def _compiled(self) -> tuple[Kernels, int, VectorStep]:
+        """The compiled functions, the address of their options, and what a step is given and fills."""
         if self._kernels is None:
-            options, *_ = arguments(self.setup, self.physics)
-            self._kernels = compiled_kernels(self.setup, self.physics), options
+            count, motors = self.num_envs, len(self.task.motors)
+            columns = 1 + len(self.setup.plant.family.Signals._fields)
+            steps = VectorStep(
+                np.empty(count if motors == 1 else (count, motors)),
+                np.empty(count, dtype=bool),
+                self._observations,
+                np.empty(count),
+                np.empty(count, dtype=bool),
+                np.empty(count, dtype=bool),
+                self._elapsed,
+                np.empty(1),
+                np.empty((columns, count, motors)),
+            )
+            options, _ = arguments(self.setup, self.physics)
+            self._kernels = compiled_kernels(self.setup, self.physics), options, steps
         return self._kernels
 
     def _finish(self, infos: dict[str, Any]) -> dict[str, Any]:

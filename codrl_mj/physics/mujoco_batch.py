@@ -14,7 +14,8 @@ from codrl_mj.physics.base import LARGEST, Plant, SimulationDivergedError
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.physics.mjcf import flags_with_friction
 from codrl_mj.physics.mujoco_single import MujocoPhysics
-from codrl_mj.physics.rows import Rows, derive_fields, lane, part, share
+from codrl_mj.physics.rows import Rows, derive_fields, lane, part
+from codrl_mj.physics.sharing import Shared, new_board, share
 from codrl_mj.physics.stepping import NOISE_KEY
 from codrl_mj.physics.variation import Variation, bare_model, field_of, mounting_of, write_fields
 
@@ -59,7 +60,7 @@ class MujocoBatchPhysics:
         threads = min(self._num_threads or os.cpu_count() or 1, self.num_envs)
         self._data = [mujoco.MjData(copy.copy(self._nominal.model)) for _ in range(threads)]
         self.model, self.data = self._nominal.model, self._nominal.data
-        self.stepping, self.arguments = self._nominal.stepping, self._nominal.arguments  # which compile for one of them
+        self.stepping, self.where = self._nominal.stepping, self._nominal.where
         self._lanes: list[tuple[Any, ...]] = []
         parts = {name: part(self.model, name) for name in ("time", "qpos", "qvel", "act")}
         self._time, self._qpos, self._qvel, self._act = (self._states[:, one] for one in parts.values())
@@ -70,6 +71,7 @@ class MujocoBatchPhysics:
         """A thread's lane, for the fields of the models that differ at present."""
         if not self._lanes:
             self._lanes = [tuple(lane(self._nominal, data, self._fields)) for data in self._data]
+            self._board = new_board()
         return self._lanes[thread]
 
     def field(self, name: str) -> np.ndarray:
@@ -145,13 +147,14 @@ class MujocoBatchPhysics:
                 self._act[rows, int(one.act) + NOISE_KEY] = keys + at
         self._disturber.reset(rows, keys)
 
-    def step(self, kernel: Any, options: np.ndarray, steps: Any) -> bool:
+    def step(self, kernel: Shared, options: int, steps: Any) -> bool:
         """Take an environment step of every simulation; `kernel` is `Kernels.step_rows` of `codrl_mj.envs.compiled`.
 
         Returns whether one of them is no longer one of numbers.
         """
         self._lane()
-        return share(kernel, self._lanes, self.num_envs, self.plant.inner_steps, self._rows, options, tuple(steps))
+        arguments = self._rows, options, tuple(steps)
+        return share(kernel, self._board, self._lanes, self.num_envs, self.plant.inner_steps, *arguments)
 
     def observe(self, kernel: Any, rows: np.ndarray, observations: np.ndarray) -> None:
         """Observe simulations where episodes start; `kernel` is `Kernels.observe_rows`."""
@@ -190,4 +193,4 @@ class MujocoBatchPhysics:
         self._nominal.show(self.state[index])
 
 
-_BOUND = ("model", "data", "stepping", "arguments", "_data", "_lanes", "_time", "_qpos", "_qvel", "_act", "_rows")
+_BOUND = ("model", "data", "stepping", "where", "_data", "_board", "_lanes", "_time", "_qpos", "_qvel", "_act", "_rows")

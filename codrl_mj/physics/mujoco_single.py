@@ -9,10 +9,9 @@ import numpy as np
 from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import HEAD
-from codrl_mj.engine.layout import addresses
 from codrl_mj.physics.base import Physics, Plant
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
-from codrl_mj.physics.stepping import Wiring, compiled_stepping
+from codrl_mj.physics.stepping import Wiring, compiled_stepping, places_of
 from codrl_mj.physics.variation import write_fields
 
 ARM = Wiring._fields.index("arm")
@@ -41,7 +40,8 @@ class MujocoPhysics(Physics):
             dof = self.model.jnt_dofadr[self.model.actuator_trnid[index, 0]]
             first = max(self.model.actuator_actadr[index], 0)
             self.wiring.append(Wiring(index, self.model.actuator_ctrladr[index], first, dof, actuator.arm_radius))
-        self._settings = np.hstack([np.array(self.wiring, dtype=np.float64), self._disturber.numbers])
+        self.settings = np.hstack([np.array(self.wiring, dtype=np.float64), self._disturber.numbers])
+        """See `codrl_mj.physics.stepping`, where `places` and `where`, too, are explained."""
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
 
@@ -49,7 +49,8 @@ class MujocoPhysics(Physics):
         """Take the views that a step uses, and make sure that the callbacks are there."""
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self.stepping = compiled_stepping(self.plant)
-        self.arguments = *addresses(self.data), self._settings, self._disturber.memory, self.trace
+        self.places = places_of(self.data, self.settings, self._disturber.memory, self.trace)
+        self.where = self.places.ctypes.data
         self.scene: tuple[Any, Any] | None = (self.model, self.data)
         self._callbacks = needed_callbacks(self.model)
         self.install()
@@ -89,7 +90,7 @@ class MujocoPhysics(Physics):
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
         """See `Physics.reset`."""
         self.install()  # raises if somebody replaced ours since the last episode
-        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), *self.arguments[:-1])
+        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), self.where)
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the actuators for others of their family; to be followed by a reset.
@@ -99,11 +100,11 @@ class MujocoPhysics(Physics):
         if not self.plant.motorised:
             return
         for row, (one, limit) in enumerate(zip(actuators, self.plant.max_forces, strict=True)):
-            index, arm, numbers = int(self._settings[row, 0]), one.arm_radius, one.numbers
+            index, arm, numbers = int(self.settings[row, 0]), one.arm_radius, one.numbers
             self.model.actuator_user[index, HEAD : HEAD + len(numbers)] = numbers
             self.model.actuator_gear[index, 0] = 1.0 / arm
             self.model.actuator_ctrlrange[index] = -limit * arm, limit * arm
-            self._settings[row, ARM] = arm
+            self.settings[row, ARM] = arm
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
         """Change fields of the model, as `Variation.fields` returns them for one simulation, before a reset."""
@@ -123,13 +124,13 @@ class MujocoPhysics(Physics):
 
     def step(self, desired_force: Any) -> None:
         """See `Physics.step`."""
-        if not self.stepping.step(desired_force, *self.arguments):
+        if not self.stepping.step(desired_force, self.where):
             self.check_finite()
 
     def observed(self, row: np.ndarray) -> np.ndarray:
         """See `Physics.observed`."""
         seen = np.empty((len(row), len(self.plant.family.OBSERVED)))
-        self.stepping.observed(row, seen, *self.arguments[:3])
+        self.stepping.observed(row, seen, self.where)
         return seen
 
     def snapshot(self) -> np.ndarray:
@@ -153,4 +154,4 @@ def _progression(entries: tuple[int, ...]) -> slice:
 
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_VIEWS = ("model", "_qpos", "_qvel", "stepping", "arguments", "scene")
+_VIEWS = ("model", "_qpos", "_qvel", "stepping", "where", "places", "scene")

@@ -5,19 +5,18 @@ the disturbances' memory. A thread has one simulation (`Lane`); it loads a row, 
 simulation, and stores the row again.
 """
 
-import functools
-import os
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from codrl_mj.engine.layout import address_of, addresses, engine_function
-from codrl_mj.engine.memory import copy_bytes, count_on, f64, internal
+from codrl_mj.engine.memory import copy_bytes, f64, internal
 from codrl_mj.kept import njit
 from codrl_mj.physics.mujoco_single import ARM, MujocoPhysics
+from codrl_mj.physics.sharing import apart
+from codrl_mj.physics.stepping import Places
 
 STATE = mujoco.mjtState
 INTEGRATION = int(STATE.mjSTATE_INTEGRATION)
@@ -33,8 +32,7 @@ _MOVING = {
     "plugin_state": STATE.mjSTATE_PLUGIN,
 }
 """Parts of MuJoCo's state that an environment step changes; nobody changes the others."""
-_AT_ONCE = 64
-"""Rows that a thread takes at most; and integration steps of a thread's that are worth waking it."""
+_MEMORY = Places._fields.index("memory")
 
 
 class Rows(NamedTuple):
@@ -56,12 +54,11 @@ class Lane(NamedTuple):
     and bytes of a value; shape (f, 4)."""
     parts: np.ndarray
     """For each part of the state: its address in the data, its first entry in a row, its length; shape (p, 3)."""
-    model: int
-    data: int
+    places: np.ndarray
+    """The simulation's, see `codrl_mj.physics.stepping`."""
     settings: np.ndarray
-    memory: np.ndarray
+    """Its own, as the next."""
     trace: np.ndarray
-    """These are the simulation's arguments, see `codrl_mj.physics.stepping`."""
 
 
 def part(model: mujoco.MjModel, name: str) -> slice:
@@ -73,15 +70,18 @@ def part(model: mujoco.MjModel, name: str) -> slice:
 
 def lane(physics: MujocoPhysics, data: mujoco.MjData, fields: Mapping[str, np.ndarray]) -> Lane:
     """The lane of other data, with a model of its own, for simulations like this one; the rows have these fields."""
-    _, _, settings, memory, trace = physics.arguments
     rows = [
         (address_of(data.model, name), rows.ctypes.data, rows.strides[0], rows[0].nbytes)
         for name, rows in fields.items()
     ]
     parts = [(name, part(data.model, name)) for name in _MOVING]
     live = [(address_of(data, name), one.start, one.stop - one.start) for name, one in parts]
-    own = settings.copy(), memory, trace.copy()
-    return Lane(np.array(rows, np.int64).reshape(-1, 4), np.array(live, np.int64), *addresses(data), *own)
+    settings, trace = apart(physics.settings), apart(physics.trace)
+    model, live_data = addresses(data)
+    own = {"settings": settings.ctypes.data, "trace": trace.ctypes.data}
+    places = Places(*physics.places.tolist())._replace(model=model, data=live_data, **own)
+    tables = np.array(rows, np.int64).reshape(-1, 4), np.array(live, np.int64)
+    return Lane(*tables, apart(np.array(places, np.int64)), settings, trace)
 
 
 @internal
@@ -94,8 +94,9 @@ def load_fields(row: int, lane: Lane) -> None:
 
 @internal
 def load(rows: Rows, row: int, lane: Lane) -> None:
-    """Make the lane's simulation the one of a row, but for its disturbances' memory, which a step is given."""
+    """Make the lane's simulation the one of a row."""
     load_fields(row, lane)
+    lane.places[_MEMORY] = rows.memory.ctypes.data + row * rows.memory.strides[0]
     state = rows.states.ctypes.data + row * rows.states.strides[0]
     for which in range(len(lane.parts)):
         live, kept = f64(lane.parts[which, 0]), f64(state + 8 * lane.parts[which, 1])
@@ -124,54 +125,7 @@ def derive_fields(rows: np.ndarray, lane: Any, derived: np.ndarray) -> None:
     lane = Lane(*lane)
     for row in rows:
         load_fields(row, lane)
-        _set_const(lane.model, lane.data)
+        _set_const(lane.places[0], lane.places[1])
         for field in derived:
             source, first, stride, size = lane.fields[field]
             copy_bytes(first + row * stride, source, size)
-
-
-CLAIMED, DONE, BROKEN = range(3)
-"""What a tally counts: rows that a thread has taken, rows that are done, simulations no longer of numbers."""
-
-
-@internal
-def tallied(tally: np.ndarray, entry: int, more: int) -> int:
-    """Count so many more; returns what was counted before, as the first of the rows that a thread claims."""
-    return count_on(tally[entry:].ctypes.data, more)
-
-
-@njit(nogil=True)
-def _await(tally: np.ndarray, count: int) -> bool:
-    """Whether all rows are done, after a short wait for others."""
-    patience = 2000
-    while patience and tallied(tally, DONE, 0) != count:
-        patience -= 1
-    return patience > 0
-
-
-@functools.cache
-def _threads(count: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(count)
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_threads.cache_clear)  # threads do not survive it
-
-
-def share(function: Any, lanes: Sequence[tuple[Any, ...]], count: int, steps: int, *arguments: Any) -> bool:
-    """Do something to so many rows, of `steps` integration steps each, on as many threads as there are lanes.
-
-    `function` is compiled: (tally, rows to claim at once, lane, *arguments) -> nothing. It claims rows until there are
-    none left, so that one that comes late finds nothing to do, and nobody waits for it. Returns whether a simulation is
-    no longer one of numbers.
-    """
-    needed = min(len(lanes), 1 + count * steps // _AT_ONCE)
-    tally = np.zeros(3, np.int64)
-    at_once = count if needed == 1 else max(1, min(_AT_ONCE, count // (8 * needed)))
-    others = [_threads(len(lanes) - 1).submit(function, tally, at_once, one, *arguments) for one in lanes[1:needed]]
-    function(tally, at_once, lanes[0], *arguments)
-    if others and not _await(tally, count):
-        for one in others:
-            if not one.cancel():
-                one.result()
-    return bool(tally[BROKEN])

@@ -1,9 +1,8 @@
 """One environment step of one simulation in MuJoCo, compiled: the engine's step with what comes before and after it.
 
-A compiled function knows a simulation by its `arguments`: (address of the model, address of the data, settings,
-memory, trace). `settings` has a row for each actuator, a `Wiring` and then a disturber's `Numbers`; `memory` is a
-disturber's, a row for each actuator; `trace` that of `Physics`. They are live: what changes them changes the
-simulation.
+A compiled function knows a simulation by one number, `where`: the address of its `Places`. `settings` has a row for
+each actuator, a `Wiring` and then a disturber's `Numbers`; `memory` is a disturber's, a row for each actuator; `trace`
+that of `Physics`. They are live: what changes them changes the simulation.
 """
 
 import functools
@@ -18,8 +17,8 @@ from codrl_mj.actuators import Family
 from codrl_mj.disturbances import OFF
 from codrl_mj.engine.doors import user_of
 from codrl_mj.engine.families import HEAD, Slot, compiled_observe, load_family, signals_at
-from codrl_mj.engine.layout import DATA, MODEL, engine_function
-from codrl_mj.engine.memory import on_stack, row_as
+from codrl_mj.engine.layout import DATA, MODEL, addresses, engine_function
+from codrl_mj.engine.memory import f64, i64, internal, on_stack, row_as
 from codrl_mj.kept import njit
 from codrl_mj.physics.base import Plant
 from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_fine
@@ -46,19 +45,54 @@ class Wiring(NamedTuple):
 WIRING = len(Wiring._fields)
 
 
+class Places(NamedTuple):
+    """Where a simulation is: an int64 array, which must live as long as it."""
+
+    model: int
+    """An address, as the next four."""
+    data: int
+    settings: int
+    memory: int
+    trace: int
+    actuators: int
+    """How many, and what the arrays have of each."""
+    of_settings: int
+    of_memory: int
+    inner_steps: int
+    columns: int
+    """Of the trace."""
+
+
+def places_of(data: Any, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray) -> np.ndarray:
+    """The `Places` of a simulation, by its `MjData`; all of them are contiguous, and stay the caller's."""
+    each = (one.ctypes.data for one in (settings, memory, trace))
+    sizes = *settings.shape, memory.shape[-1], len(trace), trace.shape[-1]
+    return np.array(Places(*addresses(data), *each, *sizes), np.int64)
+
+
+@internal
+def simulation_at(where: int) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
+    """Addresses of model and data of the simulation at an address, settings, memory and trace."""
+    at = i64(where)
+    found = Places(at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7], at[8], at[9])
+    settings = numba.carray(f64(found.settings), (found.actuators, found.of_settings))
+    memory = numba.carray(f64(found.memory), (found.actuators, found.of_memory))
+    trace = numba.carray(f64(found.trace), (found.inner_steps, found.actuators, found.columns))
+    return found.model, found.data, settings, memory, trace
+
+
 class Stepping(NamedTuple):
-    """Compiled functions; `arguments` are those of the module's docstring."""
+    """Compiled functions; `where` is that of the module's docstring."""
 
     step: Compiled
-    """(force, *arguments) -> whether the state is still one of numbers within `LARGEST`: takes one environment step
+    """(force, where) -> whether the state is still one of numbers within `LARGEST`: takes one environment step
     under a desired force [N or N*m], or under several, an array (n,). What the actuators did is in `trace`."""
     start: Compiled
-    """(state (n,), key, *arguments but the last) -> nothing: starts an episode, as `Physics.reset` does."""
+    """(state (n,), key, where) -> nothing: starts an episode, as `Physics.reset` does."""
     read: Compiled
-    """(state (n,), address of the data) -> nothing: fills `state` with the present one."""
+    """(state (n,), where) -> nothing: fills `state` with the present one."""
     observed: Compiled
-    """(row of trace (n, c), seen (n, k), *the first three arguments) -> nothing: fills `seen` with what the sensors say
-    at present."""
+    """(row of trace (n, c), seen (n, k), where) -> nothing: fills `seen` with what the sensors say at present."""
 
 
 def compiled_stepping(plant: Plant) -> Stepping:
@@ -100,7 +134,8 @@ def _stepping(
     observe = compiled_observe(family) if family.OBSERVED else None
 
     @njit(nogil=True, error_model="numpy")
-    def step(force: Any, model: int, data: int, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray) -> bool:
+    def step(force: Any, where: int) -> bool:
+        model, data, settings, memory, trace = simulation_at(where)
         timestep = MODEL.opt.timestep(model)
         qpos, qvel, ctrl, act = DATA.qpos(data), DATA.qvel(data), DATA.ctrl(data), DATA.act(data)
         state = numba.carray(on_stack(size), size)
@@ -137,14 +172,8 @@ def _stepping(
         return is_fine(state)
 
     @njit(nogil=True, error_model="numpy")
-    def start(
-        state: np.ndarray,
-        key: float,
-        model: int,
-        data: int,
-        settings: np.ndarray,
-        memory: np.ndarray,
-    ) -> None:
+    def start(state: np.ndarray, key: float, where: int) -> None:
+        model, data, settings, memory, _ = simulation_at(where)
         engine_reset(model, data)
         qpos, qvel = DATA.qpos(data), DATA.qvel(data)
         for entry in range(len(positions)):
@@ -159,11 +188,13 @@ def _stepping(
                 memory[actuator, memory.shape[1] + KEY_COLUMN] = key + actuator
 
     @njit(nogil=True, error_model="numpy")
-    def read(state: np.ndarray, data: int) -> None:
+    def read(state: np.ndarray, where: int) -> None:
+        _, data, _, _, _ = simulation_at(where)
         read_state(DATA.qpos(data), DATA.qvel(data), state)
 
     @njit(nogil=True, error_model="numpy")
-    def observed(row: np.ndarray, seen: np.ndarray, model: int, data: int, settings: np.ndarray) -> None:
+    def observed(row: np.ndarray, seen: np.ndarray, where: int) -> None:
+        model, data, settings, _, _ = simulation_at(where)
         if observe is not None:
             for actuator in range(len(settings)):
                 wiring = row_as(settings[actuator], Wiring)
