@@ -67,6 +67,7 @@ class Motors:
         meant = {index: one for pattern, one in settings.commands.items() for index in matched_by(pattern, names)}
         nominal = {index: meant[index].actuator if index in meant else one for index, one in self.present.items()}
         self._slots = list(slots(data, self.present).values())
+        self._warnings = data.warning.number[_POSITION:]  # live
         asked = {index: None if forced else meant.get(index) for index in self.present}
         self._commands = ControlCommands(data, actions, asked, settings.disturbances, step_duration)
         self.action_space = self._commands.action_space
@@ -128,10 +129,9 @@ class Motors:
 
     def check_finite(self, who: str, time: float) -> None:
         """Raise if the engine met what is no number, or too large a one; it would start anew and go on."""
-        counts, model = self.data.warning.number, self.data.model
-        if not np.count_nonzero(counts[_POSITION:]):  # since the reset; any() takes six times as long
+        if not np.count_nonzero(self._warnings):  # since the reset; any() takes six times as long
             return
-        kind = _POSITION + int(np.argmax(counts[_POSITION:]))
+        kind, model = _POSITION + int(np.argmax(self._warnings)), self.data.model
         place = int(self.data.warning.lastinfo[kind])
         if kind == mujoco.mjtWarning.mjWARN_BADCTRL:
             what = f"control {place}"
