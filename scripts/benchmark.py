@@ -137,8 +137,10 @@ def groups() -> dict[str, Makers]:
         apart = task in APART
         members = [partial(subjects.raw_batch, task, NUM_ENVS, 2, apart), partial(subjects.vector, task, NUM_ENVS, 2)]
         found[f"two threads: {task}"] = members
-    sizes = [(num_envs, threads) for num_envs in (1024, 1, 64, 16384) for threads in (1, 2)]
-    found["sizes: pendulum"] = [partial(subjects.vector, "pendulum", *size) for size in sizes]
+    cores = sorted({1, 2, os.cpu_count() or 1})
+    sizes = [(num_envs, threads) for num_envs in (NUM_ENVS, 1, 64, 16_384, 100_000) for threads in cores]
+    for task in TASKS:
+        found[f"sizes: {task}"] = [partial(subjects.vector, task, *size) for size in sizes]
     for task in ("cartpole", "mountain_car"):
         found[f"drawing: {task}"] = [partial(subjects.drawing, task, fast) for fast in (False, True)]
     return found

@@ -1,5 +1,6 @@
 """Settings and fixtures of the whole suite."""
 
+import gc
 import os
 
 import hypothesis
@@ -29,6 +30,12 @@ def pytest_collection_modifyitems(items):
             task = parameters.params.get("task")
             if isinstance(task, str) and task in OURS and task not in REPRESENTATIVES:
                 item.add_marker(pytest.mark.matrix)
+
+
+def pytest_collection_finish():
+    """Spare the collector what lives as long as the process: thousands of tests, and all that they import."""
+    gc.collect()
+    gc.freeze()
 
 
 def _remove_callbacks():

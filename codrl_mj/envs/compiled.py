@@ -38,7 +38,7 @@ from codrl_mj.envs.setup import Setup
 from codrl_mj.kept import njit
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
 from codrl_mj.physics.rows import Lane, Rows, load, store
-from codrl_mj.physics.sharing import Shared, shared
+from codrl_mj.physics.sharing import shared
 from codrl_mj.physics.stepping import Stepping, simulation_at
 
 NEEDS_KEY, FIRST_OPTION = 0, 1
@@ -81,8 +81,8 @@ class Kernels(NamedTuple):
     reset: Compiled
     """(generator, low, high, observation, *arguments) -> nothing: starts an episode from a state that the numpy
     `Generator` draws between `low` and `high` (see `Task.bounds`), and fills the observation."""
-    step_rows: Shared
-    """`step` for every row; its arguments are (rows, options, `VectorStep`)."""
+    step_rows: Compiled
+    """`step` for every row, by threads that share them; its arguments are (rows, options, `VectorStep`)."""
     observe_rows: Compiled
     """(which (m,), lane, rows, observations (N, k)) -> nothing: observes rows where episodes start."""
 

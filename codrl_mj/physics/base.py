@@ -105,8 +105,8 @@ class Physics(abc.ABC):
 
     stepping: Any = None
     """The compiled functions of a loop (see `codrl_mj.physics.stepping.Stepping`); None where a step is Python."""
-    arguments: tuple[Any, ...] = ()
-    """Their last arguments; none where there are none."""
+    where: int = 0
+    """Their last argument, an address; 0 where there are none."""
     scene: tuple[Any, Any] | None = None
     """The `mujoco.MjModel` and `mujoco.MjData` that it runs on; None where there are none."""
 

@@ -15,7 +15,7 @@ from codrl_mj.physics.disturber import Disturber
 from codrl_mj.physics.mjcf import flags_with_friction
 from codrl_mj.physics.mujoco_single import MujocoPhysics
 from codrl_mj.physics.rows import Rows, derive_fields, lane, part
-from codrl_mj.physics.sharing import Shared, new_board, share
+from codrl_mj.physics.sharing import new_board, share
 from codrl_mj.physics.stepping import NOISE_KEY
 from codrl_mj.physics.variation import Variation, bare_model, field_of, mounting_of, write_fields
 
@@ -147,7 +147,7 @@ class MujocoBatchPhysics:
                 self._act[rows, int(one.act) + NOISE_KEY] = keys + at
         self._disturber.reset(rows, keys)
 
-    def step(self, kernel: Shared, options: int, steps: Any) -> bool:
+    def step(self, kernel: Any, options: int, steps: Any) -> bool:
         """Take an environment step of every simulation; `kernel` is `Kernels.step_rows` of `codrl_mj.envs.compiled`.
 
         Returns whether one of them is no longer one of numbers.

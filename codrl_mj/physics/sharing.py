@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Sequence
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +48,23 @@ def _counted(board: np.ndarray, entry: int, more: int) -> int:
 
 
 @internal
+def _begun(board: np.ndarray) -> int:
+    """Begin a turn."""
+    board[CLAIMED] = board[BROKEN] = 0
+    return _counted(board, TURN, 1) + 1
+
+
+@internal
+def _ended(board: np.ndarray) -> bool:
+    """End it; whether nobody helps in it any more, after a short wait."""
+    _counted(board, TURN, 1)
+    patience = _PATIENCE
+    while patience and _counted(board, HELPING, 0):
+        patience -= 1
+    return patience > 0
+
+
+@internal
 def _joined(board: np.ndarray, last: int) -> int:
     """The turn that a thread now helps in, other than its last; 0 if none began in a short while."""
     for _ in range(_PATIENCE):
@@ -60,21 +77,12 @@ def _joined(board: np.ndarray, last: int) -> int:
     return 0
 
 
-class Shared(NamedTuple):
-    """What is done to rows, by threads that share them; the first arguments are (board, rows, threads, a lane)."""
+def shared(do: Compiled) -> Compiled:
+    """What shares rows: (whether it leads, board, rows, threads, lane, arguments) -> whether nobody helps any more.
 
-    lead: Compiled
-    """Begins a turn, takes part and ends it; returns whether no thread helps any more, after a short wait."""
-    help: Compiled
-    """Helps in turns as they come, until none has begun in a short while: nothing of the interpreter is needed for the
-    next one."""
-
-
-def shared(do: Compiled) -> Shared:
-    """Of a compiled function (first row, last and past it, lane, *arguments) -> simulations no longer of numbers.
-
-    Threads claim rows until there are none left, fewer the fewer are left: nobody waits long for another, or at all for
-    one that comes late.
+    It leads one turn; or it helps in turns as they come, until none has begun in a short while. `do` is a compiled
+    function (first row, last and past it, lane, *arguments) -> simulations no longer of numbers. Threads claim rows
+    until there are none left, fewer the fewer are left: nobody waits long for another, or at all for one that is late.
     """
 
     @internal
@@ -88,25 +96,17 @@ def shared(do: Compiled) -> Shared:
                 _counted(board, BROKEN, do(first, min(first + more, count), lane, *arguments))
 
     @njit(nogil=True, error_model="numpy")
-    def lead(board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any) -> bool:
-        board[CLAIMED] = board[BROKEN] = 0
-        _counted(board, TURN, 1)
-        work(board, count, threads, lane, arguments)
-        _counted(board, TURN, 1)
-        patience = _PATIENCE
-        while patience and _counted(board, HELPING, 0):
-            patience -= 1
-        return patience > 0
-
-    @njit(nogil=True, error_model="numpy")
-    def help_out(board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any) -> None:
-        turn = _joined(board, 0)
+    def take_part(leads: bool, board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any) -> bool:
+        turn = _begun(board) if leads else _joined(board, 0)
         while turn:
             work(board, count, threads, lane, arguments)
+            if leads:
+                return _ended(board)
             _counted(board, HELPING, -1)
             turn = _joined(board, turn)
+        return False
 
-    return Shared(lead, help_out)
+    return take_part
 
 
 class _Worker:
@@ -122,7 +122,7 @@ class _Worker:
     def _work(self) -> None:
         while (task := self.tasks.get()) is not None:
             function, board, *arguments = task
-            function(board, *arguments)
+            function(False, board, *arguments)
             if self.board is board:
                 self.board = None
             del task, board, arguments  # which would be kept for as long as it sleeps
@@ -141,8 +141,8 @@ def _dismiss() -> None:
         worker.thread.join()
 
 
-def share(function: Shared, board: np.ndarray, lanes: Sequence[Any], count: int, steps: int, *arguments: Any) -> bool:
-    """Do something to so many rows, of `steps` integration steps each, on as many threads as there are lanes.
+def share(function: Compiled, board: np.ndarray, lanes: Sequence[Any], count: int, steps: int, *arguments: Any) -> bool:
+    """Do what is `shared` to so many rows, of `steps` integration steps each, on as many threads as there are lanes.
 
     Whoever has a board gives the same lanes and arguments with it each time. Returns whether a simulation is no longer
     one of numbers.
@@ -153,8 +153,8 @@ def share(function: Shared, board: np.ndarray, lanes: Sequence[Any], count: int,
             _WORKERS.append(_Worker())
         if (worker := _WORKERS[at]).board is not board:
             worker.board = board
-            worker.tasks.put((function.help, board, count, threads, lanes[at + 1], arguments))
-    alone = function.lead(board, count, threads, lanes[0], arguments)
+            worker.tasks.put((function, board, count, threads, lanes[at + 1], arguments))
+    alone = function(True, board, count, threads, lanes[0], arguments)
     while not alone:
         time.sleep(1e-5)  # whoever still helps may need this CPU
         alone = board[HELPING] == 0

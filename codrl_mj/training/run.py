@@ -63,6 +63,8 @@ def train(
     import torch
 
     importlib.import_module("matplotlib.figure")  # what is missing is missed now and not in the end
+    from stable_baselines3.common.logger import Logger
+
     from codrl_mj.envs.sb3 import ActuatedVecEnv
     from codrl_mj.training.watcher import LearningEnded, Watcher
 
@@ -78,6 +80,7 @@ def train(
                 steps = config.total_steps
                 if steps is None:  # those of the longest possible episodes where these are counted
                     steps = (config.total_episodes or 0) * (config.env.time_limit or 0) * config.num_envs
+                model.set_logger(Logger(None, []))  # until the watcher's: the default makes a folder in the system's
                 with contextlib.suppress(LearningEnded):
                     model.learn(steps, callback=watcher, log_interval=None)
                 watcher.finish()

@@ -195,10 +195,12 @@ def test_tensorboard_gets_returns_and_losses(run):
     assert "train/value_loss" in events.Tags()["scalars"]
 
 
-def test_without_tensorboard_there_are_no_events(tmp_path, monkeypatch):
+def test_without_tensorboard_there_are_no_events_and_nothing_lies_anywhere_else(tmp_path, monkeypatch):
+    monkeypatch.setenv("SB3_LOGDIR", str(tmp_path / "theirs"))  # where Stable-Baselines3 would make a folder
     assert not (train(TINY, tmp_path / "run", tensorboard=False) / "tensorboard").exists()
     monkeypatch.setattr("stable_baselines3.common.logger.SummaryWriter", None)  # as if it were not installed
     assert (train(TINY, tmp_path / "other") / "result.json").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "other"}
 
 
 def test_weights_and_biases_gets_the_configuration(tmp_path, monkeypatch):
