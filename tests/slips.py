@@ -281,8 +281,7 @@ def run(face: str, made: Any, actuator: Any = "ideal", **options: Any) -> None:
         from codrl_mj.envs.compiled import compiled_env
 
         if (parts := compiled_env(env.unwrapped)) is not None:
-            seen = np.empty(env.observation_space.shape, np.float32)
-            parts.reset(env.unwrapped.np_random, parts.low, parts.high, seen, *parts.arguments)
+            parts.reset(env.unwrapped.np_random, parts.low, parts.high, parts.where)
     elif face == "vector":
         envs = gymnasium.make_vec(made.env_id, 3, vectorization_mode="vector_entry_point", actuator=actuator, **options)
         envs.reset(seed=0)

@@ -25,7 +25,7 @@ from codrl_mj.agents.tile_coding import (
     make_coder,
 )
 from codrl_mj.envs import ActuatedVectorEnv
-from codrl_mj.envs.compiled import arguments, compiled_kernels
+from codrl_mj.envs.compiled import bound, compiled_kernels
 from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.kept import njit
 from codrl_mj.physics.streams import set_words, words_of
@@ -150,7 +150,7 @@ def run_episode(
     observation: np.ndarray,
     record: np.ndarray,
     row: np.ndarray,
-    arguments: tuple[int, int],
+    where: int,
 ) -> tuple[float, int, bool, bool]:
     """Learn from an episode of an environment's compiled `step`, from its first observation (k,), which gets the last.
 
@@ -161,7 +161,7 @@ def run_episode(
     total, length, terminated = 0.0, 0, False
     while not terminated and length < len(record):
         force = forces[action]
-        reward, terminated, fine = step(force, observation, *arguments)
+        reward, terminated, fine = step(force, where)
         if not fine:
             return total, length, False, False
         record[length] = row
@@ -233,7 +233,7 @@ class CompiledEpisodes:
         vector: Any = env.env
         self._physics: Any = vector.setup.simulate()
         self._step = compiled_kernels(vector.setup, self._physics).step
-        self._arguments = arguments(vector.setup, self._physics)
+        self._where, self._observation = bound(vector.setup, self._physics)
         self._forces = vector.setup.commands.action_forces
         self._record = np.empty((vector.max_episode_steps, self._physics.trace.shape[2]))
 
@@ -263,17 +263,17 @@ class CompiledEpisodes:
         self._physics.reset(np.zeros(len(setup.task.state_names)))  # sees to the callbacks
         self._physics.restore(start["physics"][0])
         self._physics.memory[:] = start.get("disturbances", np.zeros((1, 0)))[0]
-        observation = start["observations"][0].copy()
+        self._observation[:] = start["observations"][0]
         total, length, terminated, fine = run_episode(
-            *(learner, generator, self._step, self._forces, observation, self._record),
+            *(learner, generator, self._step, self._forces, self._observation, self._record),
             self._physics.trace[-1, 0],
-            self._arguments,
+            self._where,
         )
         if not fine:
             self._physics.check_finite()
         columns = self._record[:length].T.copy()
         signals = setup.signals(columns, columns[0])
-        observations, infos = self.env.conclude(observation, total, length, not terminated, signals)
+        observations, infos = self.env.conclude(self._observation.copy(), total, length, not terminated, signals)
         return length, observations, np.array([total], dtype=np.float32), np.array([True]), infos, signals
 
 

@@ -53,7 +53,9 @@ def _pointer(element: Any) -> Any:
     return pointer
 
 
-f64, i32, i64, u8, u64 = map(_pointer, (types.float64, types.int32, types.int64, types.uint8, types.uint64))
+f64, f32, i32, i64, u8, u64 = map(
+    _pointer, (types.float64, types.float32, types.int32, types.int64, types.uint8, types.uint64)
+)
 
 
 def symbol(name: str, address: int) -> Any:

@@ -94,12 +94,12 @@ class TaskCommands:
             if not (0 <= action < len(forces) if plain else self.action_space.contains(action)):
                 raise ValueError(f"action = {action!r}: not in {self.action_space}")
             return forces.item(int(action)) if forces.ndim == 1 else forces[int(action)]
-        array, (limit, scale, count) = np.asarray(action), self._box
-        if array.shape != (count,) or array.dtype.kind != "f":
-            raise ValueError(f"action = {action!r}: not in {self.action_space}")
-        if count == 1 and -limit <= (command := float(array[0])) <= limit:  # quickly
+        limit, scale, count = self._box
+        alone = count == 1 and type(action) is np.ndarray and action.shape == (1,)
+        if alone and type(command := action.item()) is float and -limit <= command <= limit:  # quickly
             return command * scale
-        if np.isnan(array).any():
+        array = np.asarray(action)
+        if array.shape != (count,) or array.dtype.kind != "f" or np.isnan(array).any():
             raise ValueError(f"action = {action!r}: not in {self.action_space}")
         forces = np.clip(array.astype(np.float64), -limit, limit) * scale
         return float(forces[0]) if count == 1 else forces

@@ -5,19 +5,18 @@
     parts = compiled_env(env.unwrapped)  # None where this cannot be
 
     @njit(nogil=True)
-    def episode(step, reset, forces, generator, low, high, observation, arguments):
-        reset(generator, low, high, observation, *arguments)
+    def episode(step, reset, forces, generator, low, high, observation, where):
+        reset(generator, low, high, where)
         total, ended = 0.0, False
         while not ended:
             action = ...  # from observation
-            outcome = step(forces[action], observation, *arguments)
+            outcome = step(forces[action], where)
             total, ended = total + outcome[0], outcome[1] or not outcome[2]
         return total
 
     env.reset(seed=0)  # seeds the generator, and makes sure that our callbacks are installed
-    observation = np.empty(env.observation_space.shape, np.float32)
-    episode(parts.step, parts.reset, parts.forces, env.unwrapped.np_random, parts.low, parts.high, observation,
-            parts.arguments)
+    episode(parts.step, parts.reset, parts.forces, env.unwrapped.np_random, parts.low, parts.high, parts.observation,
+            parts.where)
 
 What it does is what `env.unwrapped` would do, bit for bit, and it leaves the environment where it ends. The time limit
 is a wrapper's, and the loop's to keep. The environment must outlive the calls.
@@ -33,13 +32,13 @@ from numba import types
 
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.engine.families import compiled_function
-from codrl_mj.engine.memory import f64, floats, internal, on_stack
+from codrl_mj.engine.memory import f32, f64, floats, i64, internal, on_stack
 from codrl_mj.envs.setup import Setup
 from codrl_mj.kept import njit
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
 from codrl_mj.physics.rows import Lane, Rows, load, store
 from codrl_mj.physics.sharing import shared
-from codrl_mj.physics.stepping import Stepping, simulation_at
+from codrl_mj.physics.stepping import OBSERVATION, OPTIONS, Stepping, simulation_at
 
 NEEDS_KEY, FIRST_OPTION = 0, 1
 """In `options`: whether an episode's disturbances or sensors need a key, and the first of the task's options."""
@@ -69,18 +68,15 @@ class VectorStep(NamedTuple):
 
 
 class Kernels(NamedTuple):
-    """Compiled functions.
-
-    Their `arguments` are addresses: of the options, and of the simulation, the `where` of `codrl_mj.physics.stepping`.
-    """
+    """Compiled functions; `where` is that of `codrl_mj.physics.stepping`."""
 
     step: Compiled
-    """(force, observation (k,) float32, *arguments) -> (reward, terminated, fine): takes one environment step under a
-    desired force [N or N*m], or several, an array (n,), and fills the observation. `fine` says whether the simulation
-    is still one of numbers; if not, the environment must be reset. What the actuators did is in the trace."""
+    """(force, where) -> (reward, terminated, fine): takes one environment step under a desired force [N or N*m], or
+    several, an array (n,), and fills the observation. `fine` says whether the simulation is still one of numbers; if
+    not, the environment must be reset. What the actuators did is in the trace."""
     reset: Compiled
-    """(generator, low, high, observation, *arguments) -> nothing: starts an episode from a state that the numpy
-    `Generator` draws between `low` and `high` (see `Task.bounds`), and fills the observation."""
+    """(generator, low, high, where) -> nothing: starts an episode from a state that the numpy `Generator` draws between
+    `low` and `high` (see `Task.bounds`), and fills the observation."""
     step_rows: Compiled
     """`step` for every row, by threads that share them; its arguments are (rows, options, `VectorStep`)."""
     observe_rows: Compiled
@@ -94,8 +90,10 @@ class CompiledEnv(NamedTuple):
     """See `Kernels.step`."""
     reset: Compiled
     """See `Kernels.reset`."""
-    arguments: tuple[int, int]
-    """The last arguments of both."""
+    where: int
+    """The last argument of both."""
+    observation: np.ndarray
+    """What they fill, shape (k,), float32: live, and the environment's own too."""
     trace: np.ndarray
     """What the actuators did in the last step, shape (motors, columns): live; see `codrl_mj.physics.trace_names`."""
     forces: np.ndarray | None
@@ -119,13 +117,22 @@ def compiled_env(env: Any) -> CompiledEnv | None:
     kernels, task = compiled_kernels(setup, physics), setup.task
     compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])
     low, high = setup.initial_bounds
-    parts = kernels.step, kernels.reset, arguments(setup, physics), physics.trace[-1]
+    parts = kernels.step, kernels.reset, *bound(setup, physics), physics.trace[-1]
     return CompiledEnv(*parts, setup.commands.action_forces, low, high)
 
 
-def arguments(setup: Setup, physics: Any) -> tuple[int, int]:
-    """The last arguments of an environment's kernels, of a simulation whose steps are compiled."""
-    return _options(float(setup.random), *setup.config.options).ctypes.data, physics.where
+def bound(setup: Setup, physics: Any) -> tuple[int, np.ndarray]:
+    """The address of a simulation whose steps are compiled, and the observation that they fill, which is its own."""
+    if physics.observation is None:
+        physics.observation = np.empty(setup.observation_space.shape or (), np.float32)
+    physics.places[OBSERVATION] = physics.observation.ctypes.data
+    physics.places[OPTIONS] = options_of(setup)
+    return physics.where, physics.observation
+
+
+def options_of(setup: Setup) -> int:
+    """The address of a set-up's options."""
+    return _options(float(setup.random), *setup.config.options).ctypes.data
 
 
 @functools.cache
@@ -139,8 +146,8 @@ def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
     task = setup.task
     sensors = len(setup.plant.family.OBSERVED) if setup.sensors else 0
     single, size = len(task.motors) == 1, len(task.state_names)
-    options = len(setup.config.options)
-    return _kernels(physics.stepping, compiled_outcomes(task), task.initial_state, size, single, sensors, options)
+    sizes = size, len(setup.observation_names), len(setup.config.options)
+    return _kernels(physics.stepping, compiled_outcomes(task), task.initial_state, single, sensors, *sizes)
 
 
 @functools.cache
@@ -148,10 +155,11 @@ def _kernels(
     stepping: Stepping,
     outcomes: Outcomes,
     initial_state: Callable[..., Any],
-    size: int,
     single: bool,
     sensors: int,
-    options_count: int,
+    size: int,
+    seen_size: int,
+    options_size: int,
 ) -> Kernels:
     advance, start, read, observed = stepping
     observe, rewarded, ended = outcomes.observe, outcomes.reward, outcomes.terminated
@@ -159,7 +167,8 @@ def _kernels(
     initial_entries = internal(initial_state)
 
     @internal
-    def look(row: np.ndarray, observation: np.ndarray, state: np.ndarray, where: int) -> None:
+    def look(row: np.ndarray, state: np.ndarray, where: int) -> None:
+        observation = numba.carray(f32(i64(where)[OBSERVATION]), seen_size)
         read(state, where)
         observe(state, observation)
         if sensors > 0:
@@ -171,45 +180,40 @@ def _kernels(
                     observation[first + motor * sensors + entry] = seen[motor, entry]
 
     @compiled
-    def step(force: Any, observation: np.ndarray, options: int, where: int) -> tuple[float, bool, bool]:
+    def step(force: Any, where: int) -> tuple[float, bool, bool]:
         before, after = numba.carray(on_stack(size), size), numba.carray(on_stack(size), size)
         read(before, where)
         fine = advance(force, where)
         trace = simulation_at(where)[4]
         last = trace[len(trace) - 1]
-        look(last, observation, after, where)
-        own = numba.carray(f64(options + 8 * FIRST_OPTION), options_count)
+        look(last, after, where)
+        own = numba.carray(f64(i64(where)[OPTIONS] + 8 * FIRST_OPTION), options_size)
         if single:  # decided where it is compiled: one is a number, several are an array
             return rewarded(before, last[0, 1], after, own), ended(after), fine
         return rewarded(before, last[:, 1], after, own), ended(after), fine
 
     @compiled
-    def reset(
-        generator: np.random.Generator,
-        low: np.ndarray,
-        high: np.ndarray,
-        observation: np.ndarray,
-        options: int,
-        where: int,
-    ) -> None:
+    def reset(generator: np.random.Generator, low: np.ndarray, high: np.ndarray, where: int) -> None:
         draws, state = np.empty(len(low)), np.empty(size)
         for entry in range(len(low)):
             draws[entry] = low[entry] + (high[entry] - low[entry]) * generator.random()
         entries = floats(initial_entries(draws))
         for entry in range(size):
             state[entry] = entries[entry]
-        key = generator.random() * LARGEST_KEY if f64(options)[NEEDS_KEY] != 0.0 else 0.0
+        key = generator.random() * LARGEST_KEY if f64(i64(where)[OPTIONS])[NEEDS_KEY] != 0.0 else 0.0
         start(state, key, where)
-        look(np.zeros(simulation_at(where)[4].shape[1:]), observation, state, where)
+        look(np.zeros(simulation_at(where)[4].shape[1:]), state, where)
 
     @internal
     def step_some(first: int, end: int, lane: Any, rows: Any, options: int, steps: Any) -> int:
         steps, lane, rows, broken = VectorStep(*steps), Lane(*lane), Rows(*rows), 0
         stepping, observations, signals, elapsed = steps.stepping, steps.observations, steps.signals, steps.elapsed
         where, last = lane.places.ctypes.data, lane.trace[len(lane.trace) - 1]
+        lane.places[OPTIONS] = options
         for row in range(first, end):
             load(rows, row, lane)
-            reward, over, fine = step(steps.forces[row], observations[row], options, where)
+            lane.places[OBSERVATION] = observations[row].ctypes.data
+            reward, over, fine = step(steps.forces[row], where)
             store(rows, row, lane)
             elapsed[row] += 1
             steps.rewards[row] = reward if stepping[row] else 0.0
@@ -227,6 +231,7 @@ def _kernels(
         nothing, state = np.zeros(lane.trace.shape[1:]), np.empty(size)
         for row in which:
             load(rows, row, lane)
-            look(nothing, observations[row], state, lane.places.ctypes.data)
+            lane.places[OBSERVATION] = observations[row].ctypes.data
+            look(nothing, state, lane.places.ctypes.data)
 
     return Kernels(step, reset, shared(step_some), observe_rows)

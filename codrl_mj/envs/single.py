@@ -9,7 +9,7 @@ import numpy as np
 
 from codrl_mj.actuators import IDEAL
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, written
-from codrl_mj.envs.compiled import arguments, compiled_kernels
+from codrl_mj.envs.compiled import bound, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import Draws, put_into
 from codrl_mj.envs.setup import Setup, alone
@@ -204,9 +204,9 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             if self.physics.stepping is None:
                 return self._step_apart(self.setup.commands.force(action))
             self._compiled = self._parts()
-        force_of, step, seen, options, where, columns, signals = self._compiled
+        force_of, step, where, seen, columns, signals = self._compiled
         force = force_of(action)
-        reward, terminated, fine = step(force, seen, options, where)
+        reward, terminated, fine = step(force, where)
         if not fine:
             self.physics.check_finite()
         if self.render_mode == "human":
@@ -216,9 +216,8 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     def _parts(self) -> tuple[Any, ...]:
         """What a step takes: from action to force, the compiled step with its arguments, and from trace to signals."""
         setup, row = self.setup, self.physics.trace[-1]
-        seen = np.empty(self.observation_space.shape or (), np.float32)
         columns = row[0].tolist if len(row) == 1 else row.T.copy
-        compiled = compiled_kernels(setup, self.physics).step, seen, *arguments(setup, self.physics)
+        compiled = compiled_kernels(setup, self.physics).step, *bound(setup, self.physics)
         return setup.commands.force, *compiled, columns, setup.signals
 
     def _step_apart(self, force: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:

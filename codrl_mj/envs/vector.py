@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, shared, written
-from codrl_mj.envs.compiled import Kernels, VectorStep, arguments, compiled_kernels
+from codrl_mj.envs.compiled import Kernels, VectorStep, compiled_kernels, options_of
 from codrl_mj.envs.randomization import Draws, put_into_batch
 from codrl_mj.envs.setup import set_up_many
 from codrl_mj.envs.snapshots import check_snapshot
@@ -301,8 +301,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 np.empty(1),
                 np.empty((columns, count, motors)),
             )
-            options, _ = arguments(self.setup, self.physics)
-            self._kernels = compiled_kernels(self.setup, self.physics), options, steps
+            self._kernels = compiled_kernels(self.setup, self.physics), options_of(self.setup), steps
         return self._kernels
 
     def _finish(self, infos: dict[str, Any]) -> dict[str, Any]:

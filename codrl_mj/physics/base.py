@@ -107,6 +107,8 @@ class Physics(abc.ABC):
     """The compiled functions of a loop (see `codrl_mj.physics.stepping.Stepping`); None where a step is Python."""
     where: int = 0
     """Their last argument, an address; 0 where there are none."""
+    observation: Any = None
+    """What the compiled steps of an environment fill, where they were asked for: see `codrl_mj.envs.compiled.bound`."""
     scene: tuple[Any, Any] | None = None
     """The `mujoco.MjModel` and `mujoco.MjData` that it runs on; None where there are none."""
 

@@ -2,7 +2,8 @@
 
 A compiled function knows a simulation by one number, `where`: the address of its `Places`. `settings` has a row for
 each actuator, a `Wiring` and then a disturber's `Numbers`; `memory` is a disturber's, a row for each actuator; `trace`
-that of `Physics`. They are live: what changes them changes the simulation.
+that of `Physics`. They are live: what changes them changes the simulation. What an environment has beside it, options
+and observation, is for `codrl_mj.envs.compiled`.
 """
 
 import functools
@@ -49,11 +50,13 @@ class Places(NamedTuple):
     """Where a simulation is: an int64 array, which must live as long as it."""
 
     model: int
-    """An address, as the next four."""
+    """An address, as the next six."""
     data: int
     settings: int
     memory: int
     trace: int
+    options: int
+    observation: int
     actuators: int
     """How many, and what the arrays have of each."""
     of_settings: int
@@ -67,18 +70,21 @@ def places_of(data: Any, settings: np.ndarray, memory: np.ndarray, trace: np.nda
     """The `Places` of a simulation, by its `MjData`; all of them are contiguous, and stay the caller's."""
     each = (one.ctypes.data for one in (settings, memory, trace))
     sizes = *settings.shape, memory.shape[-1], len(trace), trace.shape[-1]
-    return np.array(Places(*addresses(data), *each, *sizes), np.int64)
+    return np.array([*addresses(data), *each, 0, 0, *sizes], np.int64)
 
 
 @internal
 def simulation_at(where: int) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
     """Addresses of model and data of the simulation at an address, settings, memory and trace."""
     at = i64(where)
-    found = Places(at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7], at[8], at[9])
+    found = Places(at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7], at[8], at[9], at[10], at[11])
     settings = numba.carray(f64(found.settings), (found.actuators, found.of_settings))
     memory = numba.carray(f64(found.memory), (found.actuators, found.of_memory))
     trace = numba.carray(f64(found.trace), (found.inner_steps, found.actuators, found.columns))
     return found.model, found.data, settings, memory, trace
+
+
+OPTIONS, OBSERVATION = Places._fields.index("options"), Places._fields.index("observation")
 
 
 class Stepping(NamedTuple):

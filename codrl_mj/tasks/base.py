@@ -246,7 +246,8 @@ class Task(fields.Checked):
 
     def initial(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
         """One initial state, shape (n,): the state that Gymnasium's environment draws from the same generator."""
-        state = np.array(self.initial_state(generator.uniform(*self.bounds(options))))
+        low, high = self.bounds(options)
+        state = np.array(self.initial_state(low + (high - low) * generator.random(len(low))))
         return state.reshape(len(self.state_names))
 
     def initial_states(self, draws: np.ndarray) -> np.ndarray:

@@ -92,11 +92,13 @@ def test_a_step_is_the_plain_composition_of_engine_bounds_and_task(task, kind):
 
 
 @numba.njit
-def _episode(step, reset, forces, chosen, generator, low, high, rows, rewards, arguments):
-    reset(generator, low, high, rows[0], *arguments)
+def _episode(step, reset, forces, chosen, generator, low, high, rows, rewards, observation, where):
+    reset(generator, low, high, where)
+    rows[0] = observation
     for index in range(len(chosen)):
         force = forces[chosen[index]]
-        reward, terminated, fine = step(force, rows[index + 1], *arguments)
+        reward, terminated, fine = step(force, where)
+        rows[index + 1] = observation
         rewards[index] = reward
         if terminated or not fine:
             return index + 1
@@ -120,7 +122,7 @@ def test_a_compiled_loop_is_the_loop_over_the_environment_bit_for_bit(task, kind
         given = list(chosen)
     rows, rewards = np.zeros((51, *ours.observation_space.shape), np.float32), np.zeros(50)
     loop = (forces, chosen, ours.np_random, parts.low, parts.high, rows, rewards)
-    taken = _episode(parts.step, parts.reset, *loop, parts.arguments)
+    taken = _episode(parts.step, parts.reset, *loop, parts.observation, parts.where)
     observation, _ = theirs.reset()
     np.testing.assert_array_equal(rows[0], observation)
     for index in range(taken):
