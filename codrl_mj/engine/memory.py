@@ -108,6 +108,12 @@ def count_on(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.atomic_rmw("add", pointed(builder, arguments[0], ir.IntType(64)), arguments[1], "seq_cst")
 
 
+@emitted(lambda address: types.int64(types.uintp))
+def look(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """The int64 at an address, as other threads have left it."""
+    return builder.load_atomic(pointed(builder, arguments[0], ir.IntType(64)), "seq_cst", 8)
+
+
 @emitted(lambda address, kind: tuple_of(kind.instance_class)(types.uintp, kind))
 def read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     """The named tuple of class `kind` whose entries are the float64 numbers from an address on."""

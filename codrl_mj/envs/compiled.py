@@ -33,15 +33,12 @@ from numba import types
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import f32, f64, floats, i64, internal, on_stack
-from codrl_mj.envs.setup import Setup
+from codrl_mj.envs.setup import FIRST_OPTION, NEEDS_KEY, Setup
 from codrl_mj.kept import njit
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
 from codrl_mj.physics.rows import Lane, Rows, load, store
 from codrl_mj.physics.sharing import shared
 from codrl_mj.physics.stepping import OBSERVATION, OPTIONS, Stepping, simulation_at
-
-NEEDS_KEY, FIRST_OPTION = 0, 1
-"""In `options`: whether an episode's disturbances or sensors need a key, and the first of the task's options."""
 
 
 class VectorStep(NamedTuple):
@@ -63,6 +60,8 @@ class VectorStep(NamedTuple):
     """Steps of the present episodes, shape (N,)."""
     limit: np.ndarray
     """Steps after which an episode is truncated, shape (1,)."""
+    options: np.ndarray
+    """As `Setup.options`."""
     signals: np.ndarray
     """The last row of the trace but for its ends, shape (columns, N, motors)."""
 
@@ -78,7 +77,7 @@ class Kernels(NamedTuple):
     """(generator, low, high, where) -> nothing: starts an episode from a state that the numpy `Generator` draws between
     `low` and `high` (see `Task.bounds`), and fills the observation."""
     step_rows: Compiled
-    """`step` for every row, by threads that share them; its arguments are (rows, options, `VectorStep`)."""
+    """`step` for every row, by threads that share them; its arguments are (rows, `VectorStep`)."""
     observe_rows: Compiled
     """(which (m,), lane, rows, observations (N, k)) -> nothing: observes rows where episodes start."""
 
@@ -122,23 +121,11 @@ def compiled_env(env: Any) -> CompiledEnv | None:
 
 
 def bound(setup: Setup, physics: Any) -> tuple[int, np.ndarray]:
-    """The address of a simulation whose steps are compiled, and the observation that they fill, which is its own."""
-    if physics.observation is None:
-        physics.observation = np.empty(setup.observation_space.shape or (), np.float32)
-    physics.places[OBSERVATION] = physics.observation.ctypes.data
-    physics.places[OPTIONS] = options_of(setup)
-    return physics.where, physics.observation
-
-
-def options_of(setup: Setup) -> int:
-    """The address of a set-up's options."""
-    return _options(float(setup.random), *setup.config.options).ctypes.data
-
-
-@functools.cache
-def _options(*numbers: float) -> np.ndarray:
-    """A vector of options, kept for the process's life: compiled code knows it by its address."""
-    return np.array(numbers, dtype=np.float64)
+    """The address of a simulation whose steps are compiled, and the observation that they fill."""
+    _, seen = physics.bound or (None, np.empty(setup.observation_space.shape or (), np.float32))
+    physics.bound = options, seen = setup.options, seen
+    physics.places[OPTIONS], physics.places[OBSERVATION] = options.ctypes.data, seen.ctypes.data
+    return physics.where, seen
 
 
 def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
@@ -205,11 +192,11 @@ def _kernels(
         look(np.zeros(simulation_at(where)[4].shape[1:]), state, where)
 
     @internal
-    def step_some(first: int, end: int, lane: Any, rows: Any, options: int, steps: Any) -> int:
+    def step_some(first: int, end: int, lane: Any, rows: Any, steps: Any) -> int:
         steps, lane, rows, broken = VectorStep(*steps), Lane(*lane), Rows(*rows), 0
         stepping, observations, signals, elapsed = steps.stepping, steps.observations, steps.signals, steps.elapsed
         where, last = lane.places.ctypes.data, lane.trace[len(lane.trace) - 1]
-        lane.places[OPTIONS] = options
+        lane.places[OPTIONS] = steps.options.ctypes.data
         for row in range(first, end):
             load(rows, row, lane)
             lane.places[OBSERVATION] = observations[row].ctypes.data

@@ -23,6 +23,9 @@ from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.variation import bare_model
 from codrl_mj.tasks import Task, find_task
 
+NEEDS_KEY, FIRST_OPTION = 0, 1
+"""In `Setup.options`: whether an episode's disturbances or sensors need a key, and the first of the task's options."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Setup:
@@ -100,6 +103,11 @@ class Setup:
     def initial_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """`Task.bounds` without reset options."""
         return self.task.bounds(None)
+
+    @functools.cached_property
+    def options(self) -> np.ndarray:
+        """What compiled code reads: whether episodes need keys, and the task's options."""
+        return np.array([self.random, *self.config.options], dtype=np.float64)
 
     @functools.cached_property
     def random(self) -> bool:

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, shared, written
-from codrl_mj.envs.compiled import Kernels, VectorStep, compiled_kernels, options_of
+from codrl_mj.envs.compiled import Kernels, VectorStep, compiled_kernels
 from codrl_mj.envs.randomization import Draws, put_into_batch
 from codrl_mj.envs.setup import set_up_many
 from codrl_mj.envs.snapshots import check_snapshot
@@ -119,7 +119,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         if render_mode is not None:
             check_view(self.physics.model, width, height, camera)
         self._renderer: OffscreenRenderer | None = None
-        self._kernels: tuple[Kernels, int, VectorStep] | None = None
+        self._kernels: tuple[Kernels, VectorStep] | None = None
         self.looks: dict[str, Array] = {}  # fields of the models, where attributes were written
         self._offer_attributes(self.task)
 
@@ -267,10 +267,10 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 "call reset(options={'reset_mask': terminated | truncated})"
             )
         stepping = ~self._ended  # in NEXT_STEP mode, environments that ended are reset instead
-        kernels, options, steps = self._compiled()
+        kernels, steps = self._compiled()
         steps.forces[:], steps.stepping[:] = forces, stepping
         steps.limit[0] = np.inf if self.max_episode_steps is None else self.max_episode_steps
-        broken = self.physics.step(kernels.step_rows, options, steps)
+        broken = self.physics.step(kernels.step_rows, steps)
         rewards, terminated, truncated = steps.rewards.copy(), steps.terminated.copy(), steps.truncated.copy()
         columns = steps.signals.reshape(-1, *forces.shape).copy()
         self.signals = signals = self.setup.signals([forces, *columns], forces)
@@ -285,8 +285,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             infos = self._finish(infos)
         return self._observations.copy(), rewards, terminated, truncated, infos
 
-    def _compiled(self) -> tuple[Kernels, int, VectorStep]:
-        """The compiled functions, the address of their options, and what a step is given and fills."""
+    def _compiled(self) -> tuple[Kernels, VectorStep]:
+        """The compiled functions, and what a step is given and fills."""
         if self._kernels is None:
             count, motors = self.num_envs, len(self.task.motors)
             columns = 1 + len(self.setup.plant.family.Signals._fields)
@@ -299,9 +299,10 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 np.empty(count, dtype=bool),
                 self._elapsed,
                 np.empty(1),
+                self.setup.options,
                 np.empty((columns, count, motors)),
             )
-            self._kernels = compiled_kernels(self.setup, self.physics), options_of(self.setup), steps
+            self._kernels = compiled_kernels(self.setup, self.physics), steps
         return self._kernels
 
     def _finish(self, infos: dict[str, Any]) -> dict[str, Any]:

@@ -38,7 +38,8 @@ def signal_names(family: Family) -> tuple[str, ...]:
 def namer(names: tuple[str, ...]) -> Callable[[Any], Signals]:
     """What names the first columns, numbers of one actuator or arrays of several; `saturated`, a flag, is the last.
 
-    Written out, as `namedtuple` is: with a loop it would take a tenth of an environment's step.
+    It is false, in the columns' shape, of a family that has none. Written out, as `namedtuple` is: with a loop it would
+    take a tenth of an environment's step.
     """
     entries = [f"{name!r}: columns[{at}]" for at, name in enumerate(names) if name != "saturated"]
     flag = f"columns[{names.index('saturated')}] > 0.0" if "saturated" in names else "columns[0] < columns[0]"
@@ -107,8 +108,8 @@ class Physics(abc.ABC):
     """The compiled functions of a loop (see `codrl_mj.physics.stepping.Stepping`); None where a step is Python."""
     where: int = 0
     """Their last argument, an address; 0 where there are none."""
-    observation: Any = None
-    """What the compiled steps of an environment fill, where they were asked for: see `codrl_mj.envs.compiled.bound`."""
+    bound: tuple[Any, ...] = ()
+    """An environment's options and observation, which its compiled steps read and fill, where these were asked for."""
     scene: tuple[Any, Any] | None = None
     """The `mujoco.MjModel` and `mujoco.MjData` that it runs on; None where there are none."""
 

@@ -1,7 +1,6 @@
 """Many simulations of a task in MuJoCo at once: rows of arrays, stepped by threads."""
 
 import copy
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -15,7 +14,7 @@ from codrl_mj.physics.disturber import Disturber
 from codrl_mj.physics.mjcf import flags_with_friction
 from codrl_mj.physics.mujoco_single import MujocoPhysics
 from codrl_mj.physics.rows import Rows, derive_fields, lane, part
-from codrl_mj.physics.sharing import new_board, share
+from codrl_mj.physics.sharing import cpus, new_board, share
 from codrl_mj.physics.stepping import NOISE_KEY
 from codrl_mj.physics.variation import Variation, bare_model, field_of, mounting_of, write_fields
 
@@ -57,22 +56,22 @@ class MujocoBatchPhysics:
 
     def _bind(self) -> None:
         """Make data for each thread, and the views that a step uses."""
-        threads = min(self._num_threads or os.cpu_count() or 1, self.num_envs)
+        threads = min(self._num_threads or cpus(), self.num_envs)
         self._data = [mujoco.MjData(copy.copy(self._nominal.model)) for _ in range(threads)]
         self.model, self.data = self._nominal.model, self._nominal.data
-        self.stepping, self.where = self._nominal.stepping, self._nominal.where
+        self.stepping = self._nominal.stepping
         self._lanes: list[tuple[Any, ...]] = []
         parts = {name: part(self.model, name) for name in ("time", "qpos", "qvel", "act")}
         self._time, self._qpos, self._qvel, self._act = (self._states[:, one] for one in parts.values())
         memory = self._disturber.memory
         self._rows = tuple(Rows(self._states, self._arms, memory.reshape(*self._arms.shape, memory.shape[1])))
 
-    def _lane(self, thread: int = 0) -> tuple[Any, ...]:
-        """A thread's lane, for the fields of the models that differ at present."""
+    def _lane(self) -> tuple[Any, ...]:
+        """The first thread's lane, when all are made for the fields of the models that differ at present."""
         if not self._lanes:
             self._lanes = [tuple(lane(self._nominal, data, self._fields)) for data in self._data]
-            self._board = new_board()
-        return self._lanes[thread]
+            self._steps: Any = None
+        return self._lanes[0]
 
     def field(self, name: str) -> np.ndarray:
         """A field of the model with a value for each simulation, shape (N, ...): live, to be written to."""
@@ -147,13 +146,15 @@ class MujocoBatchPhysics:
                 self._act[rows, int(one.act) + NOISE_KEY] = keys + at
         self._disturber.reset(rows, keys)
 
-    def step(self, kernel: Any, options: int, steps: Any) -> bool:
+    def step(self, kernel: Any, steps: Any) -> bool:
         """Take an environment step of every simulation; `kernel` is `Kernels.step_rows` of `codrl_mj.envs.compiled`.
 
         Returns whether one of them is no longer one of numbers.
         """
         self._lane()
-        arguments = self._rows, options, tuple(steps)
+        if steps is not self._steps:  # who helps goes on with what it was first given
+            self._steps, self._board = steps, new_board()
+        arguments = self._rows, tuple(steps)
         return share(kernel, self._board, self._lanes, self.num_envs, self.plant.inner_steps, *arguments)
 
     def observe(self, kernel: Any, rows: np.ndarray, observations: np.ndarray) -> None:
@@ -193,4 +194,7 @@ class MujocoBatchPhysics:
         self._nominal.show(self.state[index])
 
 
-_BOUND = ("model", "data", "stepping", "where", "_data", "_board", "_lanes", "_time", "_qpos", "_qvel", "_act", "_rows")
+_BOUND = (
+    *("model", "data", "stepping", "_data", "_board", "_steps", "_lanes"),
+    *("_time", "_qpos", "_qvel", "_act", "_rows"),
+)

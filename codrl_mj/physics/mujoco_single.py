@@ -154,4 +154,4 @@ def _progression(entries: tuple[int, ...]) -> slice:
 
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_VIEWS = ("model", "_qpos", "_qvel", "stepping", "where", "places", "observation", "scene")
+_VIEWS = ("model", "_qpos", "_qvel", "stepping", "where", "places", "bound", "scene")

@@ -5,26 +5,39 @@ where none of them needs the interpreter, and sleep when none has begun for a wh
 """
 
 import atexit
+import contextlib
+import ctypes
 import os
 import threading
-import time
 from collections.abc import Sequence
 from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
+from numba import types
 
-from codrl_mj.engine.memory import count_on, internal
-from codrl_mj.kept import njit
+from codrl_mj.engine.memory import count_on, internal, look
+from codrl_mj.kept import external, njit
 from codrl_mj.physics.compiled_task import Compiled
 
 _WORTH_WAKING = 64
 """Integration steps of a thread's that are worth waking it."""
-_PATIENCE = 200_000
-"""Looks at a number for which a thread waits before it sleeps: about a millisecond."""
+_PATIENCE, _AT_ONCE = 1000, 500
+"""How often a thread looks for the next turn before it sleeps: about a millisecond; and before it offers its CPU to
+those who have none."""
+_offer_cpu = external(
+    "offer_cpu",
+    ctypes.windll.kernel32.SwitchToThread if os.name == "nt" else ctypes.CDLL(None).sched_yield,  # type: ignore[attr-defined]
+    types.int32(),
+)
 CLAIMED, BROKEN, TURN, HELPING = range(0, 32, 8)
 """What a board counts, a cache line each: rows that were taken, simulations no longer of numbers, turns that began and
 that ended, and threads that help in the present one."""
+
+
+def cpus() -> int:
+    """How many CPUs this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def apart(array: np.ndarray) -> np.ndarray:
@@ -48,6 +61,22 @@ def _counted(board: np.ndarray, entry: int, more: int) -> int:
 
 
 @internal
+def _seen(board: np.ndarray, entry: int) -> int:
+    """What is counted at present."""
+    return look(board[entry:].ctypes.data)
+
+
+@internal
+def _alone(board: np.ndarray) -> None:
+    """Wait until nobody helps."""
+    looks = 0
+    while _seen(board, HELPING):
+        looks += 1
+        if looks % _AT_ONCE == 0:
+            _offer_cpu()
+
+
+@internal
 def _begun(board: np.ndarray) -> int:
     """Begin a turn."""
     board[CLAIMED] = board[BROKEN] = 0
@@ -55,30 +84,22 @@ def _begun(board: np.ndarray) -> int:
 
 
 @internal
-def _ended(board: np.ndarray) -> bool:
-    """End it; whether nobody helps in it any more, after a short wait."""
-    _counted(board, TURN, 1)
-    patience = _PATIENCE
-    while patience and _counted(board, HELPING, 0):
-        patience -= 1
-    return patience > 0
-
-
-@internal
 def _joined(board: np.ndarray, last: int) -> int:
     """The turn that a thread now helps in, other than its last; 0 if none began in a short while."""
     for _ in range(_PATIENCE):
-        turn = _counted(board, TURN, 0)
-        if turn % 2 == 1 and turn != last:
-            _counted(board, HELPING, 1)
-            if _counted(board, TURN, 0) == turn:
-                return turn
-            _counted(board, HELPING, -1)  # it had ended
+        for _ in range(_AT_ONCE):
+            turn = _seen(board, TURN)
+            if turn % 2 == 1 and turn != last:
+                _counted(board, HELPING, 1)
+                if _seen(board, TURN) == turn:
+                    return turn
+                _counted(board, HELPING, -1)  # it had ended
+        _offer_cpu()
     return 0
 
 
 def shared(do: Compiled) -> Compiled:
-    """What shares rows: (whether it leads, board, rows, threads, lane, arguments) -> whether nobody helps any more.
+    """What shares rows: (whether it leads, board, rows, threads, lane, arguments) -> nothing.
 
     It leads one turn; or it helps in turns as they come, until none has begun in a short while. `do` is a compiled
     function (first row, last and past it, lane, *arguments) -> simulations no longer of numbers. Threads claim rows
@@ -89,22 +110,21 @@ def shared(do: Compiled) -> Compiled:
     def work(board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any) -> None:
         first = 0
         while first < count:
-            left = count - _counted(board, CLAIMED, 0)
+            left = count - _seen(board, CLAIMED)
             more = count if threads == 1 else max(1, left // (4 * threads))
             first = _counted(board, CLAIMED, more)
             if first < count:
                 _counted(board, BROKEN, do(first, min(first + more, count), lane, *arguments))
 
     @njit(nogil=True, error_model="numpy")
-    def take_part(leads: bool, board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any) -> bool:
+    def take_part(leads: bool, board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any) -> None:
         turn = _begun(board) if leads else _joined(board, 0)
         while turn:
             work(board, count, threads, lane, arguments)
-            if leads:
-                return _ended(board)
-            _counted(board, HELPING, -1)
-            turn = _joined(board, turn)
-        return False
+            _counted(board, TURN if leads else HELPING, 1 if leads else -1)
+            turn = 0 if leads else _joined(board, turn)
+        if leads:
+            _alone(board)
 
     return take_part
 
@@ -122,7 +142,8 @@ class _Worker:
     def _work(self) -> None:
         while (task := self.tasks.get()) is not None:
             function, board, *arguments = task
-            function(False, board, *arguments)
+            with contextlib.suppress(Exception):  # before it helps; whoever leads meets the same
+                function(False, board, *arguments)
             if self.board is board:
                 self.board = None
             del task, board, arguments  # which would be kept for as long as it sleeps
@@ -138,7 +159,7 @@ def _dismiss() -> None:
     """End the workers while there is an interpreter."""
     for worker in _WORKERS:
         worker.tasks.put(None)
-        worker.thread.join()
+        worker.thread.join(1.0)
 
 
 def share(function: Compiled, board: np.ndarray, lanes: Sequence[Any], count: int, steps: int, *arguments: Any) -> bool:
@@ -151,11 +172,9 @@ def share(function: Compiled, board: np.ndarray, lanes: Sequence[Any], count: in
     for at in range(threads - 1):
         if at == len(_WORKERS):
             _WORKERS.append(_Worker())
-        if (worker := _WORKERS[at]).board is not board:
+        worker = _WORKERS[at]
+        if worker.board is not board and worker.tasks.empty():  # it helps one batch of several that take turns
             worker.board = board
             worker.tasks.put((function, board, count, threads, lanes[at + 1], arguments))
-    alone = function(True, board, count, threads, lanes[0], arguments)
-    while not alone:
-        time.sleep(1e-5)  # whoever still helps may need this CPU
-        alone = board[HELPING] == 0
+    function(True, board, count, threads, lanes[0], arguments)
     return bool(board[BROKEN])
