@@ -28,6 +28,7 @@ from rich.table import Table
 import benchmark_subjects as subjects
 from benchmark_subjects import Subject
 from codrl_mj.cli.terminal import console
+from codrl_mj.physics.sharing import cpus
 from codrl_mj.runs.files import read_json, write_json
 from codrl_mj.tasks import OURS
 
@@ -137,7 +138,7 @@ def groups() -> dict[str, Makers]:
         apart = task in APART
         members = [partial(subjects.raw_batch, task, NUM_ENVS, 2, apart), partial(subjects.vector, task, NUM_ENVS, 2)]
         found[f"two threads: {task}"] = members
-    cores = sorted({1, 2, os.cpu_count() or 1})
+    cores = sorted({1, 2, cpus()})
     sizes = [(num_envs, threads) for num_envs in (NUM_ENVS, 1, 64, 16_384, 100_000) for threads in cores]
     for task in TASKS:
         found[f"sizes: {task}"] = [partial(subjects.vector, task, *size) for size in sizes]

@@ -397,3 +397,15 @@ def test_an_actuator_in_any_form_is_the_same():
     single = ActuatedEnv("pendulum", motor)
     single.reset(seed=0)
     assert single.step(np.array([1.0], np.float32))[4]["current"] == runs[0][0][4]["current"][0]
+
+
+def test_threads_of_a_shallow_copy_use_its_own_arrays():
+    taken = []
+    for threads in (1, 2):
+        one = batched("pendulum", 256, num_threads=threads)
+        one.reset(seed=0)
+        one.action_space.seed(0)
+        other = copy.copy(one)
+        other._kernels = None  # it makes its own, of what both share
+        taken.append([env.step(one.action_space.sample())[1] for _ in range(100) for env in (one, other)])
+    np.testing.assert_array_equal(*taken)
