@@ -161,7 +161,7 @@ def _make_known(function: Any) -> None:
         ours = isinstance(one, FunctionType) and one.__module__.partition(".")[0] not in _OTHERS
         if ours and one not in _KNOWN:
             _KNOWN.add(one)
-            register_jitable(one)
+            register_jitable(forceinline=True)(one)
             _make_known(one)
 
 

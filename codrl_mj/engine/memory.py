@@ -16,8 +16,13 @@ from numba.extending import intrinsic
 
 from codrl_mj.kept import linked
 
-internal = functools.partial(numba.njit, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
-"""`numba.njit` for what only compiled code calls: the ways in from Python, left out, take their time to compile."""
+internal = functools.partial(
+    numba.njit, forceinline=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
+)
+"""`numba.njit` for what only compiled code calls: the ways in from Python, left out, take their time to compile.
+
+Inlined, because numba hands over each number of a tuple by itself: to call with a drive's parameters costs 31 copies.
+"""
 
 
 def emitted(signature: Callable[..., Any]) -> Callable[[Any], Any]:

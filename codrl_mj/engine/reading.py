@@ -3,6 +3,7 @@
 import math
 import numbers
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,7 +20,9 @@ from codrl_mj.actuators import (
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.engine.doors import shaft_inertia
 from codrl_mj.engine.families import HEAD, SIGNATURE, loaded_families, signals_at, slot_size
+from codrl_mj.engine.layout import DATA
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEAD, REASONS
+from codrl_mj.kept import njit
 from codrl_mj.plugin import FAMILY, NAME, registered
 
 
@@ -171,6 +174,22 @@ def check_shafts(
                 raise ValueError(f"{model.actuator(index).name or f'actuator {index}'}: {error}") from None
 
 
+@njit(error_model="numpy")
+def _gather(data: int, places: Any, activations: int, states: int, forces: int, table: Any) -> None:
+    """What mjData has at places in its activations, states of plugins and forces, which end there; NaN beyond them."""
+    for row in range(places.shape[0]):
+        for column in range(places.shape[1]):
+            place = places[row, column]
+            if place < activations:
+                table[row, column] = DATA.act(data)[place]
+            elif place < states:
+                table[row, column] = DATA.plugin_state(data)[place - activations]
+            elif place < forces:
+                table[row, column] = DATA.actuator_force(data)[place - states]
+            else:
+                table[row, column] = math.nan
+
+
 class Readout:
     """Reads the signals of all motors of a model, quickly: one array a signal.
 
@@ -188,7 +207,7 @@ class Readout:
         families: list[Family] = [type(actuator) for actuator in self.motors.values()]
         out, instances = model.actuator_outadr[indices], model.actuator_plugin[indices]
         behind_plugin, tracks = instances >= 0, np.array([family.tracks for family in families], dtype=bool)
-        # places in activations, then plugins' states, then forces, then a NaN
+        # places in activations, then plugins' states, then forces, then nowhere
         in_plugin = model.plugin_stateadr[instances] if model.nplugin else 0
         starts = np.where(behind_plugin, model.na + in_plugin, model.actuator_actadr[indices])
         states = model.na + model.npluginstate
@@ -201,7 +220,7 @@ class Readout:
                 places.setdefault(name, np.full(len(families), nothing))[motor] = place
         self.names = tuple(places)
         """Of the signals, in order."""
-        self._places = np.stack(list(places.values()))
+        self._places = np.stack(list(places.values())).astype(np.int64)
         # a motor at the callback's door has its arm in the gear, and forces at the shaft
         self._called = np.flatnonzero(~behind_plugin)
         self._gear = np.where(behind_plugin, 1.0, model.actuator_gear[out, 0])
@@ -217,13 +236,8 @@ class Readout:
         Args:
             data: a simulation of the model.
         """
-        found = np.empty(self._ends[2] + 1)  # slice by slice: in a third of np.concatenate's time
-        activations, states, forces = self._ends
-        found[:activations] = data.act
-        found[activations:states] = data.plugin_state
-        found[states:forces] = data.actuator_force
-        found[forces] = math.nan
-        table: np.ndarray = found[self._places]
+        table = np.empty(self._places.shape)
+        _gather(data._address, self._places, *self._ends, table)
         if self._called.size:
             table[:2] *= self._gear
             controls = data.ctrl[self._control]

@@ -1,6 +1,5 @@
 """Gymnasium's environments with motors: `make`."""
 
-import contextlib
 import copy
 import dataclasses
 import functools
@@ -229,8 +228,12 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         """
         motors = self._motors
         time = motors.data.time
-        with contextlib.nullcontext() if self._watch is None else self._watch.watching():
-            observation, reward, terminated, truncated, info = self.env.step(motors.controls(action))
+        controls = motors.controls(action)
+        if self._watch is None:
+            observation, reward, terminated, truncated, info = self.env.step(controls)
+        else:
+            with self._watch.watching():
+                observation, reward, terminated, truncated, info = self.env.step(controls)
         motors.check_finite(self._id, time)
         return self._observed(observation), reward, terminated, truncated, info | motors.signals()
 
