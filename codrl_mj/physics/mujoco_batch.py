@@ -48,7 +48,9 @@ class MujocoBatchPhysics:
         self._arms = np.ones((self.num_envs, len(task.motors)))
         self._bind()
         every, (arms, additions) = np.arange(self.num_envs), mounting_of(actuators)
-        self.set_parameters(every, np.array([[one.numbers for one in each] for each in actuators]), arms)
+        self._arms[:] = arms
+        if any(tuple(each) != plant.actuators for each in actuators):  # else the model has them, and no row needs to
+            self.set_parameters(every, np.array([[one.numbers for one in each] for each in actuators]), arms)
         if (additions != additions[0]).any():
             indices = [int(one.actuator) for one in self._wiring]
             mounting = Variation(bare_model(task.name, plant.joint), motors=indices, mounting=True)
