@@ -41,9 +41,9 @@ from codrl_mj.validation.rotors import (
     FREE,
     HELD,
     SWINGING,
-    Load,
     Loop,
     Record,
+    Rotor,
     drive,
     driven_by_voltage,
     motors_on,
@@ -57,7 +57,7 @@ MOTORS: dict[str, Motor] = {
 }
 """The motors compared: the paper's, and one whose parameters all differ from each other."""
 
-_ON: tuple[tuple[Load, str], ...] = ((HELD, "Euler"), (HELD, "implicitfast"), (FREE, "Euler"), (SWINGING, "Euler"))
+_ON: tuple[tuple[Rotor, str], ...] = ((HELD, "Euler"), (HELD, "implicitfast"), (FREE, "Euler"), (SWINGING, "Euler"))
 
 
 def exact(motor: Motor, timestep: float) -> Actuator:
@@ -67,14 +67,14 @@ def exact(motor: Motor, timestep: float) -> Actuator:
 
 
 def _both(
-    load: Load, motor: Motor, actuator: Actuator, timestep: float, hold: int, count: int, integrator: str = "Euler"
+    rotor: Rotor, motor: Motor, actuator: Actuator, timestep: float, hold: int, count: int, integrator: str = "Euler"
 ) -> tuple[Record, Record, np.ndarray]:
     """Ours and the native motor, and their differences of angle, speed and current, relative to max(1, size).
 
     Both are under `count` random voltages in +-4 V, each held for `hold` steps.
     """
     volts = np.random.default_rng(0).uniform(-4.0, 4.0, count).repeat(hold)
-    ours, native = (drive(motors_on(load, [one], timestep, integrator), volts) for one in (actuator, motor))
+    ours, native = (drive(motors_on(rotor, [one], timestep, integrator), volts) for one in (actuator, motor))
     pairs = zip(ours[:3], native[:3], strict=True)
     return ours, native, np.max([np.abs(a - b) / np.maximum(1.0, np.abs(b)) for a, b in pairs], axis=(0, 2))
 
@@ -88,27 +88,27 @@ def _both(
 def same_map(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     """Tolerance 1e-10: rounding of some 100 steps of a coupled, stable system."""
     shares = (0.1, 1.0) if quick else (0.01, 0.1, 0.3, 1.0)
-    for (name, motor), (load, integrator), share in itertools.product(motors.items(), _ON, shares):
+    for (name, motor), (rotor, integrator), share in itertools.product(motors.items(), _ON, shares):
         timestep = share * motor.electrical_time_constant
         count = 20 if quick else 100
-        ours, native, difference = _both(load, motor, exact(motor, timestep), timestep, 5, count, integrator)
-        at = f"{name} motor, {load.name}, {integrator}, dt = {share:g} L/R, step {difference.argmax() + 1}"
+        ours, native, difference = _both(rotor, motor, exact(motor, timestep), timestep, 5, count, integrator)
+        at = f"{name} motor, {rotor.name}, {integrator}, dt = {share:g} L/R, step {difference.argmax() + 1}"
         time = np.arange(1, len(difference) + 1) * timestep
         theirs = Curve("<dcmotor>", time, native.current[:, 0], reference=True)
         curves = (Curve("ours", time, ours.current[:, 0]), theirs)
         plot = Plot("Current on the swinging load, Euler", "time [s]", "current [A]", curves)
-        yield Case(difference, at, plots=(plot,) if (name, load, share) == ("paper", SWINGING, 0.1) else ())
+        yield Case(difference, at, plots=(plot,) if (name, rotor, share) == ("paper", SWINGING, 0.1) else ())
 
 
 @check("motor", order("native <dcmotor>, Euler, order in the substeps", "MuJoCo's <dcmotor> at the true inductance"))
 def substeps(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     """First order in the substeps, at the true inductance."""
     counts, families = 2 ** np.arange(4, 8 if quick else 11), []
-    for (name, motor), load in itertools.product(motors.items(), (HELD, FREE, SWINGING)):
+    for (name, motor), rotor in itertools.product(motors.items(), (HELD, FREE, SWINGING)):
         timestep = 0.2 * motor.electrical_time_constant
         actuators = [driven_by_voltage(motor, int(count)) for count in counts]
-        errors = [_both(load, motor, one, timestep, 5, 20)[-1].max() for one in actuators]
-        families.append(Family(f"{name}, {load.name}", timestep / counts, np.array(errors)))
+        errors = [_both(rotor, motor, one, timestep, 5, 20)[-1].max() for one in actuators]
+        families.append(Family(f"{name}, {rotor.name}", timestep / counts, np.array(errors)))
     title = "Ours against <dcmotor>, Euler"
     yield of_order(1.0, families, title, "electrical substep [s]", "largest difference [relative]")
 
@@ -117,12 +117,12 @@ def substeps(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
 def implicitfast(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
     """Second order in the step."""
     divisors, families = 2 ** np.arange(5, 9 if quick else 11), []
-    for (name, motor), load in itertools.product(motors.items(), (FREE, SWINGING)):
+    for (name, motor), rotor in itertools.product(motors.items(), (FREE, SWINGING)):
         steps, errors = motor.electrical_time_constant / divisors, []
         for divisor, timestep in zip(divisors, steps, strict=True):
-            both = _both(load, motor, exact(motor, timestep), timestep, int(divisor), 10, "implicitfast")
+            both = _both(rotor, motor, exact(motor, timestep), timestep, int(divisor), 10, "implicitfast")
             errors.append(both[-1].max())
-        families.append(Family(f"{name}, {load.name}", steps, np.array(errors)))
+        families.append(Family(f"{name}, {rotor.name}", steps, np.array(errors)))
     title = "Ours against <dcmotor>, implicitfast"
     yield of_order(2.0, families, title, "step [s]", "largest difference [relative]")
 

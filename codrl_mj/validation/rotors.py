@@ -15,8 +15,8 @@ from codrl_mj.tasks import OURS
 
 
 @dataclasses.dataclass(frozen=True)
-class Load:
-    """What a motor turns."""
+class Rotor:
+    """What a motor turns in a test of it."""
 
     name: str
     """Its name in reports."""
@@ -26,15 +26,15 @@ class Load:
     """Whether 0.5 kg hang 0.2 m off the axis, under gravity."""
 
 
-HELD = Load("locked rotor", 1e15)
+HELD = Rotor("locked rotor", 1e15)
 """Keeps its speed, whatever the torque: 1 N*m over 100 s changes it by 1e-13 rad/s."""
-FREE = Load("free spinning", 0.2)
+FREE = Rotor("free spinning", 0.2)
 """A rotor and nothing else."""
-SWINGING = Load("swinging load", 0.2, eccentric=True)
+SWINGING = Rotor("swinging load", 0.2, eccentric=True)
 """A rotor with a bob, under gravity."""
 
 
-_BODY_INERTIA = 0.01  # kg*m^2, part of the load's
+_BODY_INERTIA = 0.01  # kg*m^2, part of the rotor's
 
 
 class Record(NamedTuple):
@@ -51,7 +51,7 @@ class Record(NamedTuple):
 
 
 def motors_on(
-    load: Load, motors: Sequence[ActuatorModel | Motor], timestep: float, integrator: str = "Euler"
+    rotor: Rotor, motors: Sequence[ActuatorModel | Motor], timestep: float, integrator: str = "Euler"
 ) -> mujoco.MjModel:
     """Motors, each on a rotor of its own: ours, with the callbacks installed, or MuJoCo's `<dcmotor>` of a winding.
 
@@ -64,8 +64,8 @@ def motors_on(
         body = spec.worldbody.add_body(name=f"rotor{index}")
         body.explicitinertial = True
         body.mass, body.inertia = 0.5, [_BODY_INERTIA] * 3
-        body.ipos = [0.0, 0.0, -0.2 if load.eccentric else 0.0]
-        body.add_joint(name=f"hinge{index}", axis=[0, 1, 0], armature=load.inertia - _BODY_INERTIA)
+        body.ipos = [0.0, 0.0, -0.2 if rotor.eccentric else 0.0]
+        body.add_joint(name=f"hinge{index}", axis=[0, 1, 0], armature=rotor.inertia - _BODY_INERTIA)
         driver = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=f"hinge{index}")
         if isinstance(motor, Motor):
             driver.set_to_dcmotor(
