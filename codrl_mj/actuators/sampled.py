@@ -20,6 +20,13 @@ quadratic in E and l is then what p*E^2 + q*E*l + r*l^2 loses in a sample, for s
 import math
 from typing import Any
 
+from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
+
+_USUAL = 2.0 * math.pi * DEFAULT_BANDWIDTH
+"""wc*T of a loop whose bandwidth is not given."""
+_USUAL_STEP = -math.expm1(-_USUAL)
+"""Its P, which a tenth of a step would go into."""
+
 
 def designed_gains(resistance: float, inductance: float, sample_time: float, bandwidth: float) -> tuple[float, float]:
     """Proportional gain [V/A] and integral gain per sample [V/A] of the loop whose zero cancels the winding's pole.
@@ -47,7 +54,7 @@ def jump(
     v lies from `low` to `high`. Found are i, c, the sum of i over the samples' starts [A], that of v times the mean
     current of each sample [A^2], and how many samples were saturated.
     """
-    step = -math.expm1(-y)  # P
+    step = _USUAL_STEP if y == _USUAL else -math.expm1(-y)  # P
     gain, apart = step / lost, lost - step
     kept, rest, rising = 1.0 - step, 1.0 - lost, 1.0 - lost / x  # rising: 1 - m
     p = (1.0 - gain) * (1.0 - rising * gain) / (step * (1.0 + kept))
