@@ -48,9 +48,9 @@ lint: $(STAMP)
 	@$(BIN)/codespell
 	@$(BIN)/python scripts/house.py
 
-bench: $(STAMP)  ## speed beside other libraries, which are installed for it
+bench: $(STAMP)  ## speed beside other libraries, which are installed for it: docs/speed.md
 	@$(INSTALL) ".[bench]"
-	@$(BIN)/python scripts/benchmark.py
+	@$(BIN)/python scripts/benchmark.py --publish
 
 soak: $(STAMP)  ## a million steps: memory, threads, episodes
 	@$(BIN)/python scripts/soak.py

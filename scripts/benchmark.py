@@ -3,6 +3,7 @@
 The members of a group take turns: A, B, C, A, B, C, ... with many steps a turn; the table has the median of the ratios
 to the group's first member, turn by turn, with their range. Libraries that are not installed are skipped.
 
+`--publish` puts them into docs/results/speed.csv, in place of the same groups' before, and writes docs/speed.md.
 `--quick` compares with scripts/ratios.json instead, in two minutes, and fails where something became slower; a change
 that is meant to be slower says why, and writes them anew by `--keep`. Trainings are in scripts/benchmark_training.py.
 """
@@ -30,6 +31,7 @@ from benchmark_subjects import Subject
 from codrl_mj.cli.terminal import console
 from codrl_mj.physics.sharing import cpus
 from codrl_mj.runs.files import read_json, write_json
+from codrl_mj.study import markdown_table, read_csv, write_csv, write_page
 from codrl_mj.tasks import OURS
 
 Makers = list[Callable[[], Subject]]
@@ -46,6 +48,20 @@ TASKS = {task.name: task for task in OURS}
 APART = ("mountain_car", "mountain_car_continuous")  # whose walls need a call of the engine for each step of it
 RATIOS = Path(__file__).with_name("ratios.json")
 """Group -> member -> its ratio to the group's first member, as it was."""
+ROWS = Path(__file__).parents[1] / "docs" / "results" / "speed.csv"
+PAGE, WRITTEN = ROWS.parents[1] / "speed.md", "<!-- written by scripts/benchmark.py -->\n"
+SHOWN = {
+    "single: pendulum": "One Pendulum",
+    "single: cartpole": "One CartPole",
+    "two threads: pendulum": "1024 Pendulums, two threads",
+    "two threads: cartpole": "1024 CartPoles, two threads",
+    "EnvPool: 1024": "1024 Pendulums beside EnvPool's, two threads",
+    "EnvPool: 16384": "16,384 of them",
+    "foreign: HalfCheetah-v5": "HalfCheetah, six motors",
+    "foreign: Humanoid-v5": "Humanoid, seventeen motors",
+    "engine: pendulum": "The engine's step, Pendulum",
+}
+"""Group -> what it is called on the page."""
 SLOWER = 0.85
 """Of a ratio that is kept, below which something became slower."""
 TRIES = 4
@@ -138,6 +154,9 @@ def groups() -> dict[str, Makers]:
         apart = task in APART
         members = [partial(subjects.raw_batch, task, NUM_ENVS, 2, apart), partial(subjects.vector, task, NUM_ENVS, 2)]
         found[f"two threads: {task}"] = members
+    for count in (NUM_ENVS, 16_384):
+        both = partial(subjects.envpool, "Pendulum-v1", count, 2), partial(subjects.vector, "pendulum", count, 2)
+        found[f"EnvPool: {count}"] = list(both)
     cores = sorted({1, 2, cpus()})
     sizes = [(num_envs, threads) for num_envs in (NUM_ENVS, 1, 64, 16_384, 100_000) for threads in cores]
     for task in TASKS:
@@ -253,6 +272,23 @@ def report(title: str, results: dict[str, dict[str, list[float]]]) -> None:
     console().print(table)
 
 
+def publish(results: dict[str, dict[str, dict[str, list[float]]]], file: Path = ROWS, page: Path = PAGE) -> None:
+    """Put groups among the rows of a file, and what is shown of all of them on a page."""
+    rows = [row for row in read_csv(file) if row["group"] not in results]
+    for group, members in results.items():
+        for name, numbers in members.items():
+            speed, ratio = numbers["steps_per_second"][0], [f"{one:.3f}" for one in numbers["ratio"]]
+            row = {"group": group, "member": name, "steps_a_second": f"{speed:.0f}"}
+            rows.append(row | dict(zip(("ratio", "least", "most"), ratio, strict=True)))
+    write_csv(file, rows)
+    tables = []
+    for group, title in SHOWN.items():
+        own = [row for row in rows if row["group"] == group]
+        told = [(row["member"], f"{int(row['steps_a_second']):,}", f"{float(row['ratio']):.2f}") for row in own]
+        tables.append(markdown_table((title, "steps a second", "times the first"), told, 2) if told else "")
+    write_page(page, [page.read_text().partition(WRITTEN)[0] + WRITTEN, *tables])
+
+
 def main() -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -262,6 +298,7 @@ def main() -> int:
     parser.add_argument("--turns", type=int, default=11, help="turns of each member of a group")
     parser.add_argument("--duration", type=float, default=0.1, help="of a turn [s]")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
+    parser.add_argument("--publish", action="store_true", help="put the groups' rows and their page into docs/")
     options = parser.parse_args()
     turns = options.turns
     if turns < 1:
@@ -270,12 +307,13 @@ def main() -> int:
     if options.quick or options.keep:
         return compare(options.keep)
     results: dict[str, Any] = {}
+    measured: dict[str, Any] = {}
     if options.only in "memory":
         results["memory"] = memory()  # first: later, freed memory would hide the growth
         console().print("memory: {bytes_per_environment:,.0f} bytes an environment".format(**results["memory"]))
     for title, makers in groups().items():
         if options.only in title:
-            results[title] = measure(build(makers), turns, options.duration)
+            results[title] = measured[title] = measure(build(makers), turns, options.duration)
             report(f"{title}, {turns} alternating turns: median (least to most)", results[title])
     if options.only in "families":
         results["families"] = families()
@@ -286,6 +324,8 @@ def main() -> int:
         for name, numbers in results["learning"].items():
             text = f"PPO, {name}: {numbers['steps_per_second']:,.0f} steps/s"
             console().print(f"{text}, {numbers['share_in_environment']:.1%} of the time in the environment")
+    if options.publish:
+        publish(measured)
     if options.out is not None:
         versions = {"codrl_mj": codrl_mj.__version__, "mujoco": mujoco.__version__, "gymnasium": gymnasium.__version__}
         machine = {"cpus": os.cpu_count(), "platform": platform.platform()}
