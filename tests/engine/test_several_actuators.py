@@ -3,7 +3,6 @@
 import mujoco
 import numpy as np
 import pytest
-from mujoco.batch import Batch
 
 from codrl_mj.actuators import Actuator
 from codrl_mj.engine import uninstall
@@ -56,12 +55,15 @@ def _spec(with_ours=True):
     return spec
 
 
-def _model(with_ours=True):
-    return _spec(with_ours).compile()
+def model_of_several(_=None, integrator="Euler", with_ours=True):
+    """The spec, compiled."""
+    model = _spec(with_ours).compile()
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    return model
 
 
 def test_the_counts_of_controls_outputs_activations_and_actuators_differ():
-    model = _model()
+    model = model_of_several()
     assert len({model.nu, model.nout, model.na, model.nactuator}) == 4
     for name in ("second", "third"):
         actuator = model.actuator(name).id
@@ -72,8 +74,7 @@ def test_the_counts_of_controls_outputs_activations_and_actuators_differ():
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4"])
 def test_every_motor_is_its_own_reference(integrator):
-    model = _model()
-    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    model = model_of_several(integrator=integrator)
     data = mujoco.MjData(model)
     references = {name: MotorSimulation(actuator) for name, actuator in OURS.items()}
     for ctrl in controls(100, model.nu):
@@ -97,8 +98,8 @@ def test_every_motor_is_its_own_reference(integrator):
 
 
 def test_foreign_actuators_act_as_without_ours():
-    model = _model()
-    bare = _model(with_ours=False)
+    model = model_of_several()
+    bare = model_of_several(with_ours=False)
     inputs = controls(100, model.nu)
     data, alone = mujoco.MjData(model), mujoco.MjData(bare)
     foreign = [index for index in range(model.nactuator) if index not in motors(model)]
@@ -124,7 +125,7 @@ def test_foreign_actuators_act_as_without_ours():
 
 
 def test_a_disabled_group_silences_one_motor_of_several():
-    model = _model()
+    model = model_of_several()
     model.opt.disableactuator = 1 << 2
     data = mujoco.MjData(model)
     trajectory(model, controls(20, model.nu), data)
@@ -136,25 +137,9 @@ def test_a_disabled_group_silences_one_motor_of_several():
 @pytest.mark.parametrize("index", [0, 1, -1])
 def test_a_bad_control_anywhere_counts_as_zero_everywhere_as_in_the_engine(index, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # the engine writes a log
-    model = _model()
+    model = model_of_several()
     inputs = controls(40, model.nu)
     zeroed = inputs.copy()
     inputs[20:30, index] = np.nan
     zeroed[20:30] = 0.0
     np.testing.assert_array_equal(trajectory(model, inputs), trajectory(model, zeroed))
-
-
-@pytest.mark.parametrize("nthread", [1, 2])
-def test_a_batch_of_many_motors_is_a_serial_loop_bit_for_bit(nthread):
-    model, simulations = _model(), 16
-    inputs = np.stack([controls(50, model.nu, seed=seed) for seed in range(simulations)], axis=1)
-    batch = Batch(model, nsim=simulations, nthread=nthread)
-    ctrl = batch.bind("ctrl")
-    for row in inputs:
-        ctrl[:] = row
-        batch.step()
-    for sim in range(simulations):
-        data = mujoco.MjData(model)
-        trajectory(model, inputs[:, sim], data)
-        np.testing.assert_array_equal(batch.bind("act")[sim], data.act)
-        np.testing.assert_array_equal(batch.bind("qpos")[sim], data.qpos)
