@@ -138,8 +138,10 @@ def test_it_ends_where_the_closed_form_says(name, sign):
 
 def test_a_resistance_under_which_the_saturated_current_oscillates_is_refused_with_its_bound():
     # i' = i + (V - Rs*i - R*i)*dt/L: the pole 1 - (R + Rs)*dt/L is -1 at Rs = 2*L/dt - R = 3
-    assert Actuator(supply=Supply(resistance=2.99)).check(0.05) is None
-    refused = Actuator(supply=Supply(resistance=3.0))
+    allowed, refused = (Actuator(supply=Supply(resistance=resistance)) for resistance in (2.99, 3.0))
+    assert allowed.check(0.05) is None
+    radii = Actuator.instability(np.array([allowed.numbers, refused.numbers]), 0.05)
+    np.testing.assert_array_equal(radii < 1.0, [True, False])
     with pytest.raises(ValueError, match=r"supply\.resistance = 3: must be < 2\*L/dt - R = 3 ohm .* of 0\.05 s"):
         refused.check(0.05)
     assert with_substeps(refused, 2).check(0.05) is None  # the remedy
