@@ -14,10 +14,8 @@ from scipy.linalg import expm
 
 import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, Inputs, SampledLoop, Supply, parameters_type
-from codrl_mj.actuators.named import resolve
 from codrl_mj.actuators.sampled import designed_gains, jump, run_samples
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
-from codrl_mj.catalogue import motor_entry
 
 # R [ohm], L [H], K [N*m/A], V [V]: maxon EC45 flat, DCX22L; Faulhaber 1331T; T-motor AK80-6; QUBE-Servo 2; PMG-132
 WINDINGS = {
@@ -274,15 +272,6 @@ def test_the_largest_current_is_kept():
 def test_bad_input_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def test_a_motor_is_asked_for_by_name_and_its_fields_are_set_over_it():
-    one = resolve({"name": "maxon-ec45-flat-50w", "motor": {"gear_ratio": 12.0}}, None, "nobody")
-    assert one.motor.gear_ratio == 12.0
-    assert one.motor.torque_constant == motor_entry("maxon-ec45-flat-50w").numbers.torque_constant
-    assert one.supply.voltage == 24.0
-    with pytest.raises(ValueError, match="did you mean 'maxon-ec45-flat-50w'"):
-        resolve("maxon-ec45-flat-50", None, "nobody")
 
 
 def test_a_datasheet_makes_a_motor():

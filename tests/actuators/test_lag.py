@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy import signal
 
@@ -11,6 +11,7 @@ from codrl_mj.actuators.lag import HISTORY
 from tests.actuators.strategies import between, zero_or
 
 
+@example([1.0, -2.0, 0.5, 3.0] * 5, 0.01, 0.03, HISTORY - 1, 0.75, 1.0)
 @given(
     st.lists(between(-10, 10), min_size=1, max_size=40),
     between(1e-3, 0.1),
