@@ -90,19 +90,6 @@ def test_motors_of_ours_stand_beside_a_muscle_and_a_plugin_of_others(robot, tmp_
         codrl_mj.make(env_id, {"muscle": "ideal"})
 
 
-def test_two_environments_with_different_motors_do_not_know_of_each_other():
-    makers = [functools.partial(codrl_mj.make, "HalfCheetah-v5", {".*": name}) for name in ("lag", "torque_speed")]
-    inputs = actions(makers[0](), 40)
-    alone = [run(make(), inputs, seed=1) for make in makers]
-    envs = [make() for make in makers]
-    for env in envs:
-        env.reset(seed=1)
-    together = [[env.step(action) for env in envs] for action in inputs]
-    for each, expected in zip(zip(*together, strict=True), alone, strict=True):
-        assert_same(list(each), expected[1:])
-    assert not np.array_equal(alone[0][-1][0], alone[1][-1][0])
-
-
 @pytest.mark.parametrize(("env_id", "steps"), [("InvertedPendulum-v5", 30), ("Reacher-v5", 50)])
 def test_the_faster_a_strong_motors_loop_the_closer_it_is_to_ideal(env_id, steps):
     """What is lost is what the loop takes to answer, a share of a sample: ten times the rate, a tenth of it."""

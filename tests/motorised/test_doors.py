@@ -66,40 +66,41 @@ def test_both_doors_agree(first, second, kind, integrator):
     assert second or np.isfinite(plugin).all()  # two families lack what the other has
 
 
+def of_state(what):
+    def restored(data):
+        state = np.empty(mujoco.mj_stateSize(data.model, what))
+        mujoco.mj_getState(data.model, data, state, what)
+        other = mujoco.MjData(data.model)
+        mujoco.mj_setState(data.model, other, state, what)
+        return other
+
+    return restored
+
+
+SAVED = {
+    "state": of_state(mujoco.mjtState.mjSTATE_FULLPHYSICS),
+    "integration": of_state(mujoco.mjtState.mjSTATE_INTEGRATION),
+    "copy": copy.copy,
+    "pickle": lambda data: pickle.loads(pickle.dumps(data)),
+}
+
+
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_further_forward_calls_and_copies_of_the_data_change_nothing(integrator):
-    model = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["lag"]})
-    inputs = controls(STEPS, 2)
-    expected = trajectory(model, inputs)
+@pytest.mark.parametrize("how", SAVED)
+def test_a_simulation_is_continued_from_what_is_saved_of_it(how, integrator):
+    """Whatever forward calls there are meanwhile, and wherever the saved one goes."""
+    model, inputs = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["lag"]}), controls(STEPS, 2)
 
     def meddle(data):
-        for _ in range(3):
-            mujoco.mj_forward(model, data)
-        with_others = copy.copy(data)
-        mujoco.mj_step(model, with_others, 5)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_step(model, copy.copy(data), 5)
 
-    np.testing.assert_array_equal(trajectory(model, inputs, before_step=meddle), expected)
-
-
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("carry", ["state", "copy", "pickle", "integration"])
-def test_a_simulation_is_continued_from_what_is_saved_of_it(carry, integrator):
-    model = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["lag"]})
-    inputs = controls(STEPS, 2)
     data = mujoco.MjData(model)
     first = trajectory(model, inputs[:70], data)
-    if carry in ("state", "integration"):
-        what = mujoco.mjtState.mjSTATE_FULLPHYSICS if carry == "state" else mujoco.mjtState.mjSTATE_INTEGRATION
-        state = np.empty(mujoco.mj_stateSize(model, what))
-        mujoco.mj_getState(model, data, state, what)
-        other = mujoco.MjData(model)
-        mujoco.mj_setState(model, other, state, what)
-    else:
-        other = copy.copy(data) if carry == "copy" else pickle.loads(pickle.dumps(data))
+    other = SAVED[how](data)
     mujoco.mj_step(model, data, 3)  # the first goes its own way
-    np.testing.assert_array_equal(
-        np.concatenate((first, trajectory(other.model, inputs[70:], other))), trajectory(model, inputs)
-    )
+    rest = trajectory(other.model, inputs[70:], other, before_step=meddle)
+    np.testing.assert_array_equal(np.concatenate((first, rest)), trajectory(model, inputs))
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
