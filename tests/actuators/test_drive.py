@@ -227,10 +227,11 @@ def test_the_gear_turns_torque_speed_inertia_and_friction():
     [
         (4e-6, 200.0, 0.01, 0.2 * 0.01),
         (4e-6, 200.0, -0.01, 0.25 * 0.01),
+        (0.0, 200.0, 0.01, 0.2 * 0.01),
         (4e-6, 1e-3, 0.01, 4e-6 * 1e-3 / 0.01),  # near standstill it only stops the rotor
         *((inertia, 0.0, 0.01, 0.0) for inertia in (4e-6, 0.0)),
     ],
-    ids=["driving", "driven", "nearly still", "still", "still and light"],
+    ids=["driving", "driven", "driving and light", "nearly still", "still", "still and light"],
 )
 def test_a_gear_passes_on_a_share_and_brakes_what_drives_it(inertia, speed, torque, lost, sign):
     lossy = Drive(GearMotor(gear_efficiency=0.8, rotor_inertia=inertia), supply=Supply(48.0))

@@ -107,6 +107,23 @@ class Bare(ActuatorModel):
         return state, 0.5 * inputs.desired_torque, state
 
 
+class Endless(NamedTuple):
+    """A signal that is no finite number; the engine multiplies the last one by a gain of 0."""
+
+    limit: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Boundless(Bare):
+    """A family that shows what is infinite."""
+
+    Signals = Endless
+
+    @staticmethod
+    def advance(parameters, timestep, state, inputs):  # noqa: ARG004
+        return state, 0.5 * inputs.desired_torque, Endless(math.inf)
+
+
 SPRINGS = [
     Spring(),
     Spring(Coil(0.3, 5), Brake(0.2), limit=0.3),
@@ -115,6 +132,7 @@ SPRINGS = [
 ALL = [
     *SPRINGS,
     Bare(),
+    Boundless(),
     Lag(0.07),
     Lag(0.02, 0.033),
     Lag(0.0, 0.08),
@@ -176,29 +194,6 @@ def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integr
         torques.append(torque)
     assert np.ptp(torques) > 0.05
     assert len(data.act) == slot_size(family)
-
-
-def test_a_signal_may_be_infinite():
-    """Alone as the last one too, which the engine multiplies by a gain of 0."""
-
-    class Endless(NamedTuple):
-        limit: float
-
-    @dataclasses.dataclass(frozen=True)
-    class Boundless(ActuatorModel):
-        Signals = Endless
-
-        @staticmethod
-        def advance(parameters, timestep, state, inputs):  # noqa: ARG004
-            return state, inputs.desired_torque, Endless(math.inf)
-
-    engine.load_family(Boundless)
-    model = rotor(Boundless())
-    data = mujoco.MjData(model)
-    data.ctrl[0] = 0.25
-    mujoco.mj_step(model, data)
-    assert data.act[signals_at(Boundless)] == math.inf
-    assert data.actuator_force[0] == 0.25
 
 
 @pytest.mark.parametrize(
