@@ -10,6 +10,7 @@ import pytest
 from mujoco.batch import Batch
 
 import codrl_mj
+from codrl_mj.actuators import TorqueSpeed
 from tests.matrix import but
 from tests.motorised.models import (
     ACTUATORS,
@@ -116,6 +117,22 @@ def test_a_reset_and_a_keyframe_bring_motors_to_rest(integrator):
     plain = mujoco.MjData(model)
     plain.qpos[:] = used.qpos
     np.testing.assert_allclose(trajectory(model, inputs, used), trajectory(model, inputs, plain), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("share", [0.3, 1.0, 1.7])
+def test_after_a_keyframe_s_time_a_step_takes_no_torque_from_before(integrator, share):
+    spec, found = arm(integrator), []
+    spec.add_key(name="later", time=share * 0.005, qpos=[0.1, -0.2])
+    for model in (spec.copy().compile(), behind_plugin(spec, {".*": TorqueSpeed(1e6, 1e6, 1e6)})):
+        data = mujoco.MjData(model)
+        data.ctrl[:] = 0.3
+        mujoco.mj_step(model, data, 3)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        data.ctrl[:] = -0.5
+        mujoco.mj_step(model, data, 2)
+        found.append(np.concatenate([data.qpos, data.qvel]))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
 
 
 def test_several_families_of_one_model_are_each_as_if_alone():
