@@ -7,6 +7,7 @@ import pickle
 import mujoco
 import numpy as np
 import pytest
+from mujoco import rollout
 from mujoco.batch import Batch
 
 import codrl_mj
@@ -21,6 +22,7 @@ from tests.motorised.models import (
     behind_callback,
     behind_plugin,
     controls,
+    full_state,
     trajectory,
 )
 
@@ -173,6 +175,18 @@ def test_a_batch_is_a_loop(integrator, nthread):
         np.testing.assert_array_equal(qpos[sim], data.qpos)
         np.testing.assert_array_equal(state[sim], data.plugin_state)
     assert len(np.unique(qpos[:, 0])) == nsim
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_rollout_is_a_loop(integrator):
+    model = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["torque_speed"]})
+    inputs = np.array([controls(50, 2, seed) for seed in range(6)])
+    start = full_state(mujoco.MjData(model))
+    states, _ = rollout.rollout(model, [mujoco.MjData(model) for _ in range(2)], start, inputs)
+    for sequence, found in zip(inputs, states, strict=True):
+        data = mujoco.MjData(model)
+        trajectory(model, sequence, data)
+        np.testing.assert_array_equal(found[-1], full_state(data))
 
 
 def test_a_set_state_needs_motors_cleared_and_then_they_are():
