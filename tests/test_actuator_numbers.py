@@ -16,14 +16,9 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 
 
-def _script():
-    spec = importlib.util.spec_from_file_location("actuator_numbers", ROOT / "scripts" / "actuator_numbers.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-SCRIPT = _script()
+_SPEC = importlib.util.spec_from_file_location("actuator_numbers", ROOT / "scripts" / "actuator_numbers.py")
+SCRIPT = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(SCRIPT)
 
 
 def written(kind):

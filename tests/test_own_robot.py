@@ -62,9 +62,9 @@ def test_the_python_examples_run(capsys):
     namespace["envs"].close()
 
 
-def run(command):
-    line = [SHORT.get(word, word) for word in shlex.split(command)]
-    assert main(line) == 0
+def run(*commands):
+    for command in commands:
+        assert main([SHORT.get(word, word) for word in shlex.split(command)]) == 0
 
 
 def test_the_training_runs():
@@ -74,8 +74,7 @@ def test_the_training_runs():
 
 @pytest.mark.matrix
 def test_all_commands_run_one_after_the_other():
-    for command in COMMANDS:
-        run(command)
+    run(*COMMANDS)
     assert [command.split()[0] for command in COMMANDS] == ["train", "evaluate", "evaluate", "render", "validate"]
     assert Path("ball.gif").stat().st_size > 1000
 

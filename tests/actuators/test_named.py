@@ -2,13 +2,14 @@
 
 import dataclasses
 import json
-import re
+import math
+import shutil
 import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 
-import codrl_mj
 from codrl_mj.actuators import (
     FAMILIES,
     IDEAL,
@@ -32,7 +33,8 @@ from codrl_mj.actuators import (
     resolve,
 )
 from codrl_mj.fields import real
-from codrl_mj.tasks import OURS, TASKS, named_actuator, resolve_actuators
+from codrl_mj.own_code import asset_folder
+from codrl_mj.tasks import TASKS, named_actuator, resolve_actuators
 from tests.actuators.strategies import of_every_family
 from tests.tasks.faces import every_rebuilt
 
@@ -63,94 +65,176 @@ PAPER_GAINS = {
 }
 
 
-def test_every_task_of_the_papers_has_its_actuator():
-    assert all(len(task.paper) == len(task.motors) for task in OURS)
-
-
 @every_rebuilt
-def test_the_paper_actuator_has_the_papers_motor_and_gains(task):
+def test_named_actuators_are_the_papers_motor_and_gains_and_variations_of_them(task):
     kp, ki, kd, kff, arm = PAPER_GAINS[task]
     motor = Motor(resistance=1.0, inductance=0.1, torque_constant=1.0, back_emf_constant=1.0, arm_radius=arm)
-    assert named_actuator("paper", task) == Actuator(motor, CurrentLoop(kp, ki, kd, kff, max_voltage=24.0))
-
-
-@every_rebuilt
-def test_the_weak_actuators_differ_from_the_papers_in_their_gains_only(task):
-    motor = TASKS[task].paper[0].motor
-    assert named_actuator("weak", task) == Actuator(motor, CurrentLoop(kp=1.0, ki=1.0))
-    assert named_actuator("weaker", task) == Actuator(motor, CurrentLoop(kp=0.2, ki=0.2))
-
-
-@every_rebuilt
-def test_the_open_loop_actuator_feeds_nothing_back_and_holds_the_reference_at_rest(task):
-    actuator = named_actuator("open_loop", task)
-    loop = actuator.controller
-    assert (loop.kp, loop.ki, loop.kd) == (0.0, 0.0, 0.0)
-    assert loop.kff == actuator.motor.resistance  # u = R*i_ref is the voltage at which i_ref is at rest
-    assert loop.bemf_compensation
-    assert actuator.motor.inductance == 0.5
-    assert actuator.motor.arm_radius == TASKS[task].paper[0].motor.arm_radius
-
-
-@every_rebuilt
-@pytest.mark.parametrize("name", NAMED)
-def test_every_named_actuator_is_stable_at_the_step_it_is_used_with(name, task):
-    actuator = named_actuator(name, task)
-    assert (actuator is IDEAL) == (name == "ideal")
-    actuator.check(TASKS[task].step_duration / TASKS[task].motor_inner_steps)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "near"),
-    [
-        ("papr", "'paper'"),
-        ("weakest", "'weaker'"),
-        ("open-loop", "'open_loop'"),
-        ("maxon-ec45", "'maxon-ec45-flat-339285' or 'maxon-ec45-flat-50w'"),
-        ("Maxon-EC45-flat-50", "'maxon-ec45-flat-50w'"),
-    ],
-)
-def test_an_unknown_name_suggests_the_nearest_and_no_others(wrong, near):
-    with pytest.raises(ValueError, match="unknown actuator") as refused:
-        named_actuator(wrong, "cartpole")
-    said = f"unknown actuator '{wrong}': did you mean {near}? It can be module:NAME of your own"
-    assert str(refused.value) == said
-
-
-def test_a_name_like_none_lists_the_known_ones_and_says_who_lists_the_motors():
-    with pytest.raises(ValueError, match="unknown actuator '12345': Known: ideal, paper, weak, weaker") as refused:
-        resolve_actuators("12345", CARTPOLE)
-    assert "torque_speed, the motors of `codrl-mj motor list`, or module:NAME of your own" in str(refused.value)
-    assert "maxon" not in str(refused.value)
-
-
-def test_resolve_takes_every_way_to_write_an_actuator():
-    actuator = Actuator(Motor(resistance=2.0), CurrentLoop(kp=3.0))
-    assert resolve_actuators(actuator, CARTPOLE) == (actuator,)
-    assert resolve_actuators(actuator, CARTPOLE)[0] is actuator
-    assert resolve_actuators(actuator.as_mapping(), CARTPOLE) == (actuator,)
-    assert resolve_actuators("paper", CARTPOLE) == CARTPOLE.paper
-    assert resolve_actuators("ideal", CARTPOLE) == (IDEAL,)
-    assert resolve_actuators(None, CARTPOLE) == (IDEAL,)
-    assert resolve_actuators([actuator], CARTPOLE) == (actuator,)
-    for name, family in FAMILIES.items():
-        assert resolve_actuators(name, CARTPOLE) == (family(),)
-
-
-@pytest.mark.parametrize("value", [3, 1.5, ["paper", 3], [3], Motor()])
-def test_resolve_refuses_anything_else(value):
-    with pytest.raises(
-        ValueError, match=r"actuator = .*must be a name .*, an actuator or a mapping|2 actuators for the 1"
-    ):
-        resolve_actuators(value, CARTPOLE)
-
-
-def test_the_public_names_are_the_functions():
-    assert codrl_mj.tasks.named_actuator is named_actuator
-    assert codrl_mj.actuators.Actuator is Actuator
+    expected = {
+        "paper": Actuator(motor, CurrentLoop(kp, ki, kd, kff, max_voltage=24.0)),
+        "weak": Actuator(motor, CurrentLoop(kp=1.0, ki=1.0)),
+        "weaker": Actuator(motor, CurrentLoop(kp=0.2, ki=0.2)),
+        # u = R*i_ref is the voltage at which i_ref is at rest
+        "open_loop": Actuator(dataclasses.replace(motor, inductance=0.5), CurrentLoop(kp=0.0, kff=motor.resistance)),
+    }
+    assert {name: named_actuator(name, task) for name in NAMED} == {"ideal": IDEAL, **expected}
+    assert len(TASKS[task].paper) == len(TASKS[task].motors)
+    for name in NAMED:
+        named_actuator(name, task).check(TASKS[task].step_duration / TASKS[task].motor_inner_steps)
 
 
 # -- several motors -----------------------------------------------------------------------------------------
+
+# -- whatever may be written --------------------------------------------------------------------------------
+
+FED = Actuator(Motor(resistance=3.0), supply=Supply(12.0, 0.5))
+BY_HAND = "motor: {resistance: 2}\ncontroller:\n  kp: 1.5  # V/A\n  max_voltage: .inf\n"
+FILES = {  # JSON is YAML
+    **{f"lag{kind}": json.dumps(Lag(0.2, 0.01).as_mapping()) for kind in (".yaml", ".yml", ".json")},
+    "fed.json": json.dumps(FED.as_mapping()),
+    "mine.json": json.dumps(MINE.as_mapping()),
+    "by_hand.yaml": BY_HAND,
+    "over.yaml": "name: weak\nmotor: {resistance: 2}\n",
+    "itself.yaml": "name: itself.yaml\n",
+    "short.yaml": "name: kraken-x60\nmotor: {gear_ratio: 70.3}",
+    "swing.yaml": json.dumps(Lag(0.2).as_mapping()),
+    "bench/actuator.yaml": json.dumps(Lag(0.2).as_mapping()),
+    "slipped/missing.py": "import nowhere_at_all",
+    "slipped/undefined.py": "x = 1\ny = z",
+    "slipped/unreadable.py": "def :",
+    "slipped/other.py": "MINES = 1",
+}
+WRONG_FILES = ("{", "3", "", "[1, 2]", "family: lagg", "motr: {}", "motor: 3", "controller: {kp: -1}", "1: 2")
+WRONG_FILES = {f"wrong{index}.yaml": text for index, text in enumerate((*WRONG_FILES, "controller: {kp: }"))}
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """The files above, and a motor's own: a copy of one of the catalogue."""
+    for name, text in (FILES | WRONG_FILES).items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    shutil.copy(asset_folder() / "motors" / "maxon-re65.toml", tmp_path / "drawer.toml")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = set(sys.modules)
+    yield
+    for name in {one for one in sys.modules if one.startswith("slipped")} - before:
+        del sys.modules[name]
+
+
+def over(part, **fields):
+    """The cart-pole's weak actuator with some fields of its own."""
+    weak = Actuator(CARTPOLE.paper[0].motor, CurrentLoop(kp=1.0, ki=1.0))
+    return dataclasses.replace(weak, **{part: dataclasses.replace(getattr(weak, part), **fields)})
+
+
+@pytest.mark.parametrize(
+    ("given", "made"),
+    [
+        (FED, FED),
+        (FED.as_mapping(), FED),
+        ("paper", CARTPOLE.paper[0]),
+        ("ideal", IDEAL),
+        (None, IDEAL),
+        *((name, family()) for name, family in FAMILIES.items()),
+        ({"motor": {"resistance": 3}}, Actuator(Motor(resistance=3.0))),
+        ({"family": "current_loop"}, Actuator()),
+        ({"family": f"{__name__}:Mine", "strength": 3.0}, MINE),
+        (MINE.as_mapping(), MINE),
+        (f"{__name__}:MINE", MINE),
+        (f"{__name__}:Mine", Mine()),
+        (Path("lag.yaml"), Lag(0.2, 0.01)),
+        *((f"lag{kind}", Lag(0.2, 0.01)) for kind in (".yaml", ".yml", ".json")),
+        ("fed.json", FED),
+        ("mine.json", MINE),
+        ("by_hand.yaml", Actuator(Motor(resistance=2.0), CurrentLoop(kp=1.5, max_voltage=math.inf))),
+        ("over.yaml", over("motor", resistance=2.0)),
+        ({"name": "weak", "controller": {"kp": 5.0}}, over("controller", kp=5.0)),
+    ],
+)
+def test_an_actuator_is_made_of_whatever_may_be_written(files, given, made):
+    assert resolve_actuators(given, CARTPOLE) == resolve_actuators([given], CARTPOLE) == (made,)
+    assert given is not FED or resolve_actuators(given, CARTPOLE)[0] is FED
+
+
+BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("papr", r"^unknown actuator 'papr': did you mean 'paper'\? It can be module:NAME of your own$"),
+        ("weakest", r"'weakest': did you mean 'weaker'\?"),
+        ("open-loop", r"'open-loop': did you mean 'open_loop'\?"),
+        ("maxon-ec45", r"'maxon-ec45': did you mean 'maxon-ec45-flat-339285' or 'maxon-ec45-flat-50w'\?"),
+        ("Maxon-EC45-flat-50", r"did you mean 'maxon-ec45-flat-50w'\?"),
+        (
+            "12345",
+            r"'12345': Known: ideal, paper, weak, weaker(?!.*maxon).*, the motors of `codrl-mj motor list`",
+        ),
+        *((value, r"actuator = .*must be a name \(ideal.*\), an actuator or a mapping") for value in (3, 1.5, Motor())),
+        ({"motr": {}}, r"unknown actuator field motr; did you mean motor\?$"),
+        ({"controllr": {}}, r"unknown actuator field controllr; did you mean controller\?$"),
+        ({"motor": {"inductanse": 0.1}}, r"field motor\.inductanse; did you mean motor\.inductance\?$"),
+        ({"motor": {"arm_radus": 0.1}, "controller": {}}, r"motor\.arm_radus; did you mean motor\.arm_radius\?$"),
+        ({"controller": {"kf": 5.0}}, r"controller\.kf; did you mean controller\.kff\?$"),
+        ({"supply": {"resistence": 5.0}}, r"supply\.resistence; did you mean supply\.resistance\?$"),
+        ({"motor": {"zzz": 1.0}}, r"unknown actuator field motor\.zzz; known: resistance, inductance,"),
+        ({"motor": 3.0}, r"'motor' = 3\.0: must be a mapping of Motor's fields"),
+        ({"controller": {"ki": -2.0}}, r"CurrentLoop\.ki = -2\.0: must be a finite number >= 0"),
+        ({"family": "lagg"}, r"unknown family 'lagg': did you mean 'lag'"),
+        ({"family": "torque-speed"}, r"unknown family 'torque-speed': did you mean 'torque_speed'"),
+        ({"family": "lag", "time_constnt": 1.0}, r"unknown actuator field time_constnt; did you mean time_constant\?"),
+        ({"family": "lag", "motor": {}}, "unknown actuator field motor; known: time_constant, delay"),
+        ({"family": "lag", "delay": -1.0}, r"Lag\.delay = -1\.0: must be a finite number >= 0"),
+        ({"family": "torque_speed", "max_torque": 0}, r"TorqueSpeed\.max_torque = 0: must be a finite number > 0"),
+        ({"family": "ideal", "motor": {}}, "unknown actuator field motor"),
+        (
+            {"family": "nowhere_at_all:Mine"},
+            "'nowhere_at_all:Mine': No module named 'nowhere_at_all'; must be",
+        ),
+        ({"family": f"{__name__}:Yours"}, "has no attribute 'Yours'; must be module:NAME"),
+        ({"family": f"{__name__}:Motor"}, "is no subclass of codrl_mj's ActuatorModel"),
+        ({"family": f"{__name__}:MINE"}, "is no subclass of codrl_mj's ActuatorModel"),
+        (
+            {"family": "slipped.missing:Mine"},
+            r"missing failed: ModuleNotFoundError: .*'nowhere_at_all' \(.*missing\.py",
+        ),
+        ({"family": "slipped.undefined:Mine"}, r"NameError: name 'z' is not defined \(.*undefined\.py, line 2\)"),
+        ({"family": "slipped.unreadable:Mine"}, "importing slipped.unreadable failed: SyntaxError"),
+        ({"family": "slipped.other:Mine"}, r"'Mine'; must be module:NAME; did you mean 'MINES'\? .*other\.py"),
+        (f"{__name__}:CARTPOLE", "is neither an actuator nor a family of them"),
+        (f"{__name__}:MIEN", "has no attribute 'MIEN'; must be module:NAME"),
+        ("nowhere_at_all:MINE", "No module named 'nowhere_at_all'"),
+        (":", "must be module:NAME"),
+        (f"{__name__}:", "must be module:NAME"),
+        ("itself.yaml", r"^itself\.yaml: name = 'itself\.yaml': must be an actuator's name, and no file"),
+        *((name, rf"^{name}: ") for name in WRONG_FILES),
+        (
+            {"name": "ideal", "motor": {"resistance": 1.0}},
+            "the ideal actuator has no motor and no controller to",
+        ),
+        ({"name": "paper", "motor": {"resistence": 1.0}}, r"unknown actuator field motor\.resistence"),
+        ({"name": "lag", "delay": -1}, r"Lag\.delay = -1"),
+    ],
+)
+def test_what_describes_no_actuator_is_refused_with_the_reason(files, given, message):
+    with pytest.raises(ValueError, match=message):
+        resolve_actuators(given, CARTPOLE)
+
+
+@pytest.mark.parametrize("name", ["paper", "weak", "open_loop", "over.yaml"])
+def test_a_task_without_a_papers_actuator_has_no_variations_of_it(files, name):
+    with pytest.raises(ValueError, match=r"actuator = '\w+': .* of which bare has none; known are current_loop"):
+        resolve_actuators(name, BARE)
+    assert resolve_actuators("ideal", BARE) == (IDEAL,)
+    assert resolve_actuators("lag", BARE) == (Lag(),)
+
+
+def test_a_file_that_is_not_there_is_refused_with_its_name():
+    with pytest.raises(FileNotFoundError, match=r"no actuator file at none\.yaml"):
+        resolve("none.yaml", None, "nobody")
+
 
 PAIR = dataclasses.replace(
     CARTPOLE,
@@ -164,35 +248,23 @@ PAIR = dataclasses.replace(
 def test_every_motor_has_its_own_variation_of_its_own_actuator():
     for name, gain in (("weak", 1.0), ("weaker", 0.2)):
         loop = CurrentLoop(kp=gain, ki=gain)
-        assert resolve_actuators(name, PAIR) == (
-            Actuator(PAIR.paper[0].motor, loop),
-            Actuator(PAIR.paper[1].motor, loop),
-        )
+        assert resolve_actuators(name, PAIR) == tuple(Actuator(paper.motor, loop) for paper in PAIR.paper)
     assert resolve_actuators(["paper", "weak"], PAIR)[0] == PAIR.paper[0]
     assert resolve_actuators(Lag(), PAIR) == (Lag(), Lag())
-
-
-def test_too_few_and_too_many_are_refused_with_the_motors_names():
-    for count in (1, 3):
-        with pytest.raises(ValueError, match=f"{count} actuators for the 2 motors of pair: left, right"):
-            resolve_actuators(["paper"] * count, PAIR)
-
-
-def test_families_are_not_mixed():
-    with pytest.raises(ValueError, match=r"actuators of several families \(Actuator, Lag\)"):
-        resolve_actuators(["paper", Lag()], PAIR)
     assert check_same_family([Lag(0.1), Lag(0.2)]) is Lag
 
 
-def test_a_task_without_a_papers_actuator_has_no_variations_of_it():
-    alone = dataclasses.replace(CARTPOLE, paper=(), name="bare")
-    for name in ("paper", "weak", "open_loop"):
-        with pytest.raises(
-            ValueError, match=rf"actuator = '{name}': .* of which bare has none; known are current_loop"
-        ):
-            resolve_actuators(name, alone)
-    assert resolve_actuators("ideal", alone) == (IDEAL,)
-    assert resolve_actuators("lag", alone) == (Lag(),)
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["paper"], "1 actuators for the 2 motors of pair: left, right"),
+        (["paper"] * 3, "3 actuators for the 2 motors of pair: left, right"),
+        (["paper", Lag()], r"actuators of several families \(Actuator, Lag\)"),
+    ],
+)
+def test_as_many_actuators_as_motors_and_of_one_family(given, message):
+    with pytest.raises(ValueError, match=message):
+        resolve_actuators(given, PAIR)
 
 
 # -- families -----------------------------------------------------------------------------------------------
@@ -210,75 +282,11 @@ def test_every_family_survives_its_mapping_and_json(actuator):
 
 def test_a_family_is_found_by_its_name_and_by_its_place():
     for name, family in FAMILIES.items():
-        assert find_family(name) is family
-        assert find_family(f"{family.__module__}:{family.__name__}") is family
+        assert find_family(name) is find_family(f"{family.__module__}:{family.__name__}") is family
         assert name == family.family
-    assert find_family(f"{__name__}:Mine") is Mine
-
-
-def test_somebody_elses_family_survives_its_mapping_though_its_name_is_not_known():
-    mapping = json.loads(json.dumps(MINE.as_mapping()))
-    assert mapping == {"family": f"{__name__}:Mine", "strength": 3.0}
-    assert actuator_from_mapping(mapping) == MINE
-
-
-def test_a_family_derived_from_ours_survives_its_mapping():
-    derived = Actuator().commands()["voltage"].actuator
-    assert actuator_from_mapping(json.loads(json.dumps(derived.as_mapping()))) == derived
-
-
-def test_a_mapping_without_a_family_is_a_current_loop():
-    assert actuator_from_mapping({"motor": {"resistance": 2.0}}) == Actuator(Motor(resistance=2.0))
-    assert actuator_from_mapping({"family": "current_loop"}) == Actuator()
-
-
-@pytest.mark.parametrize(("wrong", "near"), [("lagg", "lag"), ("torque-speed", "torque_speed"), ("idael", "ideal")])
-def test_an_unknown_family_suggests_the_nearest(wrong, near):
-    with pytest.raises(ValueError, match=f"unknown family '{wrong}': did you mean '{near}'"):
-        actuator_from_mapping({"family": wrong})
-
-
-@pytest.mark.parametrize(
-    ("mapping", "message"),
-    [
-        ({"family": "lag", "time_constnt": 1.0}, r"unknown actuator field time_constnt; did you mean time_constant\?"),
-        ({"family": "lag", "motor": {}}, "unknown actuator field motor; known: time_constant, delay"),
-        ({"family": "lag", "delay": -1.0}, r"Lag\.delay = -1\.0: must be a finite number >= 0"),
-        ({"family": "torque_speed", "max_torque": 0}, r"TorqueSpeed\.max_torque = 0: must be a finite number > 0"),
-        ({"family": "ideal", "motor": {}}, "unknown actuator field motor"),
-    ],
-)
-def test_a_mapping_that_its_family_cannot_read_is_refused(mapping, message):
-    with pytest.raises(ValueError, match=message):
-        actuator_from_mapping(mapping)
-
-
-@pytest.mark.parametrize(
-    ("place", "message"),
-    [
-        ("nowhere_at_all:Mine", "'nowhere_at_all:Mine': No module named 'nowhere_at_all'; must be module:NAME"),
-        (f"{__name__}:Yours", "has no attribute 'Yours'; must be module:NAME"),
-        (f"{__name__}:Motor", "is no subclass of codrl_mj's ActuatorModel"),
-        (f"{__name__}:MINE", "is no subclass of codrl_mj's ActuatorModel"),
-    ],
-)
-def test_a_place_where_there_is_no_family_is_refused(place, message):
-    with pytest.raises(ValueError, match=message):
-        find_family(place)
 
 
 # -- what an actuator is called -------------------------------------------------------------------------------
-
-
-def drawer_motor(folder, **changes):
-    """A motor's file of one's own: a copy of one of the catalogue, and what is changed in it."""
-    from codrl_mj.own_code import asset_folder
-
-    text = (asset_folder() / "motors" / "maxon-re65.toml").read_text()
-    for old, new in changes.items():
-        text = re.sub(rf"^{old} = .*$", f'{old} = "{new}"', text, flags=re.MULTILINE)
-    (folder / "drawer.toml").write_text(text)
-    return folder / "drawer.toml"
 
 
 @pytest.mark.parametrize(
@@ -303,17 +311,10 @@ def drawer_motor(folder, **changes):
         (f"{__name__}:Mine", f"{__name__}:Mine"),
     ],
 )
-def test_an_actuator_is_called_what_it_was_asked_for_by(tmp_path, monkeypatch, given, name):
-    monkeypatch.chdir(tmp_path)
-    drawer_motor(tmp_path)
-    (tmp_path / "bench").mkdir()
-    for file in ("swing.yaml", "bench/actuator.yaml"):
-        (tmp_path / file).write_text(json.dumps(Lag(0.2).as_mapping()))
-    (tmp_path / "short.yaml").write_text("name: kraken-x60\nmotor: {gear_ratio: 70.3}")
+def test_an_actuator_is_called_what_it_was_asked_for_by(files, given, name):
     made = resolve(given, CARTPOLE.paper[0], "cartpole")
     assert name_of(made, CARTPOLE.paper[0]) == name
-    short = named_mapping(made)
-    again = resolve(json.loads(json.dumps(short)), None, "nobody")
+    again = resolve(json.loads(json.dumps(named_mapping(made))), None, "nobody")
     assert again == made
     assert label_of(again) == label_of(made)
 
@@ -333,116 +334,14 @@ def test_a_motor_of_the_catalogue_is_known_by_its_numbers_and_written_short():
     assert named_mapping(labelled(Lag(0.2), "slow")) == {"label": "slow", **Lag(0.2).as_mapping()}
 
 
-def test_a_name_is_nothing_of_the_actuator(tmp_path):
-    asked, plain = resolve(str(drawer_motor(tmp_path)), None, "nobody"), resolve("maxon-re65", None, "nobody")
+def test_a_name_is_nothing_of_the_actuator(files):
+    asked, plain = resolve("drawer.toml", None, "nobody"), resolve("maxon-re65", None, "nobody")
     assert (name_of(asked), name_of(plain)) == ("drawer", "maxon-re65")
-    assert asked == plain
-    assert hash(asked) == hash(plain)
-    assert asked.as_mapping() == plain.as_mapping()
-    assert label_of(labelled(IDEAL, "nothing")) == ""
-
-
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
-        (
-            "import nowhere_at_all",
-            r"importing slipped failed: ModuleNotFoundError: .*'nowhere_at_all' \(.*slipped\.py, l",
-        ),
-        ("x = 1\ny = z", r"importing slipped failed: NameError: name 'z' is not defined \(.*slipped\.py, line 2\)"),
-        ("def :", "importing slipped failed: SyntaxError"),
-        ("MINES = 1", r"has no attribute 'Mine'; must be module:NAME; did you mean 'MINES'\? .*slipped\.py"),
-    ],
-)
-def test_of_a_module_that_cannot_be_used_the_cause_is_said(source, message, tmp_path, monkeypatch):
-    (tmp_path / "slipped.py").write_text(source)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "slipped", raising=False)
-    with pytest.raises(ValueError, match=message):
-        find_family("slipped:Mine")
-    sys.modules.pop("slipped", None)
+    assert (asked, hash(asked), asked.as_mapping()) == (plain, hash(plain), plain.as_mapping())
+    assert label_of(labelled(IDEAL, "nothing")) == label_of(MINE) == ""  # which may be known by other names
 
 
 # -- places and files ---------------------------------------------------------------------------------------
-
-
-def test_an_actuator_or_a_family_of_anybodys_is_named_by_its_place():
-    assert resolve(f"{__name__}:MINE", None, "nobody") == MINE
-    assert label_of(MINE) == ""  # it may be known by other names
-    assert resolve(f"{__name__}:Mine", None, "nobody") == Mine()
-
-
-@pytest.mark.parametrize(
-    ("place", "message"),
-    [
-        (f"{__name__}:CARTPOLE", "is neither an actuator nor a family of them"),
-        (f"{__name__}:MIEN", "has no attribute 'MIEN'; must be module:NAME"),
-        ("nowhere_at_all:MINE", "No module named 'nowhere_at_all'"),
-        (":", "must be module:NAME"),
-        (f"{__name__}:", "must be module:NAME"),
-    ],
-)
-def test_a_place_where_there_is_no_actuator_is_refused(place, message):
-    with pytest.raises(ValueError, match=message):
-        resolve(place, None, "nobody")
-
-
-@pytest.mark.parametrize("name", ["mine.yaml", "mine.yml", "mine.json"])
-def test_a_file_holds_the_mapping(name, tmp_path):
-    path = tmp_path / name
-    for actuator in (Lag(0.2, 0.01), Actuator(Motor(resistance=3.0), supply=Supply(12.0, 0.5)), MINE):
-        path.write_text(json.dumps(actuator.as_mapping()))  # JSON is YAML
-        assert resolve(str(path), None, "nobody") == actuator
-        assert resolve(path, None, "nobody") == actuator
-
-
-def test_a_file_may_set_fields_over_a_named_actuator(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text("name: weak\nmotor: {resistance: 2}\n")
-    motor = dataclasses.replace(CARTPOLE.paper[0].motor, resistance=2.0)
-    assert resolve_actuators(path, CARTPOLE) == (Actuator(motor, CurrentLoop(kp=1.0, ki=1.0)),)
-    with pytest.raises(ValueError, match=re.escape(f"{path}: actuator = 'weak': a variation of the paper's")):
-        resolve(path, None, "nobody")
-    path.write_text(f"name: {path}\n")
-    with pytest.raises(
-        ValueError, match=re.escape(f"{path}: name = '{path}': must be an actuator's name, and no file")
-    ):
-        resolve_actuators(path, CARTPOLE)
-
-
-def test_yaml_may_be_written_by_hand(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text("motor: {resistance: 2}\ncontroller:\n  kp: 1.5  # V/A\n  max_voltage: .inf\n")
-    assert resolve(path, None, "nobody") == Actuator(
-        Motor(resistance=2.0), CurrentLoop(kp=1.5, max_voltage=float("inf"))
-    )
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{",
-        "3",
-        "",
-        "[1, 2]",
-        "family: lagg",
-        "motr: {}",
-        "motor: 3",
-        "controller: {kp: -1}",
-        "1: 2",
-        "controller: {kp: }",
-    ],
-)
-def test_a_file_that_describes_no_actuator_is_refused_with_its_name(text, tmp_path):
-    path = tmp_path / "wrong.yaml"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=re.escape(f"{path}: ")):
-        resolve(str(path), None, "nobody")
-
-
-def test_a_file_that_is_not_there_is_refused_with_its_name(tmp_path):
-    with pytest.raises(FileNotFoundError, match=re.escape(f"no actuator file at {tmp_path / 'none.yaml'}")):
-        resolve(str(tmp_path / "none.yaml"), None, "nobody")
 
 
 # -- single fields over another actuator ----------------------------------------------------------------------
@@ -458,12 +357,3 @@ def test_single_fields_are_set_over_anothers():
     assert actuator_over(Lag(0.1, 0.2), {"delay": 0.3}) == Lag(0.1, 0.3)
     assert actuator_over(TorqueSpeed(), {"max_torque": 2.0}) == TorqueSpeed(max_torque=2.0)
     assert actuator_over(IDEAL, {"motor": {}}) is IDEAL
-
-
-def test_what_cannot_be_set_is_refused():
-    with pytest.raises(ValueError, match="the ideal actuator has no motor and no controller to set fields of"):
-        actuator_over(IDEAL, {"motor": {"resistance": 1.0}})
-    with pytest.raises(ValueError, match=r"unknown actuator field motor\.resistence"):
-        actuator_over(Actuator(), {"motor": {"resistence": 1.0}})
-    with pytest.raises(ValueError, match=r"Lag\.delay = -1"):
-        actuator_over(Lag(), {"delay": -1})

@@ -23,22 +23,30 @@ def servo(supply=1e4, **loop):
     return Servo(MOTOR, SampledLoop(20e3), Supply(supply), ServoLoop(**loop))
 
 
-def turned(one, targets, timestep, load=0.0):
-    """Positions [rad] and speeds [rad/s] of a hinge under targets, one a step, and a torque [N*m] besides."""
+def hinge(timestep=0.001):
+    """The spec of a hinge with a motor, under an integrator that uses its derivatives."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.gravity, body = timestep, [0.0] * 3, spec.worldbody.add_body()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    body.explicitinertial, body.mass, body.inertia = True, 1.0, [INERTIA] * 3
+    body.add_geom(size=[0.1] * 3, mass=INERTIA / 0.4 / 0.01)  # a ball
     body.add_joint(name="shaft", axis=[0.0, 0.0, 1.0])
-    spec.add_actuator(target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_position(kp=3.0, kv=1.0)
-    model = codrl_mj.motorise(spec, {"shaft": one}).compile()
+    spec.add_actuator(name="it", target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+    return spec
+
+
+def run(model, targets, load=0.0, start=0.0):
+    """Positions [rad] and speeds [rad/s] under targets, one a step, and a torque [N*m] besides, from a position."""
     data, rows = mujoco.MjData(model), []
-    data.qfrc_applied[:] = load
+    data.qfrc_applied[:], data.qpos[:] = load, start
     for target in targets:
         data.ctrl[:] = target
         mujoco.mj_step(model, data)
         rows.append((data.qpos[0], data.qvel[0]))
     return np.array(rows).T
+
+
+def turned(one, targets, timestep=0.001, load=0.0):
+    return run(codrl_mj.motorise(hinge(timestep), {"shaft": one}).compile(), targets, load)
 
 
 @pytest.mark.parametrize(
@@ -69,23 +77,12 @@ def test_what_the_model_s_own_servo_was_is_gone(saved):
     """That is `<position kp="3" kv="30">`, under an integrator that would use its derivative too; and in its XML."""
     ways = []
     for own in (True, False):
-        spec = mujoco.MjSpec()
-        spec.option.timestep, spec.option.gravity, body = 0.002, [0.0] * 3, spec.worldbody.add_body()
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        body.add_geom(size=[0.1] * 3, mass=INERTIA / 0.4 / 0.01)  # a ball
-        body.add_joint(name="shaft", axis=[0.0, 0.0, 1.0])
-        actuator = spec.add_actuator(target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        actuator.set_to_position(kp=3.0, kv=30.0) if own else actuator.set_to_motor()
+        spec = hinge(0.002)
+        if own:
+            spec.actuator("it").set_to_position(kp=3.0, kv=30.0)
         motorised = codrl_mj.motorise(spec, {"shaft": servo(velocity_gain=1.5, servo_rate=500.0)})
         model = motorised.compile()
-        if saved:
-            model = mujoco.MjModel.from_xml_string(motorised.to_xml())
-        data, way = mujoco.MjData(model), []
-        while data.time < 0.5:
-            data.ctrl[:] = 0.3
-            mujoco.mj_step(model, data)
-            way.append(data.qpos[0])
-        ways.append(way)
+        ways.append(run(mujoco.MjModel.from_xml_string(motorised.to_xml()) if saved else model, [0.3] * 250)[0])
     np.testing.assert_array_equal(*ways)
     assert ways[0][-1] == pytest.approx(0.3, abs=2e-3)
 
@@ -93,7 +90,7 @@ def test_what_the_model_s_own_servo_was_is_gone(saved):
 @pytest.mark.parametrize(("integral", "left"), [(0.0, 0.2 / 1.5), (20.0, 0.0)])
 def test_an_integral_takes_what_a_load_leaves(integral, left):
     one = servo(controls="velocity", velocity_gain=1.5, velocity_integral_gain=integral)
-    _, speeds = turned(one, [2.0] * 2000, 0.001, load=-0.2)
+    _, speeds = turned(one, [2.0] * 2000, load=-0.2)
     assert speeds[-1] == pytest.approx(2.0 - left, abs=1e-3)
 
 
@@ -101,7 +98,7 @@ def test_the_integral_does_not_wind_up():
     """The shaft cannot follow for a second, and then can."""
     one = servo(supply=4.0, controls="velocity", velocity_gain=1.5, velocity_integral_gain=20.0, max_torque=0.3)
     targets = np.where(np.arange(3000) < 2000, 100.0, 3.0)
-    _, speeds = turned(one, targets, 0.001)
+    _, speeds = turned(one, targets)
     reached = -math.expm1(-2.0 * 0.042**2 / (8.4 * TOTAL / RATIO**2))  # of the no-load speed, in 2 s
     assert speeds[1999] == pytest.approx(reached * 4.0 / (0.042 * RATIO), rel=1e-3)
     assert (np.abs(speeds[2450:] - 3.0) < 0.05).all()
@@ -109,7 +106,7 @@ def test_the_integral_does_not_wind_up():
 
 def test_speed_and_torque_keep_their_limits():
     one = servo(velocity_gain=1.5, max_velocity=2.0, max_torque=0.4)
-    _, speeds = turned(one, [3.0] * 1400, 0.001)
+    _, speeds = turned(one, [3.0] * 1400)
     assert speeds[50] == pytest.approx(0.4 / TOTAL * 0.051, rel=0.02)
     assert speeds[700] == pytest.approx(2.0, rel=1e-3)
     assert speeds.max() < 2.01
@@ -118,7 +115,7 @@ def test_speed_and_torque_keep_their_limits():
 def test_feed_forward_takes_the_lag_away():
     targets = 0.5 * np.arange(1, 2001) * 0.001
     lags = [
-        targets[-1] - turned(servo(velocity_gain=1.5, velocity_feed_forward=share), targets, 0.001)[0][-1]
+        targets[-1] - turned(servo(velocity_gain=1.5, velocity_feed_forward=share), targets)[0][-1]
         for share in (0.0, 1.0)
     ]
     assert lags[0] == pytest.approx(0.5 / 20.0, rel=0.05)
@@ -126,7 +123,7 @@ def test_feed_forward_takes_the_lag_away():
     ramp = 2.0 * np.arange(1, 2001) * 0.001
     for inertia, left in ((0.0, 2.0 * TOTAL / 1.5), (TOTAL, 0.0)):
         one = servo(controls="velocity", velocity_gain=1.5, inertia_feed_forward=inertia)
-        _, speeds = turned(one, ramp, 0.001)
+        _, speeds = turned(one, ramp)
         assert ramp[-1] - speeds[-1] == pytest.approx(left, abs=0.003)
 
 
@@ -142,7 +139,7 @@ def test_feed_forward_takes_the_lag_away():
 )
 def test_what_cannot_work_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        turned(servo(**{"velocity_gain": 1.5, **change}), [], 0.001)
+        turned(servo(**{"velocity_gain": 1.5, **change}), [])
 
 
 @pytest.mark.parametrize("rate", [500.0, 1000.0])
@@ -168,64 +165,52 @@ def test_the_bound_of_stability_is_where_it_is(gains, rate):
             supply=1e9, position_gain=position, velocity_gain=gain, velocity_integral_gain=integral, servo_rate=rate
         )
         one = dataclasses.replace(one, controller=SampledLoop(100e3))
-        spec_positions, _ = _free(one, 1e-6)
-        assert least * 1e-6 <= np.abs(spec_positions[-50:]).max() <= most * 1e-6
+        model = codrl_mj.motorise(hinge(), {"shaft": one}, allow_unstable=True).compile()
+        assert least * 1e-6 <= np.abs(run(model, [0.0] * 1500, start=1e-6)[0][-50:]).max() <= most * 1e-6
 
 
-def _free(one, start):
-    """As `turned`, let be unstable, with a target of 0 from a position beside it."""
-    spec = mujoco.MjSpec()
-    spec.option.timestep, spec.option.gravity, body = 0.001, [0.0] * 3, spec.worldbody.add_body()
-    body.explicitinertial, body.mass, body.inertia = True, 1.0, [INERTIA] * 3
-    body.add_joint(name="shaft", axis=[0.0, 0.0, 1.0])
-    spec.add_actuator(target="shaft", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
-    model = codrl_mj.motorise(spec, {"shaft": one}, allow_unstable=True).compile()
-    data, rows = mujoco.MjData(model), []
-    data.qpos[:] = start
-    for _ in range(1500):
-        mujoco.mj_step(model, data)
-        rows.append((data.qpos[0], data.qvel[0]))
-    return np.array(rows).T
+ASKED = Servo(GearMotor(gear_ratio=20.0), SampledLoop(20e3), Supply(48.0), ServoLoop(velocity_gain=3.0))
 
 
-def test_an_agent_asks_a_servo_for_positions_and_not_for_forces():
-    one = Servo(GearMotor(gear_ratio=20.0), SampledLoop(20e3), Supply(48.0), ServoLoop(velocity_gain=3.0))
-    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=one, action="position", max_episode_steps=500)
+def test_an_agent_asks_a_servo_for_positions():
+    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=ASKED, action="position", max_episode_steps=500)
     assert env.action_space.high == pytest.approx(math.pi)
     env.reset(seed=0)
     for _ in range(100):
         _, _, _, _, info = env.step(np.array([1.0], np.float32))
     # in the units of the joint, and held there against gravity by an error: no integral
-    angle = env.unwrapped.state[0] if hasattr(env.unwrapped, "state") else env.unwrapped.data.qpos[0]
-    assert info["error"] == pytest.approx(1.0 - angle, abs=1e-6)
+    assert info["error"] == pytest.approx(1.0 - env.unwrapped.data.qpos[0], abs=1e-6)
     assert abs(info["error"]) < 0.1
     assert info["desired_force"] == info["actual_force"]
-    with pytest.raises(ValueError, match="a Servo is not asked for forces; must be one of position"):
-        gymnasium.make("codrl_mj/Pendulum-v0", actuator=one)
 
 
-def test_a_position_that_is_wrapped_is_not_held():
-    one = Servo(GearMotor(gear_ratio=20.0), SampledLoop(20e3), Supply(48.0), ServoLoop(velocity_gain=3.0))
-    with pytest.raises(
-        ValueError, match=r"acrobot wraps theta1 .*theta2 .*, and a position that jumps by a turn cannot be held"
-    ):
-        gymnasium.make("codrl_mj/Acrobot-v0", actuator=one, action="position", levels=(-1.0, 0.0, 1.0))
+@pytest.mark.parametrize(
+    ("env_id", "options", "message"),
+    [
+        ("Pendulum-v0", {}, "a Servo is not asked for forces; must be one of position"),
+        (
+            "Acrobot-v0",
+            {"levels": (-1.0, 0.0, 1.0)},
+            r"acrobot wraps theta1 .*theta2 .*, and a position that jumps",
+        ),
+    ],
+)
+def test_what_a_servo_cannot_be_asked_for_is_refused(env_id, options, message):
+    action = {"action": "position", **options} if options else {}
+    with pytest.raises(ValueError, match=message):
+        gymnasium.make(f"codrl_mj/{env_id}", actuator=ASKED, **action)
 
 
 def test_servos_in_a_vector_are_the_servos_alone():
-    one = Servo(GearMotor(gear_ratio=20.0), SampledLoop(20e3), Supply(48.0), ServoLoop("velocity", velocity_gain=3.0))
-    arguments = {
-        "actuator": one,
-        "action": "velocity",
-        "randomize": {"motor.resistance": Uniform(4.0, 12.0), "loop.velocity_gain": Uniform(1.0, 5.0)},
-    }
-    ours = gymnasium.make_vec("codrl_mj/Pendulum-v0", 3, "vector_entry_point", **arguments)
-    alone = gymnasium.make_vec("codrl_mj/Pendulum-v0", 3, "sync", **arguments)
-    np.testing.assert_array_equal(ours.reset(seed=3)[0], alone.reset(seed=3)[0])
+    draws = {"motor.resistance": Uniform(4.0, 12.0), "loop.velocity_gain": Uniform(1.0, 5.0)}
+    one = dataclasses.replace(ASKED, loop=ServoLoop("velocity", velocity_gain=3.0))
+    arguments = {"actuator": one, "action": "velocity", "randomize": draws}
+    both = [gymnasium.make_vec("codrl_mj/Pendulum-v0", 3, kind, **arguments) for kind in ("vector_entry_point", "sync")]
+    np.testing.assert_array_equal(*(envs.reset(seed=3)[0] for envs in both))
     for action in np.random.default_rng(0).uniform(-10, 10, size=(40, 3, 1)).astype(np.float32):
-        (*one_step, infos), (*other, expected) = ours.step(action), alone.step(action)
-        np.testing.assert_array_equal(one_step[0], other[0])
-        np.testing.assert_array_equal(infos["error"], expected["error"])
+        ours, alone = (envs.step(action) for envs in both)
+        np.testing.assert_array_equal(ours[0], alone[0])
+        np.testing.assert_array_equal(ours[4]["error"], alone[4]["error"])
 
 
 @pytest.mark.parametrize(

@@ -14,41 +14,27 @@ pytestmark = pytest.mark.usefixtures("bare_engine")
 HEAD, SIZE = user_head(Actuator), slot_size(Actuator)
 
 
-def _user(head):
-    return " ".join(map(repr, [*head, *Actuator().numbers]))
+OURS = (*HEAD, *Actuator().numbers)
 
 
-OURS = _user(HEAD)
-NOT_OURS = _user((HEAD[0], HEAD[1] + 1, HEAD[2]))
-NO_FAMILY = _user((*HEAD[:2], (HEAD[2] + 1) % 10**6))
-NO_NUMBER = _user((*HEAD[:2], -1.0))
+def general(user=(), actdim=SIZE, **kinds):
+    """An actuator with user dynamics and bias, or other kinds, and user data."""
+    kinds = {"dyntype": "user", "biastype": "user", "actdim": actdim, "user": " ".join(map(repr, user))} | kinds
+    return f'<general joint="a" {" ".join(f"""{name}="{value}" """ for name, value in kinds.items() if value)}/>'
+
 
 FOREIGN = {
-    "user dynamics and bias without user data": '<general joint="a" dyntype="user" actdim="3" biastype="user"/>',
-    "as many activations and no user data": f'<general joint="a" dyntype="user" actdim="{SIZE}" biastype="user"/>',
-    "as many activations and other user data": (
-        f'<general joint="a" dyntype="user" actdim="{SIZE}" biastype="user" user="{NOT_OURS}"/>'
-    ),
-    "our signature and a family that nobody loaded": (
-        f'<general joint="a" dyntype="user" actdim="{SIZE}" biastype="user" user="{NO_FAMILY}"/>'
-    ),
-    "our signature and a number that is no family's": (
-        f'<general joint="a" dyntype="user" actdim="{SIZE}" biastype="user" user="{NO_NUMBER}"/>'
-    ),
-    "short user data": (
-        f'<general joint="a" dyntype="user" actdim="{SIZE}" biastype="user" user="{HEAD[0]} {HEAD[1]}"/>'
-    ),
-    "our user data on a plain motor": f'<motor joint="a" user="{OURS}"/>',
-    "our user data on another dynamics": (
-        f'<general joint="a" dyntype="filter" dynprm="0.1" biastype="user" user="{OURS}"/>'
-    ),
-    "our user data on another bias": (
-        f'<general joint="a" dyntype="user" actdim="{SIZE}" biastype="affine" biasprm="1 2 3" user="{OURS}"/>'
-    ),
-    "our user data with another number of activations": (
-        f'<general joint="a" dyntype="user" actdim="{SIZE - 1}" biastype="user" user="{OURS}"/>'
-    ),
-    "user gain": f'<general joint="a" gaintype="user" user="{NOT_OURS}"/>',
+    "user dynamics and bias without user data": general(actdim=3),
+    "as many activations and no user data": general(),
+    "as many activations and other user data": general((HEAD[0], HEAD[1] + 1, *OURS[2:])),
+    "our signature and a family that nobody loaded": general((*HEAD[:2], (HEAD[2] + 1) % 10**6, *OURS[3:])),
+    "our signature and a number that is no family's": general((*HEAD[:2], -1.0, *OURS[3:])),
+    "short user data": general(HEAD[:2]),
+    "our user data on a plain motor": general(OURS, actdim=0, dyntype="", biastype=""),
+    "our user data on another dynamics": general(OURS, actdim=0, dyntype="filter", dynprm="0.1"),
+    "our user data on another bias": general(OURS, biastype="affine", biasprm="1 2 3"),
+    "our user data with another number of activations": general(OURS, actdim=SIZE - 1),
+    "user gain": general((HEAD[0], HEAD[1] + 1), actdim=0, dyntype="", biastype="", gaintype="user"),
     "integrator": '<general joint="a" dyntype="integrator"/>',
     "muscle": '<muscle joint="a" lengthrange="-1 1" force="1"/>',
     "dc motor": '<dcmotor joint="a" motorconst="0.5 0.5" resistance="1" inductance="0.1" input="voltage"/>',
@@ -88,21 +74,15 @@ def test_a_foreign_model_moves_as_without_us(kind, integrator):
     np.testing.assert_array_equal(trajectory(model, inputs, _start(model)), without)
 
 
-def test_models_compile_alike_while_installed():
-    before = mujoco.MjModel.from_xml_string(_xml(FOREIGN["integrator"]))
-    ours_before = rotor_spec().compile()
-    engine.install()
-    after = mujoco.MjModel.from_xml_string(_xml(FOREIGN["integrator"]))
-    ours_after = rotor_spec().compile()
-    spec = mujoco.MjSpec.from_string(_xml(FOREIGN["muscle"]))
-    spec.compile()
-    for one, other in ((before, after), (ours_before, ours_after)):
-        blobs = []
-        for model in (one, other):
-            blob = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-            mujoco.mj_saveModel(model, None, blob)
-            blobs.append(blob)
-        np.testing.assert_array_equal(*blobs)
+@pytest.mark.parametrize("build", [rotor_spec, lambda: mujoco.MjSpec.from_string(_xml(FOREIGN["muscle"]))])
+def test_models_compile_alike_while_installed(build):
+    blobs = []
+    for _ in range(2):
+        model = build().compile()
+        blobs.append(np.empty(mujoco.mj_sizeModel(model), np.uint8))
+        mujoco.mj_saveModel(model, None, blobs[-1])
+        engine.install()
+    np.testing.assert_array_equal(*blobs)
 
 
 def test_a_spec_is_recompiled_mid_episode_while_installed():

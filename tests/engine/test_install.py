@@ -30,43 +30,36 @@ def _set(name, callback):
     getattr(mujoco, f"set_mjcb_{name}")(callback)
 
 
-def test_install_sets_both_callbacks_and_uninstall_removes_them():
-    assert not engine.installed()
-    engine.install()
-    assert engine.installed()
-    assert None not in _present().values()
-    engine.uninstall()
-    assert not engine.installed()
-    assert _present() == {"control": None, "act_bias": None}
-
-
 def test_install_and_uninstall_are_idempotent():
     engine.uninstall()
+    assert not engine.installed()
     engine.install()
     once = _present()
+    assert engine.installed()
+    assert None not in once.values()
     engine.install()
     assert all(_present()[name] is once[name] for name in once)
-    engine.uninstall()
-    engine.uninstall()
+    for _ in range(2):
+        engine.uninstall()
+        assert not engine.installed()
+        assert _present() == {"control": None, "act_bias": None}
     engine.install()
     assert all(_present()[name] is once[name] for name in once)
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_a_foreign_callback_is_not_replaced_and_nothing_changes(name):
+def test_a_foreign_callback_is_neither_replaced_nor_removed(name):
     _set(name, FOREIGN[name])
     with pytest.raises(engine.CallbackInUseError, match=f"mjcb_{name} is already set.*set_mjcb_{name}.None."):
         engine.install()
-    assert _present() == {"control": None, "act_bias": None, name: FOREIGN[name]}
+    alone = {"control": None, "act_bias": None, name: FOREIGN[name]}
+    assert _present() == alone
     assert not engine.installed()
-
-
-@pytest.mark.parametrize("name", FOREIGN)
-def test_uninstall_leaves_a_foreign_callback_alone(name):
+    _set(name, None)
     engine.install()
     _set(name, FOREIGN[name])
     engine.uninstall()
-    assert _present() == {"control": None, "act_bias": None, name: FOREIGN[name]}
+    assert _present() == alone
 
 
 @pytest.mark.parametrize("name", FOREIGN)
@@ -83,16 +76,12 @@ def test_an_unknown_part_is_refused():
         engine.install("engine")
 
 
-def test_a_simulation_whose_callback_was_replaced_says_so_at_the_next_episode():
+def test_a_simulation_whose_callback_was_replaced_says_so_and_works_again_at_the_next_episode_without_it():
     physics = MujocoPhysics(Plant(TASKS["cartpole"], [Actuator()], 1, "euler"))
     mujoco.set_mjcb_control(FOREIGN["control"])
     with pytest.raises(engine.CallbackInUseError):
         physics.reset(physics.state)
-
-
-def test_a_simulation_whose_callback_was_removed_works_again_at_the_next_episode():
-    physics = MujocoPhysics(Plant(TASKS["cartpole"], [Actuator()], 1, "euler"))
-    engine.uninstall()
+    mujoco.set_mjcb_control(None)
     physics.reset(physics.state)
     physics.step(5.0)
     assert physics.trace[-1, 0, trace_names(Actuator).index("current")] > 0.0

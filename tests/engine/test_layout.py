@@ -31,47 +31,31 @@ def _is_pointer(struct_name, field):
     return dict(layout.struct(struct_name)._fields_)[field] is ctypes.c_void_p
 
 
-def _model():
-    spec = mujoco.MjSpec.from_string(layout._PROBE)
-    return spec.compile()
-
-
-def _live_arrays(owner, struct_name):
-    """(field, address) of every array of the C structure that the bindings show and that is not empty."""
-    for field in layout.STRUCTS[struct_name].fields:
-        live = getattr(owner, field.name, None)
-        if isinstance(live, np.ndarray) and live.size and isinstance(field.type, layout.ast_nodes.PointerType):
-            yield field.name, live.ctypes.data
-
-
 @pytest.mark.parametrize("struct_name", ["mjModel", "mjData"])
 def test_every_array_of_a_live_object_lies_where_its_offset_says(struct_name):
-    model = _model()
+    model = mujoco.MjSpec.from_string(layout._PROBE).compile()
     owner = model if struct_name == "mjModel" else mujoco.MjData(model)
     checked = 0
-    for field, address in _live_arrays(owner, struct_name):
-        found = ctypes.c_void_p.from_address(owner._address + layout.offset(struct_name, field)).value
-        if found is None:
-            continue  # lives in the arena, which nothing has used yet
-        assert found == address, field
-        checked += 1
+    for field in layout.STRUCTS[struct_name].fields:
+        live = getattr(owner, field.name, None)
+        if not (isinstance(live, np.ndarray) and live.size and isinstance(field.type, layout.ast_nodes.PointerType)):
+            continue
+        found = ctypes.c_void_p.from_address(owner._address + layout.offset(struct_name, field.name)).value
+        if found is not None:  # else it lives in the arena, which nothing has used yet
+            assert found == live.ctypes.data, field.name
+            checked += 1
     assert checked > 50
 
 
-def test_dotted_fields_are_read_through_the_nested_structure():
-    model = _model()
-    timestep = ctypes.c_double.from_address(model._address + layout.offset("mjModel", "opt.timestep"))
-    assert timestep.value == model.opt.timestep
-    timestep.value = 0.25
-    assert model.opt.timestep == 0.25
-
-
-def test_scalars_are_read_and_written_where_their_offset_says():
-    model = _model()
+def test_scalars_of_nested_structures_too_are_read_and_written_where_their_offset_says():
+    model = mujoco.MjSpec.from_string(layout._PROBE).compile()
     data = mujoco.MjData(model)
-    assert ctypes.c_int64.from_address(model._address + layout.offset("mjModel", "nactuator")).value == model.nactuator
-    ctypes.c_double.from_address(data._address + layout.offset("mjData", "time")).value = 7.5
-    assert data.time == 7.5
+    count = ctypes.c_int64.from_address(model._address + layout.offset("mjModel", "nactuator"))
+    timestep = ctypes.c_double.from_address(model._address + layout.offset("mjModel", "opt.timestep"))
+    time = ctypes.c_double.from_address(data._address + layout.offset("mjData", "time"))
+    assert (count.value, timestep.value, time.value) == (model.nactuator, model.opt.timestep, data.time)
+    timestep.value, time.value = 0.25, 7.5
+    assert (model.opt.timestep, data.time) == (0.25, 7.5)
 
 
 def test_the_hidden_stack_frame_lies_between_its_checked_neighbours():
@@ -87,6 +71,8 @@ def test_unknown_fields_and_types_are_refused():
         layout.offset("mjModel", "opt.no_such_thing")
     with pytest.raises(LayoutError, match="does not know: 'quaternion128'"):
         layout._ctype(layout.ast_nodes.ValueType(name="quaternion128"))
+    assert not hasattr(layout.MODEL, "no_such_thing")
+    assert not hasattr(layout.MODEL.opt, "nactuator")
 
 
 def _check(*first):
@@ -145,8 +131,3 @@ def test_nothing_is_compiled_from_a_wrong_layout(owner, monkeypatch):
 
     with pytest.raises(LayoutError, match=f"MuJoCo {mujoco.__version__}: {owner}"):
         read.compile("float64(uintp)")
-
-
-def test_a_field_that_a_structure_does_not_have_is_no_attribute():
-    assert not hasattr(layout.MODEL, "no_such_thing")
-    assert not hasattr(layout.MODEL.opt, "nactuator")

@@ -28,37 +28,19 @@ def _families(model):
     return {model.actuator(index).name: type(motor) for index, motor in codrl_mj.engine.motors(model).items()}
 
 
-def test_models_from_files_and_text_get_motors_inside_and_none_outside(tmp_path):
+def test_models_from_files_text_and_environments_get_motors_inside_and_none_outside(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(ARM)
-    with codrl_mj.motorised({"servo": "lag"}):
+    with codrl_mj.motorised({"servo": "lag", "elbow": "lag", "b.*": "lag"}):
         models = [mujoco.MjModel.from_xml_path(str(path)), mujoco.MjModel.from_xml_string(xml=ARM)]
-    assert [_families(model) for model in models] == [{"servo": Lag}] * 2
-    assert not codrl_mj.engine.motors(mujoco.MjModel.from_xml_string(ARM))
-
-
-def test_assets_are_found():
-    with codrl_mj.motorised({".*": "lag"}):
-        model = mujoco.MjModel.from_xml_string(ARM_FROM_FILE, {"arm.xml": ARM.encode()})
-    assert _families(model) == {"servo": Lag, "motor": Lag}
-
-
-def test_names_of_joints_match_too():
-    with codrl_mj.motorised({"elbow": "lag"}):
-        assert _families(mujoco.MjModel.from_xml_string(ARM)) == {"motor": Lag}
-
-
-def test_an_environment_that_is_built_inside_has_motors():
-    with codrl_mj.motorised({"b.*": "lag"}):
-        env = gym.make("HalfCheetah-v5")
+        models.append(mujoco.MjModel.from_xml_string(ARM_FROM_FILE, {"arm.xml": ARM.encode()}))
+        ball, env = mujoco.MjModel.from_xml_string(BALL), gym.make("HalfCheetah-v5")
+    with pytest.raises(ZeroDivisionError), codrl_mj.motorised({"servo": "lag"}):
+        raise ZeroDivisionError  # passes, and everything is as before
+    assert [_families(model) for model in models] == [{"servo": Lag, "motor": Lag}] * 3
     assert list(codrl_mj.engine.motors(env.unwrapped.model)) == [0, 1, 2]
-
-
-def test_a_model_without_a_match_is_left_alone_where_another_has_one():
-    with codrl_mj.motorised({"servo": "lag"}):
-        ball, arm = mujoco.MjModel.from_xml_string(BALL), mujoco.MjModel.from_xml_string(ARM)
-    assert _families(arm) == {"servo": Lag}
-    assert ball.nplugin == 0
+    assert ball.nplugin == 0  # without a match it is left alone where others have one
+    assert not codrl_mj.engine.motors(mujoco.MjModel.from_xml_string(ARM))
 
 
 def test_of_nested_blocks_the_innermost_counts():
@@ -67,12 +49,6 @@ def test_of_nested_blocks_the_innermost_counts():
             inner = mujoco.MjModel.from_xml_string(ARM)
         outer = mujoco.MjModel.from_xml_string(ARM)
     assert (*_families(inner), *_families(outer)) == ("motor", "servo")
-
-
-def test_an_exception_passes_and_everything_is_restored():
-    with pytest.raises(ZeroDivisionError), codrl_mj.motorised({"servo": "lag"}):
-        raise ZeroDivisionError
-    assert not codrl_mj.engine.motors(mujoco.MjModel.from_xml_string(ARM))
 
 
 def test_threads_have_motors_of_their_own():
@@ -106,10 +82,6 @@ def test_threads_have_motors_of_their_own():
     ("actuators", "text"),
     [
         ({"wheel": "lag"}, r"'wheel': no actuator has such a name.*there are servo, shoulder, motor, elbow"),
-        ({"serv": "lag"}, "did you mean 'servo'"),
-        ({".*": "lag", "servo": "lag"}, "both '.*' and 'servo' match it"),
-        ({".*": "lagg"}, "did you mean 'lag'"),
-        ({"*": "lag"}, "must be a regular expression"),
         ("lag", "must be a mapping of patterns"),
         ({".*": {"family": "lag", "delay": 1.0}}, "must be <= 0.08 s"),
     ],

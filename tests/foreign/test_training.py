@@ -2,13 +2,12 @@
 
 import dataclasses
 import json
-import os
-import signal
-import time
+import re
 from pathlib import Path
 
 import gymnasium as gym
 import imageio
+import mujoco
 import numpy as np
 import pytest
 import yaml
@@ -27,7 +26,6 @@ from codrl_mj.training.config import read_config
 from tests.foreign.models import BareEnv
 from tests.matrix import but
 from tests.training.interruptions import TERMINATE, crash, differing, interrupt, outcome, resume
-from tests.training.test_kill import in_a_process, kill_test, status_of, wait_for
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # deprecated attributes in other people's models
 MAXON = {".*": "maxon-ec45-flat-50w"}
@@ -51,10 +49,37 @@ CASES = {
 }
 
 
+class _FromOne(BareEnv):
+    action_space = gym.spaces.Discrete(2, start=1)
+
+
+class _Switched(BareEnv):
+    def __init__(self, *, discrete):
+        super().__init__()
+        self.action_space = gym.spaces.Discrete(2) if discrete else BareEnv.action_space
+
+
+class _WithDictionaries(BareEnv):
+    observation_space = gym.spaces.Dict({"all": BareEnv.observation_space})
+
+    def reset(self, **options):
+        observation, info = super().reset(**options)
+        return {"all": observation}, info
+
+
+IDS = {"Bare": BareEnv, "Endless": BareEnv, "Dict": _WithDictionaries, "One": _FromOne, "Switched": _Switched}
+
+
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
+    """Another folder, without pictures, where environments of somebody's are registered."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
+    for name, creator in IDS.items():
+        gym.register(f"Foreign{name}-v0", creator, max_episode_steps=None if name == "Endless" else 50)
+    yield
+    for name in IDS:
+        gym.registry.pop(f"Foreign{name}-v0")
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +97,7 @@ def reacher(tmp_path_factory):
 def test_a_configuration_survives_json(name):
     whole = json.loads(json.dumps(CASES[name].as_mapping()))
     assert TrainConfig.from_mapping(whole, whole=True) == CASES[name]
+    assert TrainConfig.from_mapping({"task": "codrl_mj/Pendulum-v0"}).env.task == "pendulum"  # an id of ours
 
 
 def test_a_file_says_what_is_behind_what(tmp_path):
@@ -83,20 +109,14 @@ def test_a_file_says_what_is_behind_what(tmp_path):
     assert (found.agent.gamma, found.agent.hidden, found.num_envs) == (0.98, (256, 256), 1)  # the others as always
 
 
-def test_ids_of_ours_are_their_tasks():
-    assert TrainConfig.from_mapping({"task": "codrl_mj/Pendulum-v0"}).env.task == "pendulum"
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"task": "HalfCheeta-v5"}, "HalfCheeta.*doesn't exist"),
         ({"task": "HalfCheetah-v5", "actuator": {}}, "actuator = {}: must be one for all"),
         ({"task": "HalfCheetah-v5", "actuator": {"(": "lag"}}, "must be a regular expression"),
         ({"task": "HalfCheetah-v5", "actuator": {".*": "maxon-ec45-flat"}}, "or 'maxon-ec45-flat-50w'?"),
         ({"task": "HalfCheetah-v5", "actuator": "paper"}, "of which the environment HalfCheetah-v5 has none"),
         ({"task": "HalfCheetah-v5", "max_episode_steps": 0}, "must be an integer >= 1"),
-        ({"task": "HalfCheetah-v5", "randomize": ["motor.resistance"]}, "must be FIELD=DISTRIBUTION"),
         ({"task": "HalfCheetah-v5", "options": {"frame_skip": {1, 2}}}, "that JSON can hold"),
         ({"task": "HalfCheetah-v5", "levels": [1.0]}, "HalfCheetah-v5 has none"),
     ],
@@ -125,93 +145,42 @@ def test_an_interrupted_training_comes_to_the_same_result(tmp_path, name):
     assert differing(theirs, ours) == []
 
 
-@pytest.mark.matrix
-def test_a_killed_training_of_the_cheetah_comes_to_the_same_result():
-    line = "HalfCheetah-v5 --actuators .*=maxon-ec45-flat-50w --total-steps 1200 --checkpoint-interval 200 "
-    arguments = ["train", *line.split(), *QUICK.split(), "--env.max-episode-steps", "100"]
-    assert main([*arguments, "--out", "uninterrupted"]) == 0
-    child = in_a_process([*arguments, "--out", "run"])
-    wait_for(lambda: kill_test.saved_steps(Path("run")) >= 400)
-    time.sleep(0.05)  # [s]
-    os.kill(child, signal.SIGKILL)
-    assert status_of(child) == -9
-    assert main(["train", "--resume", "run"]) == 0
-    assert differing(outcome(Path("uninterrupted")), outcome(Path("run"))) == []
-
-
 def test_where_nobody_can_set_the_state_a_continued_training_starts_an_episode():
-    gym.register("ForeignBare-v0", BareEnv, max_episode_steps=50)
-    try:
-        tiny = config(EnvConfig("ForeignBare-v0", {".*": "lag"}))
-        interrupt(tiny, Path("run"), 70, crash)  # in the second episode
-        resume(tiny, Path("run"))
-    finally:
-        gym.registry.pop("ForeignBare-v0")
+    tiny = config(EnvConfig("ForeignBare-v0", {".*": "lag"}))
+    interrupt(tiny, Path("run"), 70, crash)  # in the second episode
+    resume(tiny, Path("run"))
     lengths = np.loadtxt("run/episodes.csv", delimiter=",", skiprows=1)[:, 3]
     assert read_run(Path("run")).steps == 240
     assert set(lengths) == {50.0}  # none was cut
 
 
-def test_dictionaries_of_observations_are_refused():
-    gym.register("ForeignDict-v0", lambda: _WithDictionaries(), max_episode_steps=50)
-    try:
-        with pytest.raises(ValueError, match=r"must be a vector.*FlattenObservation"):
-            train(config(EnvConfig("ForeignDict-v0", {".*": "lag"})), Path("run"))
-    finally:
-        gym.registry.pop("ForeignDict-v0")
+@pytest.mark.parametrize(
+    ("env_id", "agent", "message"),
+    [
+        ("ForeignDict-v0", SMALL, r"must be a vector.*FlattenObservation"),
+        ("ForeignOne-v0", PPOConfig(), r"a choice \(Discrete\) that counts from 0"),
+    ],
+)
+def test_spaces_that_nobody_learns_in_are_refused(env_id, agent, message):
+    with pytest.raises(ValueError, match=message):
+        train(TrainConfig(EnvConfig(env_id), agent, total_steps=8), Path("run"))
 
 
-def test_choices_that_do_not_count_from_0_are_refused():
-    gym.register("ForeignOne-v0", lambda: _FromOne(), max_episode_steps=50)
-    try:
-        with pytest.raises(ValueError, match=r"a choice \(Discrete\) that counts from 0"):
-            train(TrainConfig(EnvConfig("ForeignOne-v0"), PPOConfig(), total_steps=8), Path("run"))
-    finally:
-        gym.registry.pop("ForeignOne-v0")
-
-
-class _FromOne(BareEnv):
-    action_space = gym.spaces.Discrete(2, start=1)
-
-
-@pytest.fixture
-def switched():
-    gym.register("ForeignSwitched-v0", _Switched, max_episode_steps=50)
-    yield "ForeignSwitched-v0"
-    gym.registry.pop("ForeignSwitched-v0")
-
-
-class _Switched(BareEnv):
-    def __init__(self, *, discrete):
-        super().__init__()
-        self.action_space = gym.spaces.Discrete(2) if discrete else BareEnv.action_space
-
-
-def test_the_options_of_an_environment_decide_who_can_act_in_it(switched):
-    posed = {"task": switched, "env": {"options": {"discrete": True}}}
+def test_the_options_of_an_environment_decide_who_can_act_in_it():
+    chosen, options = "ForeignSwitched-v0", {"discrete": True}
+    posed = {"task": chosen, "env": {"options": options}}
     assert [TrainConfig.from_mapping(posed | one).agent.name for one in ({}, {"agent": "dqn"})] == ["ppo", "dqn"]
-    assert TrainConfig.from_mapping({"task": switched, "env": {"options": {"discrete": False}}}).agent.name == "sac"
-    options = TrainConfig.preset(switched, "dqn", env={"options": {"discrete": True}}).env.options
-    assert options == {"discrete": True}
-    line = ["train", switched, "--env.options", "discrete=true", "--agent", "dqn", "--total-steps", "8"]
+    assert TrainConfig.from_mapping({"task": chosen, "env": {"options": {"discrete": False}}}).agent.name == "sac"
+    assert TrainConfig.preset(chosen, "dqn", env={"options": options}).env.options == options
+    line = ["train", chosen, "--env.options", "discrete=true", "--agent", "dqn", "--total-steps", "8"]
     assert main([*line, "--num-envs", "1", "--agent.learning-starts", "4", "--evaluation-episodes", "1"]) == 0
-
-
-class _WithDictionaries(BareEnv):
-    observation_space = gym.spaces.Dict({"all": BareEnv.observation_space})
-
-    def reset(self, **options):
-        observation, info = super().reset(**options)
-        return {"all": observation}, info
 
 
 # -- measuring ------------------------------------------------------------------------------------------------
 
 
-def test_every_integration_step_is_looked_at_and_nothing_changes_by_it():
+def test_every_integration_step_is_looked_at_nothing_changes_by_it_and_a_file_keeps_it():
     """The trace, against the sums of a loop over `mj_step` of one's own."""
-    import mujoco
-
     known = EnvConfig("HalfCheetah-v5", MAXON, max_episode_steps=10)
     policy = RandomPolicy(known.make().action_space, 1)
     (episode,) = run_episodes(policy, known.make, 1, seed=4)
@@ -230,6 +199,10 @@ def test_every_integration_step_is_looked_at_and_nothing_changes_by_it():
     found = codrl_mj.evaluation.summarize(known.task, [episode]).motors
     assert list(found) == ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]
     np.testing.assert_allclose([one["mechanical_work"] for one in found.values()], work, rtol=1e-12)
+    save_episode(episode, Path("episode.npz"))
+    again = load_episode(Path("episode.npz"))
+    for field in dataclasses.fields(episode):
+        np.testing.assert_equal(getattr(again, field.name), getattr(episode, field.name))
 
 
 def test_motors_of_several_families_are_measured_by_what_they_have():
@@ -240,15 +213,6 @@ def test_motors_of_several_families_are_measured_by_what_they_have():
     assert maxon["rms_current"] == pytest.approx(found.rms_current)
     assert maxon["copper_loss"] == pytest.approx(found.copper_loss.mean)
     assert found.success is None  # Reacher says nothing of it
-
-
-def test_an_episode_survives_its_file(tmp_path):
-    known = EnvConfig("Reacher-v5", {".*": "lag"})
-    (episode,) = run_episodes(RandomPolicy(known.make().action_space, 0), known.make, 1)
-    save_episode(episode, tmp_path / "episode.npz")
-    other = load_episode(tmp_path / "episode.npz")
-    for field in dataclasses.fields(episode):
-        np.testing.assert_equal(getattr(other, field.name), getattr(episode, field.name))
 
 
 # -- the command line -----------------------------------------------------------------------------------------
@@ -282,16 +246,12 @@ def test_draws_of_the_model_survive_files_and_flags():
 
 
 def test_an_environment_without_a_time_limit_needs_one():
-    gym.register("ForeignEndless-v0", BareEnv)
-    try:
-        endless = EnvConfig("ForeignEndless-v0", {".*": "lag"})
-        with pytest.raises(ValueError, match="registered without a time limit"):
-            endless.make()
-        limited = dataclasses.replace(endless, max_episode_steps=5)
-        assert TrainConfig(limited, SACConfig()).evaluation_env.time_limit == 5
-        assert evaluate(RandomPolicy(limited.make().action_space), limited, 1).length.mean == 5
-    finally:
-        gym.registry.pop("ForeignEndless-v0")
+    endless = EnvConfig("ForeignEndless-v0", {".*": "lag"})
+    with pytest.raises(ValueError, match="registered without a time limit"):
+        endless.make()
+    limited = dataclasses.replace(endless, max_episode_steps=5)
+    assert TrainConfig(limited, SACConfig()).evaluation_env.time_limit == 5
+    assert evaluate(RandomPolicy(limited.make().action_space), limited, 1).length.mean == 5
 
 
 def test_a_policy_of_stable_baselines_is_evaluated_by_the_id(capsys):
@@ -367,8 +327,6 @@ def test_an_episode_is_filmed_with_the_strip_of_a_motor(reacher, capsys):
     ],
 )
 def test_what_cannot_be_costs_one_line(capfd, line, message):
-    import re
-
     assert main([*line.split(), "--out", "run"]) == 2
     said = [one for one in capfd.readouterr().err.splitlines() if one.startswith("codrl-mj: error")]
     assert len(said) == 1

@@ -1,6 +1,7 @@
 """The control callback and the plugin run the same actuators: bit for bit, whatever happens in between."""
 
 import copy
+import itertools
 import pickle
 
 import mujoco
@@ -10,12 +11,13 @@ from mujoco import rollout
 from mujoco.batch import Batch
 
 import codrl_mj
+from codrl_mj.actuators import TorqueSpeed
+from tests.matrix import but
 from tests.motorised.models import (
     ACTUATORS,
     INTEGRATORS,
     LOOP,
     NOISY,
-    Worn,
     arm,
     behind_callback,
     behind_plugin,
@@ -31,89 +33,75 @@ STEPS = 200
 
 def _both(actuators, integrator, kind="hinge"):
     """Positions, speeds and signals at both doors after each step."""
-    found = []
-    inputs = controls(STEPS, 2)
+    found, motors, count = [], list(actuators.values()), len(actuators)
     for build in (behind_callback, behind_plugin):
         model = build(arm(integrator, kind), actuators)
-        data, read, rows = mujoco.MjData(model), codrl_mj.engine.Readout(model), []
-        codrl_mj.engine.clear_motors(data, range(5, 5 + len(actuators)))
-        shaft = np.ones(2)
+        data, read, rows, shaft = mujoco.MjData(model), codrl_mj.engine.Readout(model), [], np.ones(2)
+        codrl_mj.engine.clear_motors(data, range(5, 5 + count))
         if build is behind_callback:  # where a control is the torque at the shaft, or the shaft's motion
-            arms = [(1 / one.arm_radius if one.MOTION else one.arm_radius) for one in actuators.values()]
-            shaft[: len(actuators)] = arms
-        for desired in inputs:
+            shaft[:count] = [(1 / one.arm_radius if one.MOTION else one.arm_radius) for one in motors]
+        for desired in controls(STEPS, 2):
             data.ctrl[:] = desired * shaft
             mujoco.mj_step(model, data)
             seen = read(data)
             # one door stores the force, the other makes it from the torque
-            wanted = np.where(
-                [one.tracks for one in actuators.values()], desired[: len(actuators)], seen["actual_force"]
-            )
+            wanted = np.where([one.tracks for one in motors], desired[:count], seen["actual_force"])
             np.testing.assert_allclose(seen.pop("desired_force"), wanted, rtol=1e-15)
             rows.append(np.concatenate((data.qpos, data.qvel, data.qfrc_actuator, *seen.values())))
-        assert list(codrl_mj.engine.motors(model).values()) == list(actuators.values())
+        assert list(codrl_mj.engine.motors(model).values()) == motors
         found.append(np.array(rows))
     return found
 
 
+ALONE = [(name, None, "hinge") for name in ACTUATORS]
+MIXED = ("noisy_current_loop", "somebody's", "slide")
+PAIRS = [*ALONE, *itertools.product(ACTUATORS, ACTUATORS, ["hinge", "slide"])]
+
+
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("name", ACTUATORS)
-def test_both_doors_agree(name, integrator):
-    callback, plugin = _both({"one": ACTUATORS[name]}, integrator)
+@pytest.mark.parametrize(("first", "second", "kind"), but([*ALONE, MIXED], PAIRS))
+def test_both_doors_agree(first, second, kind, integrator):
+    second = {} if second is None else {"two": ACTUATORS[second]}
+    callback, plugin = _both({"one": ACTUATORS[first], **second}, integrator, kind)
     np.testing.assert_array_equal(plugin, callback)
-    assert np.isfinite(plugin).all()
+    assert second or np.isfinite(plugin).all()  # two families lack what the other has
+
+
+def of_state(what):
+    def restored(data):
+        state = np.empty(mujoco.mj_stateSize(data.model, what))
+        mujoco.mj_getState(data.model, data, state, what)
+        other = mujoco.MjData(data.model)
+        mujoco.mj_setState(data.model, other, state, what)
+        return other
+
+    return restored
+
+
+SAVED = {
+    "state": of_state(mujoco.mjtState.mjSTATE_FULLPHYSICS),
+    "integration": of_state(mujoco.mjtState.mjSTATE_INTEGRATION),
+    "copy": copy.copy,
+    "pickle": lambda data: pickle.loads(pickle.dumps(data)),
+}
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_both_doors_agree_on_a_model_of_two_families_with_a_slide(integrator):
-    callback, plugin = _both({"one": NOISY, "two": Worn()}, integrator, "slide")
-    np.testing.assert_array_equal(plugin, callback)
-
-
-@pytest.mark.matrix
-@pytest.mark.parametrize("kind", ["hinge", "slide"])
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("second", ACTUATORS)
-@pytest.mark.parametrize("first", ACTUATORS)
-def test_both_doors_agree_on_all_pairs(first, second, integrator, kind):
-    callback, plugin = _both({"one": ACTUATORS[first], "two": ACTUATORS[second]}, integrator, kind)
-    np.testing.assert_array_equal(plugin, callback)
-
-
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_further_forward_calls_and_copies_of_the_data_change_nothing(integrator):
-    model = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["lag"]})
-    inputs = controls(STEPS, 2)
-    expected = trajectory(model, inputs)
+@pytest.mark.parametrize("how", SAVED)
+def test_a_simulation_is_continued_from_what_is_saved_of_it(how, integrator):
+    """Whatever forward calls there are meanwhile, and wherever the saved one goes."""
+    model, inputs = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["lag"]}), controls(STEPS, 2)
 
     def meddle(data):
-        for _ in range(3):
-            mujoco.mj_forward(model, data)
-        with_others = copy.copy(data)
-        mujoco.mj_step(model, with_others, 5)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_step(model, copy.copy(data), 5)
 
-    np.testing.assert_array_equal(trajectory(model, inputs, before_step=meddle), expected)
-
-
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("carry", ["state", "copy", "pickle", "integration"])
-def test_a_simulation_is_continued_from_what_is_saved_of_it(carry, integrator):
-    model = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["lag"]})
-    inputs = controls(STEPS, 2)
     data = mujoco.MjData(model)
     first = trajectory(model, inputs[:70], data)
-    if carry in ("state", "integration"):
-        what = mujoco.mjtState.mjSTATE_FULLPHYSICS if carry == "state" else mujoco.mjtState.mjSTATE_INTEGRATION
-        state = np.empty(mujoco.mj_stateSize(model, what))
-        mujoco.mj_getState(model, data, state, what)
-        other = mujoco.MjData(model)
-        mujoco.mj_setState(model, other, state, what)
-    else:
-        other = copy.copy(data) if carry == "copy" else pickle.loads(pickle.dumps(data))
+    other = SAVED[how](data)
     mujoco.mj_step(model, data, 3)  # the first goes its own way
-    np.testing.assert_array_equal(
-        np.concatenate((first, trajectory(other.model, inputs[70:], other))), trajectory(model, inputs)
-    )
+    rest = trajectory(other.model, inputs[70:], other, before_step=meddle)
+    np.testing.assert_array_equal(np.concatenate((first, rest)), trajectory(model, inputs))
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -131,6 +119,22 @@ def test_a_reset_and_a_keyframe_bring_motors_to_rest(integrator):
     plain = mujoco.MjData(model)
     plain.qpos[:] = used.qpos
     np.testing.assert_allclose(trajectory(model, inputs, used), trajectory(model, inputs, plain), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("share", [0.3, 1.0, 1.7])
+def test_after_a_keyframe_s_time_a_step_takes_no_torque_from_before(integrator, share):
+    spec, found = arm(integrator), []
+    spec.add_key(name="later", time=share * 0.005, qpos=[0.1, -0.2])
+    for model in (spec.copy().compile(), behind_plugin(spec, {".*": TorqueSpeed(1e6, 1e6, 1e6)})):
+        data = mujoco.MjData(model)
+        data.ctrl[:] = 0.3
+        mujoco.mj_step(model, data, 3)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        data.ctrl[:] = -0.5
+        mujoco.mj_step(model, data, 2)
+        found.append(np.concatenate([data.qpos, data.qvel]))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
 
 
 def test_several_families_of_one_model_are_each_as_if_alone():
@@ -213,8 +217,6 @@ def test_noise_has_the_key_that_it_is_given():
         ends.append(trajectory(model, inputs, data))
     np.testing.assert_array_equal(ends[0], ends[1])
     assert not np.array_equal(ends[0], ends[2])
-    with pytest.raises(ValueError, match="there are 1, must be 2, one for each motor"):
-        codrl_mj.engine.clear_motors(data, [1])
 
 
 def test_actuation_switched_off_and_on_again_is_the_same_at_both_doors():

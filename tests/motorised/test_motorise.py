@@ -1,11 +1,13 @@
 """`motorise`: what goes where, what is refused and why, and what is added to joints."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
 
 import codrl_mj
-from codrl_mj.actuators import Actuator, CurrentLoop, Ideal, Lag
+from codrl_mj.actuators import Actuator, CurrentLoop, Drive, GearMotor, Ideal, Lag
 from tests.motorised.models import LOOP, Worn, arm, controls, own_controls, trajectory
 
 _MODEL = """
@@ -38,27 +40,11 @@ THREE = (
 
 
 def test_patterns_match_names_or_what_is_driven_from_beginning_to_end():
-    lag, loop = Lag(time_constant=0.1), LOOP
-    model = codrl_mj.motorise(_spec(*THREE), {"left": lag, "hip_r.*": loop}).compile()
-    assert codrl_mj.engine.motors(model) == {0: lag, 1: loop}
+    lag = Lag(time_constant=0.1)
+    model = codrl_mj.motorise(_spec(*THREE), {"left": lag, "hip_r.*": LOOP}).compile()
+    assert codrl_mj.engine.motors(model) == {0: lag, 1: LOOP}
     model = codrl_mj.motorise(_spec(*THREE), {"hip_.*": "lag", "rope": "ideal"}).compile()
     assert codrl_mj.engine.motors(model) == {0: Lag(), 1: Lag(), 2: Ideal()}
-    with pytest.raises(ValueError, match="'hip': no actuator has such a name, nor drives anything that has"):
-        codrl_mj.motorise(_spec(*THREE), {"hip": "lag"})
-
-
-def test_a_pattern_that_matches_nothing_is_refused_with_what_there_is():
-    with pytest.raises(
-        ValueError, match=r"'hip_rihgt'.*did you mean 'hip_right'\? there are left, hip_left, hip_right, "
-    ):
-        codrl_mj.motorise(_spec(*THREE), {"hip_rihgt": "lag"})
-    with pytest.raises(ValueError, match="there are none"):
-        codrl_mj.motorise(_spec(), {".*": "lag"})
-
-
-def test_two_patterns_for_one_actuator_are_refused():
-    with pytest.raises(ValueError, match=r"actuator left of hip_left: both 'left' and 'hip_.*' match it"):
-        codrl_mj.motorise(_spec(*THREE), {"left": "lag", "hip_.*": "ideal"})
 
 
 @pytest.mark.parametrize(
@@ -75,42 +61,63 @@ def test_actuators_are_given_as_everywhere(given, expected):
     assert codrl_mj.engine.motors(codrl_mj.motorise(arm(), {"one": given}).compile()) == {0: expected}
 
 
-def test_an_actuator_may_come_from_a_file(tmp_path):
-    path = tmp_path / "drive.yaml"
-    path.write_text("family: lag\ntime_constant: 0.3\n")
-    assert codrl_mj.engine.motors(codrl_mj.motorise(arm(), {"one": str(path)}).compile()) == {0: Lag(time_constant=0.3)}
-
-
-def test_the_given_spec_is_not_changed():
-    spec = arm()
+def test_the_given_spec_is_not_changed_and_what_is_unstable_allowed_on_request():
+    spec, unstable = arm(), Actuator(controller=CurrentLoop(kp=500.0))
     before = spec.to_xml()
-    codrl_mj.motorise(spec, {".*": LOOP})
+    model = codrl_mj.motorise(spec, {".*": unstable}, allow_unstable=True).compile()
+    assert codrl_mj.engine.motors(model) == {0: unstable, 1: unstable}
     assert spec.to_xml() == before
 
 
-REFUSED = {
-    "a muscle": ('<muscle joint="hip_left"/>', "mjDYN_MUSCLE"),
-    "a dcmotor": ('<dcmotor joint="hip_left" motorconst="1" resistance="1"/>', "mjDYN_DCMOTOR"),
-    "a pid": ('<pid joint="hip_left" kp="1"/>', "mjGAIN_PID"),
-    "an orientation": ('<orientation joint="ball" kp="1" input="quat"/>', "mjGAIN_SO3"),
-    "a user's dynamics": ('<general joint="hip_left" dyntype="user" actdim="1"/>', "mjDYN_USER"),
-    "a user's bias": ('<general joint="hip_left" biastype="user"/>', "mjBIAS_USER"),
-    "adhesion": ('<adhesion body="world" ctrlrange="0 1"/>', "mjTRN_BODY"),
-    "a ball": ('<motor joint="ball" gear="1 0 0"/>', "neither a hinge nor a slide"),
-    "a free joint": ('<motor joint="free" gear="1 0 0 0 0 0"/>', "neither a hinge nor a slide"),
-    "a reference site": ('<motor site="here" refsite="there" gear="1 0 0 0 0 0"/>', "reference site"),
-    "a delay": ('<motor joint="hip_left" delay="0.02" nsample="3"/>', "delayed"),
-    "user data": ('<motor joint="hip_left" user="0 1"/>', "has user data"),
-    "a limited tendon": ('<motor tendon="weak_rope"/>', "limits the force of its actuators"),
-}
+IMPOSSIBLE = [  # an actuator, and why it cannot be motorised
+    ('<muscle name="it" joint="hip_left"/>', "mjDYN_MUSCLE"),
+    ('<dcmotor name="it" joint="hip_left" motorconst="1" resistance="1"/>', "mjDYN_DCMOTOR"),
+    ('<pid name="it" joint="hip_left" kp="1"/>', "mjGAIN_PID"),
+    ('<orientation name="it" joint="ball" kp="1" input="quat"/>', "mjGAIN_SO3"),
+    ('<general name="it" joint="hip_left" dyntype="user" actdim="1"/>', "mjDYN_USER"),
+    ('<general name="it" joint="hip_left" biastype="user"/>', "mjBIAS_USER"),
+    ('<adhesion name="it" body="world" ctrlrange="0 1"/>', "mjTRN_BODY"),
+    ('<motor name="it" joint="ball" gear="1 0 0"/>', "neither a hinge nor a slide"),
+    ('<motor name="it" joint="free" gear="1 0 0 0 0 0"/>', "neither a hinge nor a slide"),
+    ('<motor name="it" site="here" refsite="there" gear="1 0 0 0 0 0"/>', "reference site"),
+    ('<motor name="it" joint="hip_left" delay="0.02" nsample="3"/>', "delayed"),
+    ('<motor name="it" joint="hip_left" user="0 1"/>', "has user data"),
+    ('<motor name="it" tendon="weak_rope"/>', "limits the force of its actuators"),
+]
+STEEP = Actuator(controller=CurrentLoop(kp=500.0))
+RUBBING = Drive(GearMotor(coulomb_friction=1e-3))
+TWICE = "'.*' matches both actuator kp of hip_left and actuator kv of hip_left: each"
+PAIR = ('<position name="kp" joint="hip_left" kp="5"/>', '<velocity name="kv" joint="hip_left" kv="0.5"/>')
+SITE = '<general name="push" site="here" gear="1 0 0 0 0 0"/>'
 
 
-@pytest.mark.parametrize("kind", REFUSED)
-def test_what_cannot_be_motorised_is_refused_by_name(kind):
-    actuator, reason = REFUSED[kind]
-    named = actuator.replace(" ", ' name="it" ', 1)
-    with pytest.raises(ValueError, match=f"^actuator it of [a-z_]+: cannot be motorised: .*{reason}"):
-        codrl_mj.motorise(_spec(named), {".*": "ideal"})
+@pytest.mark.parametrize(
+    ("actuators", "patterns", "message"),
+    [
+        *(
+            ((one,), {".*": "ideal"}, f"^actuator it of [a-z_]+: cannot be motorised: .*{why}")
+            for one, why in IMPOSSIBLE
+        ),
+        ((SITE,), {"push": RUBBING}, "it drives neither a joint nor a tendon, which the friction"),
+        (THREE, {"hip": "lag"}, "'hip': no actuator has such a name, nor drives anything that has"),
+        (THREE, {"hip_rihgt": "lag"}, r"did you mean 'hip_right'\? there are left, hip_left, hip_right, "),
+        ((), {".*": "lag"}, "there are none"),
+        (THREE, {"left": "lag", "hip_.*": "ideal"}, r"actuator left of hip_left: both 'left' and 'hip_.*' match it"),
+        (PAIR, {".*": "lag"}, re.escape(TWICE)),
+        (THREE, {"*": "lag"}, r"'\*': must be a regular expression \(nothing to repeat"),
+        (THREE, {3: "lag"}, "3: must be a regular expression"),
+        (THREE, [".*"], r"actuators = \['\.\*'\]: must be a mapping of patterns"),
+        (THREE, {"left": STEEP}, r"'left': actuator: the current loop is unstable at a step of 0.01 s"),
+    ],
+)
+def test_what_cannot_be_motorised_is_refused_with_the_reason(actuators, patterns, message):
+    with pytest.raises(ValueError, match=message):
+        codrl_mj.motorise(_spec(*actuators), patterns)
+
+
+def test_what_cannot_be_simulated_is_not_allowed_with_what_is_unstable():
+    with pytest.raises(ValueError, match=r"'one': Lag\.delay = 5: must be <= 0\.04 s"):
+        codrl_mj.motorise(arm(), {"one": Lag(delay=5.0)}, allow_unstable=True)
 
 
 def test_plugins_and_motors_of_ours_are_not_motorised_again():
@@ -141,14 +148,7 @@ def test_the_limit_of_a_tendon_is_not_applied_to_plugins():
     assert forces == [1.0, 45.0]
 
 
-PAIR = ('<position name="kp" joint="hip_left" kp="5"/>', '<velocity name="kv" joint="hip_left" kv="0.5"/>')
-
-
-def test_several_actuators_of_one_joint_are_several_motors_only_if_one_says_so():
-    with pytest.raises(
-        ValueError, match=r"'.*' matches both actuator kp of hip_left and actuator kv of hip_left: each"
-    ):
-        codrl_mj.motorise(_spec(*PAIR), {".*": "lag"})
+def test_several_actuators_of_one_joint_are_several_motors_if_one_says_so():
     plain, ours = _spec(*PAIR).compile(), codrl_mj.motorise(_spec(*PAIR), {"kp": "ideal", "kv": "ideal"}).compile()
     inputs = controls(100, 2)
     np.testing.assert_array_equal(trajectory(ours, inputs), trajectory(plain, inputs))
@@ -164,15 +164,6 @@ def test_two_motors_of_one_joint_are_together_one_twice_as_strong():
     alone = trajectory(codrl_mj.motorise(one, {"a": lag}).compile(), inputs)
     count = one.compile().nq + one.compile().nv
     np.testing.assert_array_equal(together[:, :count], alone[:, :count])
-
-
-def test_an_unstable_actuator_is_refused_unless_asked_for():
-    unstable = Actuator(controller=CurrentLoop(kp=500.0))
-    with pytest.raises(ValueError, match=r"'one': actuator: the current loop is unstable at a step of 0.005 s"):
-        codrl_mj.motorise(arm(), {"one": unstable})
-    assert codrl_mj.engine.motors(codrl_mj.motorise(arm(), {"one": unstable}, allow_unstable=True).compile()) == {
-        0: unstable
-    }
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicitfast"])
@@ -217,29 +208,3 @@ def test_motorised_models_are_attached_to_others():
     both, one = trajectory(model, np.tile(inputs, 2)), trajectory(alone, inputs)
     np.testing.assert_allclose(both[:, :2], one[:, :2], rtol=0, atol=1e-12)
     np.testing.assert_allclose(both[:, 2:4], one[:, :2], rtol=0, atol=1e-12)
-
-
-RUBBING = codrl_mj.actuators.Drive(codrl_mj.actuators.GearMotor(coulomb_friction=1e-3))
-
-
-def test_friction_needs_a_joint_or_a_tendon():
-    with pytest.raises(ValueError, match="it drives neither a joint nor a tendon, which the friction"):
-        codrl_mj.motorise(_spec('<general name="push" site="here" gear="1 0 0 0 0 0"/>'), {"push": RUBBING})
-
-
-@pytest.mark.parametrize(
-    ("patterns", "message"),
-    [
-        ({"*": "lag"}, r"'\*': must be a regular expression \(nothing to repeat"),
-        ({3: "lag"}, "3: must be a regular expression"),
-        ([".*"], r"actuators = \['\.\*'\]: must be a mapping of patterns"),
-    ],
-)
-def test_patterns_that_are_none_are_refused(patterns, message):
-    with pytest.raises(ValueError, match=message):
-        codrl_mj.motorise(arm(), patterns)
-
-
-def test_what_cannot_be_simulated_is_not_allowed_with_what_is_unstable():
-    with pytest.raises(ValueError, match=r"'one': Lag\.delay = 5: must be <= 0\.04 s"):
-        codrl_mj.motorise(arm(), {"one": Lag(delay=5.0)}, allow_unstable=True)

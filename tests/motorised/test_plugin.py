@@ -26,36 +26,18 @@ def test_there_is_one_plugin_of_ours_and_it_stays_where_it_is():
     assert [structure.attributes[index] for index in range(structure.nattribute)] == [b"family"]
 
 
-def test_importing_registers_and_compiles_nothing():
-    code = (
-        "import sys, codrl_mj; from codrl_mj import plugin; assert 'numba' not in sys.modules; "
-        "print(list(plugin.registered())[-1])"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert result.stdout.strip() == "codrl_mj.actuator"
-
-
-def test_a_second_copy_of_the_package_is_refused():
+def test_importing_registers_and_compiles_nothing_and_a_second_copy_is_refused():
     """MuJoCo itself would end the process."""
     code = (
-        "import sys, codrl_mj\n"
+        "import sys, codrl_mj; from codrl_mj import plugin; assert 'numba' not in sys.modules\n"
+        "print(list(plugin.registered())[-1])\n"
         "for name in [name for name in sys.modules if name.startswith('codrl_mj')]: del sys.modules[name]\n"
         "import codrl_mj"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert result.stdout.strip() == "codrl_mj.actuator"
     assert result.returncode == 1
     assert "RuntimeError: MuJoCo has a plugin codrl_mj.actuator already: another copy of codrl_mj" in result.stderr
-
-
-def _pid():
-    slot, structure = plugin.registered()["mujoco.pid"]
-    copy = plugin.Plugin()
-    ctypes.pointer(copy)[0] = structure
-    return slot, copy
-
-
-def test_the_structure_of_the_installed_mujoco_is_accepted():
-    plugin.check_structure({"mujoco.pid": _pid()})
 
 
 @pytest.mark.parametrize(
@@ -70,13 +52,15 @@ def test_the_structure_of_the_installed_mujoco_is_accepted():
     ],
 )
 def test_a_structure_that_is_another_is_refused(change):
-    slot, structure = _pid()
+    slot, original = plugin.registered()["mujoco.pid"]
+    structure = plugin.Plugin()
+    ctypes.pointer(structure)[0] = original
+    plugin.check_structure({"mujoco.pid": (slot, structure)})
     for name, value in change.items():
         setattr(structure, name, value)
-    with pytest.raises(plugin.LayoutError, match=r"its plugin mujoco\.pid is not as expected"):
-        plugin.check_structure({"mujoco.pid": (slot, structure)})
-    with pytest.raises(plugin.LayoutError, match=r"its plugin mujoco\.pid is not as expected"):
-        plugin.check_structure({})
+    for registered in ({"mujoco.pid": (slot, structure)}, {}):
+        with pytest.raises(plugin.LayoutError, match=r"its plugin mujoco\.pid is not as expected"):
+            plugin.check_structure(registered)
 
 
 def test_a_family_defined_anew_takes_the_place_of_the_one_before_if_models_can_go_on():
