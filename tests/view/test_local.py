@@ -3,6 +3,7 @@
 import asyncio
 import http.client
 import socket
+import sys
 import time
 
 import msgspec
@@ -75,14 +76,7 @@ def test_it_asks_nobody_to_share_it(server):
 
 
 def test_malformed_messages_and_clients_that_vanish_do_it_no_harm(server):
-    bad = [
-        b"",
-        b"\x00\xff\x13",
-        b"\xc1",
-        msgspec.msgpack.encode({"type": "Nonsense"}),
-        msgspec.msgpack.encode([1, 2]),
-        "text",
-    ]
+    bad = [b"", b"\x00\xff\x13", b"\xc1", *map(msgspec.msgpack.encode, ({"type": "Nonsense"}, [1, 2])), "text"]
 
     async def attempt():
         for message in bad:
@@ -111,8 +105,6 @@ def test_malformed_messages_and_clients_that_vanish_do_it_no_harm(server):
 
 
 def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys):
-    import sys
-
     monkeypatch.setitem(sys.modules, "codrl_mj.view.browser", None)
     monkeypatch.setitem(sys.modules, "viser", None)
     monkeypatch.delitem(sys.modules, "codrl_mj.view.browser")
