@@ -178,6 +178,8 @@ def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
     policy, _ = trained("furuta", "ppo")
     export(policy, FURUTA, "ppo", tmp_path / "out", 1, limits=limits)
     contract, python = Contract.read(tmp_path / "out"), OnnxPolicy(tmp_path / "out")
+    assert contract.limits == {"arm_velocity": [-4.0, 4.0], "cos_rod": [pytest.approx(np.cos(3.0)), None]}
+    assert "arm_velocity, at least -4, at most 4" in (tmp_path / "out/controller.h").read_text()
     angles = np.random.default_rng(0).uniform(-np.pi, np.pi, 200)
     rows = np.array([[1.0, 0.0, np.cos(one), np.sin(one), 3.0 * one, 0.0] for one in angles])
     fine = (np.abs(angles) < 3.0) & (np.abs(3.0 * angles) < 4.0)
