@@ -18,7 +18,7 @@ import pytest
 
 import codrl_mj
 from codrl_mj import register
-from codrl_mj.actuators import NAMED, CurrentLoop, Ideal, Lag, Motor, Supply
+from codrl_mj.actuators import NAMED, CurrentLoop, Lag, Motor, Supply
 from codrl_mj.agents.presets import ELSEWHERE, PRESETS
 from codrl_mj.cli import VERBS, find_verb, main
 from codrl_mj.envs.config import EnvConfig
@@ -156,26 +156,19 @@ def test_the_help_of_a_verb_with_numbers_has_json(capsys, verb):
 # -- train, evaluate, render --------------------------------------------------------------------------------
 
 
-def test_training_leaves_a_run_folder_and_says_what_is_next(capsys):
-    ran(f"train cartpole --actuator ideal --seed 3 {TINY}")
-    config = load_config(Path("runs/cartpole-ppo-ideal-3"))
-    assert config.actuator == Ideal()
-    assert (config.seed, config.total_steps, config.num_envs, config.agent.hidden) == (3, 500, 2, (8,))
-    assert "next: codrl-mj evaluate runs/cartpole-ppo-ideal-3" in capsys.readouterr().out
-
-
-def test_fields_are_set_over_the_named_actuator():
+def test_training_leaves_a_run_folder_whose_fields_are_set_over_the_named_actuator(capsys):
     loop = "--actuator.controller.kp 0.3 --actuator.controller.max-voltage inf"
     more = "--actuator.controller.bemf-compensation False --actuator.motor.inductance 0.07"
     env = "--env.center-radius 0.1 --env.inner-steps 2 --env.sutton-barto-reward True"
-    ran(f"train cartpole --actuator weaker {loop} {more} {env} {TINY} --out run")
-    config = read("run/config.json")["train"]["env"]
-    weaker = named_actuator("weaker", "cartpole").as_mapping()
+    ran(f"train cartpole --actuator weaker --seed 3 {loop} {more} {env} {TINY}")
+    assert "next: codrl-mj evaluate runs/cartpole-ppo-weaker-3" in capsys.readouterr().out
+    config = load_config(Path("runs/cartpole-ppo-weaker-3"))
+    assert (config.seed, config.total_steps, config.num_envs, config.agent.hidden) == (3, 500, 2, (8,))
+    assert (config.env.options.center_radius, config.env.options.sutton_barto_reward) == (0.1, True)
+    assert config.env.inner_steps == 2
     changed = {"kp": 0.3, "max_voltage": math.inf, "bemf_compensation": False}
-    assert config["actuator"]["controller"] == weaker["controller"] | changed
-    assert config["actuator"]["motor"] == weaker["motor"] | {"inductance": 0.07}
-    assert config["options"] == {"center_radius": 0.1, "sutton_barto_reward": True}
-    assert config["inner_steps"] == 2
+    changed = {f"controller.{name}": value for name, value in changed.items()} | {"motor.inductance": 0.07}
+    assert config.actuator == named_actuator("weaker", "cartpole").replaced(changed)
 
 
 def test_evaluation_is_that_of_the_package_and_a_file_gets_no_colours(capsys, trained, monkeypatch):
@@ -233,25 +226,22 @@ def policy_alone(run):
         shutil.copy(run / name, "alone")
 
 
-def test_commands_and_observations_are_those_of_the_training():
+def test_a_run_is_evaluated_and_filmed_in_the_environment_of_its_training():
     levels = "--env.action voltage --env.levels -3 3 --env.observe-actuator"
-    ran(f"train cartpole --actuator paper {levels} {TINY} --out volts")
+    env = f"{levels} --env.disturbances.command-delay 0.1"
+    ran(f"train cartpole --actuator paper {env} {TINY} --out volts")
     policy_alone(Path("volts"))
-    for subject in ("volts", f"volts {levels}", f"alone --task cartpole --actuator paper {levels}"):
+    for subject in ("volts", f"volts {env}", f"alone --task cartpole --actuator paper {env}"):
         ran(f"evaluate {subject} --episodes 2 --out {len(subject)}.json")
     first, *others = (path.read_text() for path in Path().glob("*.json"))
     assert others == [first] * 2
-    assert json.loads(first)["peak_voltage"] == 3.0
+    expected = evaluate(load_policy(Path("volts")), load_config(Path("volts")).evaluation_env, 2)
+    assert json.loads(first) == json.loads(json.dumps(expected.as_mapping()))
+    assert expected.peak_voltage == 3.0
+    ran("evaluate volts --episodes 2 --env.disturbances.command-delay 0 --out at_once.json")
+    assert read("at_once.json")["returns"] != json.loads(first)["returns"]
     for subject in ("volts", f"cartpole {levels}"):
         ran(f"render {subject} --out film.gif {SMALL_FILM}")
-
-
-def test_a_run_is_evaluated_in_the_environment_of_its_training():
-    ran(f"train cartpole --env.disturbances.command-delay 0.1 {TINY} --out late")
-    ran("evaluate late --episodes 3 --out as_trained.json")
-    ran("evaluate late --episodes 3 --env.disturbances.command-delay 0 --out at_once.json")
-    expected = evaluate(load_policy(Path("late")), load_config(Path("late")).evaluation_env, 3)
-    assert read("as_trained.json") == json.loads(json.dumps(expected.as_mapping())) != read("at_once.json")
 
 
 def test_a_run_can_be_filmed_and_a_task_with_random_actions(capsys, trained):

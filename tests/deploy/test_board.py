@@ -18,6 +18,7 @@ from codrl_mj.deploy.board import TARGETS, missing_tools
 from codrl_mj.deploy.wire import Wire
 from codrl_mj.envs.config import EnvConfig
 from tests.deploy.test_export import trained
+from tests.deploy.test_run import with_sensors
 from tests.matrix import but
 
 pytestmark = pytest.mark.skipif(bool(missing_tools("host")), reason="NOT RUN: no C compiler: apt-get install gcc")
@@ -304,30 +305,12 @@ def test_a_frame_of_which_bytes_are_lost_is_refused_and_those_after_it_come_thro
 
 
 WATCHING, DRIVING = 1, 2
-SENSORS = """
-#include "wire.h"
-real given[CONTROLLER_COMMANDS];
-int wire_sense(real observation[CONTROLLER_OBSERVATIONS]) {
-  for (int k = 0; k < CONTROLLER_OBSERVATIONS; k++) observation[k] = 0.3f;
-  return 1;
-}
-void wire_measure(real motors[3 * CONTROLLER_COMMANDS]) {
-  for (int k = 0; k < 3 * CONTROLLER_COMMANDS; k++) motors[k] = 0;
-}
-void wire_apply(const real command[CONTROLLER_COMMANDS]) {
-  for (int k = 0; k < CONTROLLER_COMMANDS; k++) given[k] = command[k];
-}
-"""
 
 
 @pytest.fixture
 def wired(folder, tmp_path):
     """Functions of the exported wire: to send a frame of a kind at a stamp [us], to ask the watchdog; what is given."""
-    (tmp_path / "sensors.c").write_text(SENSORS)
-    sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
-    line = ["cc", "-std=c99", "-shared", "-fPIC", "-DBOARD_SENSORS", f"-I{folder}", *sources]
-    library = str(tmp_path / "wire.so")
-    subprocess.run([*line, str(tmp_path / "sensors.c"), "-lm", "-o", library], check=True)
+    library = with_sensors(folder, tmp_path, "-shared", "-fPIC", "-DBAD=0", "-DWORSE=0", "-DGONE=0")
     wire, contract = ctypes.CDLL(library), Contract.read(folder)
     real = {"f": ctypes.c_float, "d": ctypes.c_double}[kind_of(folder)]
     given = (real * len(contract.actions)).in_dll(wire, "given")

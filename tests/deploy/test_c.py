@@ -225,14 +225,8 @@ MLP, SARSA = ("pendulum", "ppo"), ("acrobot", "sarsa")
 @pytest.mark.parametrize(
     ("board", "policy", "hidden", "double", "says"),
     [
-        (
-            "arduino-uno",
-            MLP,
-            128,
-            False,
-            r"arduino-uno: the policy needs about \d+ bytes of flash, must be at most 32256",
-        ),
-        ("arduino-uno", MLP, 48, False, r"arduino-uno: the policy needs about 1\d+ bytes of RAM, must be at most 2048"),
+        ("arduino-uno", MLP, 128, False, r"arduino-uno: .* needs about \d+ bytes of flash, must be at most 32256"),
+        ("arduino-uno", MLP, 48, False, r"arduino-uno: .* needs about 1\d+ bytes of RAM, must be at most 2048"),
         ("arduino-uno", MLP, 48, True, "double has 4 bytes"),
         ("arduino-uno", SARSA, None, False, r"train a smaller one \(--agent.tilings 4\), or name a larger"),
         ("arduino-un", MLP, 48, False, "did you mean arduino-uno"),

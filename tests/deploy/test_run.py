@@ -19,21 +19,30 @@ pytestmark = pytest.mark.skipif(bool(missing_tools("host")), reason="NOT RUN: no
 SENSORS = """
 #include "wire.h"
 static int asked;
-static real given;
+real given[CONTROLLER_COMMANDS];
 int wire_sense(real observation[CONTROLLER_OBSERVATIONS]) {
   asked++;
   for (int k = 0; k < CONTROLLER_OBSERVATIONS; k++) observation[k] = 0.01f * (real)asked;
   observation[0] = observation[2] = 1;
-  if (asked == BAD) observation[4] = WORSE;
+  if (asked == BAD) observation[CONTROLLER_OBSERVATIONS - 2] = WORSE;
   return asked != GONE;
 }
 void wire_measure(real motors[3 * CONTROLLER_COMMANDS]) {
-  motors[0] = given;
+  motors[0] = given[0];
   motors[1] = 0.5f;
   motors[2] = 0.1f * (real)asked;
 }
-void wire_apply(const real command[CONTROLLER_COMMANDS]) { given = command[0]; }
+void wire_apply(const real command[CONTROLLER_COMMANDS]) { given[0] = command[0]; }
 """
+
+
+def with_sensors(folder, out, *flags):
+    """The board's program of an exported folder, compiled with these sensors; its path."""
+    (out / "sensors.c").write_text(SENSORS)
+    sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
+    line = ["cc", "-std=c99", "-DBOARD_SENSORS", *flags, f"-I{folder}", *sources, str(out / "sensors.c")]
+    subprocess.run([*line, "-lm", "-o", str(out / "board")], check=True)
+    return str(out / "board")
 
 
 def exported(out, fastest):
@@ -52,11 +61,7 @@ def port(folder, tmp_path):
     tty, running, opened = pytest.importorskip("tty"), [], []
 
     def start(bad=0, worse="0", gone=0):
-        (tmp_path / "sensors.c").write_text(SENSORS)
-        program = str(tmp_path / "board")
-        sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
-        flags = ["-DBOARD_SENSORS", f"-DBAD={bad}", f"-DWORSE={worse}", f"-DGONE={gone}", f"-I{folder}"]
-        subprocess.run(["cc", *flags, *sources, str(tmp_path / "sensors.c"), "-lm", "-o", program], check=True)
+        program = with_sensors(folder, tmp_path, f"-DBAD={bad}", f"-DWORSE={worse}", f"-DGONE={gone}")
         ours, theirs = os.openpty()
         tty.setraw(theirs)
         tty.setraw(ours)

@@ -12,6 +12,7 @@ from codrl_mj.identify.checks import FACTORS, check, name_of_factor
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.simulation import Moved, moving
 from codrl_mj.identify.synthetic import Excitation, Load, Sampler, Sensor, run, simulate
+from tests.identify.draws import scaled
 from tests.matrix import but
 
 MOTORS = {
@@ -49,13 +50,6 @@ def logged(motor="small", kind="prbs", sag=0.0, jitter=0.0, dropped=0.0, seed=0,
         sensors[signal] = dataclasses.replace(sensors.get(signal, Sensor()), **{field: value})
     sampler = Sampler(RATE, jitter, dropped, mean_voltage=True)
     return simulate(drive, excitation_of(motor, kind), load, sensors, sampler, seed)
-
-
-def scaled(log, **factors):
-    """Signals times a factor, as by a wrong unit or sign."""
-    signals = {name: factors.get(name, 1.0) * values for name, values in log.signals.items()}
-    steps = {name: abs(factors.get(name, 1.0)) * step for name, step in log.resolution.items()}
-    return dataclasses.replace(log, signals=signals, resolution=steps)
 
 
 def without(log, *names):
