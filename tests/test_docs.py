@@ -191,6 +191,20 @@ def test_the_commands_of_a_page_run_as_typed(page, trained, tmp_path):
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
 
 
+def test_the_python_of_the_first_page_prints_what_a_weak_loop_does(capsys):
+    (block,) = re.findall(r"```python\n(.*?)```", PAGES["README.md"], re.DOTALL)
+    namespace = {}
+    exec(compile(block, "README.md", "exec"), namespace)
+    namespace["env"].close()
+    *numbers, saturated = capsys.readouterr().out.split()
+    desired, actual, current, voltage = map(float, numbers)
+    assert desired == 10.0
+    assert 0 < actual < desired  # its first step
+    assert current > 0
+    assert voltage > 0
+    assert saturated == "False"
+
+
 @pytest.mark.matrix
 def test_the_first_page_identifies_a_motor_as_typed(tmp_path):
     """From logs of a motor on its own, whose columns have the names of that line."""
@@ -228,3 +242,14 @@ def test_the_file_of_upright_tolerances_has_the_pendulum_s_own():
     assert f"within {angle} of upright and slower than {speed}" in page
     assert all(0.0 <= float(row[f"{angle}, {speed}"]) <= 1.0 for row in rows)
     assert len(rows) == 13
+
+
+def test_of_the_papers_statements_as_many_are_confirmed_as_the_results_say():
+    results = ROOT / "docs" / "results"
+    with (results / "reproduction" / "claims.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["source"] == "paper" and row["counted"] == "yes"]
+    sure, near = (sum(row["verdict"] == one for row in rows) for one in ("confirmed", "compatible"))
+    said = f"{len(rows)} statements {sure} are confirmed, and {near}, read off one run, compatible with ours."
+    assert said in PAGES["README.md"].replace("\n", " ")
+    counted = f"**Of {len(rows)} statements: {sure} confirmed, {near} compatible, "
+    assert counted in (results / "reproduction.md").read_text()

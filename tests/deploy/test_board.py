@@ -192,9 +192,13 @@ def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
     assert not commands[~fine].any()
     assert commands[fine].all()
     np.testing.assert_allclose(python.predict(rows)[0], commands, atol=1e-6)
-    for limit, says in {"arm_velocit": "did you mean arm_velocity", "rod": "must be > 0 and < pi"}.items():
+    for name, limit, says in (
+        ("arm_velocit", 4.0, "did you mean arm_velocity"),
+        ("arm_velocity", -4.0, "arm_velocity = -4: must be > 0"),
+        ("rod", 4.0, "must be > 0 and < pi"),
+    ):
         with pytest.raises(ValueError, match=says):
-            export(policy, FURUTA, "ppo", tmp_path / "other", 1, limits={limit: 4.0})
+            export(policy, FURUTA, "ppo", tmp_path / "other", 1, limits={name: limit})
 
 
 @pytest.mark.skipif(bool(missing_tools("cortex-m4f")), reason=f"NOT RUN: {missing_tools('cortex-m4f')}")
@@ -270,9 +274,9 @@ def program(folder, tmp_path_factory):
     return built
 
 
-def frame(folder, sequence, stamp, row):
-    content = struct.pack(f"<BBI{len(row)}{kind_of(folder)}", sequence, 0, stamp % 2**32, *row)
-    return b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF))
+def frame(folder, sequence, stamp, row, kind=0, spoilt=False):
+    content = struct.pack(f"<BBI{len(row)}{kind_of(folder)}", sequence, kind, stamp % 2**32, *row)
+    return b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF) ^ spoilt)
 
 
 def test_every_frame_damaged_doubled_late_or_old_is_told_and_the_next_is_understood(folder, program):
@@ -318,10 +322,7 @@ def wired(folder, tmp_path):
     wire.wire_reset(state)
 
     def send(stamp, kind, spoilt=False):
-        row = contract.golden["observations"][0]
-        content = struct.pack(f"<BBI{len(row)}{kind_of(folder)}", 1, kind, stamp % 2**32, *row)
-        crc = binascii.crc_hqx(content, 0xFFFF) ^ spoilt
-        for byte in b"\xa5\x5a" + content + struct.pack("<H", crc):
+        for byte in frame(folder, 1, stamp, contract.golden["observations"][0], kind, spoilt):
             wire.wire_byte(state, byte, answer)
         return answer[3], any(given)
 
@@ -375,16 +376,19 @@ def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(
         "a number": (header, [["soon", *rows[0][1:]], *rows[1:]]),
         "no column 'motor'": (header[:sent], [row[:sent] for row in rows]),
     }
+
+    def text(header, rows, end="\n"):
+        return end.join(",".join(row) for row in (header, *rows))
+
     for says, table in refused.items():
-        log.write_text("\n".join(",".join(row) for row in (table[0], *table[1])))
+        log.write_text(text(*table))
         with pytest.raises(ValueError, match=says):
             check_log(folder, log)
-    text = "\r\n".join(",".join(row) for row in (header, *rows))
-    log.write_text("\ufeff" + text + "\r\n\r\n", encoding="utf-8")  # as a spreadsheet saves it
+    log.write_text("\ufeff" + text(header, rows, "\r\n") + "\r\n\r\n", encoding="utf-8")  # as a spreadsheet saves it
     assert check_log(folder, log) == found
     for row in rows:
         row[sent] = str(float(row[sent]) + 0.01)
-    log.write_text("\n".join(",".join(row) for row in (header, *rows)))
+    log.write_text(text(header, rows))
     assert check_log(folder, log).differing == len(rows)
     assert main(["board", "check", str(folder), str(log)]) == 1
 
