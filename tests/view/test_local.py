@@ -39,7 +39,8 @@ def connect(server, **options):
     )
 
 
-def test_it_listens_on_this_machine_alone(server):
+def test_it_listens_on_this_machine_alone_and_asks_nobody_to_share_it(server):
+    assert server.request_share_url() is None
     assert server.get_host() == "127.0.0.1"
     address = socket.gethostbyname(socket.gethostname())
     if not address.startswith("127."):
@@ -69,10 +70,6 @@ def test_pages_of_others_cannot_open_a_socket(server, origin):
 
     with pytest.raises(websockets.exceptions.InvalidStatus, match="403"):
         asyncio.run(attempt())
-
-
-def test_it_asks_nobody_to_share_it(server):
-    assert server.request_share_url() is None
 
 
 def test_malformed_messages_and_clients_that_vanish_do_it_no_harm(server):
