@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
+from gymnasium.spaces import Box, Discrete
 
 import codrl_mj
 import tests
@@ -70,15 +70,7 @@ def task(**changes: Any) -> Any:
 
 NUMBERS = ("()", "(1.0, 2.0, 3.0, 4.0, 5.0)", "[1.0] * 3", "np.zeros(3)", "1.0", "None", "'abc'", "((1.0,), 2.0, 3.0)")
 NOT_ONE = (
-    "(1.0,)",
-    "None",
-    "'a'",
-    "1j",
-    "np.zeros(1)",
-    "np.nan",
-    "[1.0]",
-    "unknown",
-    "state[7]",
+    *("(1.0,)", "None", "'a'", "1j", "np.zeros(1)", "np.nan", "[1.0]", "unknown", "state[7]"),
     "raise KeyError('gone')",
 )
 
@@ -95,72 +87,64 @@ class Worded(NamedTuple):
     weight: str = "heavy"
 
 
-TASKS = [
-    *itertools.product(
-        ("initial_state", "observation", "constrain"), (*NUMBERS, "(1.0, 'a', 1.0, 1.0)", "np.nan, 1.0, 1.0")
-    ),
-    *itertools.product(("reward", "terminated"), NOT_ONE),
-    *itertools.product(("goal",), (*NOT_ONE, "1.0 if state[0] > 0.0 else 0.0")),
-    ("initial_state", "return (1.0, draws[1], 0.0, 0.0) if draws[0] > 0.0 else (0.0, draws[1], 0.0, 0.0)"),
-    *itertools.product(
-        ("initial_bounds",),
-        (
-            "np.zeros(4)",
-            "np.zeros(3), np.zeros(4)",
-            "np.ones(4), np.zeros(4)",
-            "np.zeros(4), np.full(4, np.inf)",
+def pairs(table: dict[str, tuple]) -> list[tuple[str, Any]]:
+    """Every field of a row's with each of its values."""
+    return [(field, value) for fields, values in table.items() for field in fields.split() for value in values]
+
+
+TASKS = pairs(
+    {
+        "initial_state observation constrain": (*NUMBERS, "(1.0, 'a', 1.0, 1.0)", "np.nan, 1.0, 1.0"),
+        "reward terminated": NOT_ONE,
+        "goal": (*NOT_ONE, "1.0 if state[0] > 0.0 else 0.0"),
+        "initial_state": ("return (1.0, draws[1], 0.0, 0.0) if draws[0] > 0.0 else (0.0, draws[1], 0.0, 0.0)",),
+        "initial_bounds": (
+            *("np.zeros(4)", "np.zeros(3), np.zeros(4)", "np.ones(4), np.zeros(4)", "np.zeros(4), np.full(4, np.inf)"),
             "0.0, 1.0",
         ),
-    ),
-    *itertools.product(FUNCTIONS, (3, "raise ValueError('mine')", lambda: 0.0)),
-    *itertools.product(("observation", "reward", "terminated"), (None,)),
-    *itertools.product(
-        ("state_names", "observation_names", "motors"),
-        ((), ("a",) * 4, "abcd", ["a", "b", "c", "d"], (1, 2, 3, 4), None, 3),
-    ),
-    *itertools.product(("state_names",), (("a", "b", "c"), ("a", "b", "c", "d", "e"))),
-    *itertools.product(("observation_names",), (("a",), ("a", "b"), ("a", "b", "c", "d"))),
-    *itertools.product(("integrators",), (("rk5",), (), "rk4", ("rk4", "rk4"), None)),
-    *itertools.product(("step_duration",), (0.0, -0.02, np.nan, np.inf, "0.02", None, True)),
-    *itertools.product(("motor_inner_steps", "ideal_inner_steps"), (0, -1, 2.0, "2", None, True)),
-    *itertools.product(("max_episode_steps",), (0, -1, 2.0, "2", True)),
-    *itertools.product(("max_force",), (0.0, -1.0, np.nan, np.inf, "2", None, (1.0, 1.0), ())),
-    *itertools.product(
-        ("forces",), ((), (1.0, np.nan), ("a",), 3.0, "ab", ((1.0, 2.0), (3.0, 4.0)), (1.0, (2.0,)), (-2.1, 2.0))
-    ),
-    *itertools.product(("qpos",), ((1,), (0, 4), (0, 0), (1, 0), ("a", "b"), 3, (0, 1, 2))),
-    *itertools.product(("wrapped",), ((4,), (-1,), ("a",), 3)),
-    *itertools.product(
-        ("observation_space",),
-        (spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (4,)), spaces.Box(-1, 1, (3,), np.float64), spaces.Discrete(3), 3),
-    ),
-    *itertools.product(("action_space",), (spaces.Box(-1, 1, (2,)), spaces.Discrete(3), 3)),
-    *itertools.product(("options",), (Undefaulted, Worded, dict, 3)),
-    *itertools.product(("paper", "name", "env_id"), (3,)),
-    *itertools.product(("trials",), (Trials((1.0,) * 4, ((0.0,),) * 4, (0.0,) * 3, 2, 1),)),
-    *itertools.product(("goal_hold",), (-1.0, np.nan, "1")),
-]
+        " ".join(FUNCTIONS): (3, "raise ValueError('mine')", lambda: 0.0),
+        "observation reward terminated": (None,),
+        "state_names observation_names motors": ((), ("a",) * 4, "abcd", ["a", "b", "c", "d"], (1, 2, 3, 4), None, 3),
+        "state_names": (("a", "b", "c"), ("a", "b", "c", "d", "e")),
+        "observation_names": (("a",), ("a", "b"), ("a", "b", "c", "d")),
+        "integrators": (("rk5",), (), "rk4", ("rk4", "rk4"), None),
+        "step_duration": (0.0, -0.02, np.nan, np.inf, "0.02", None, True),
+        "motor_inner_steps ideal_inner_steps": (0, -1, 2.0, "2", None, True),
+        "max_episode_steps": (0, -1, 2.0, "2", True),
+        "max_force": (0.0, -1.0, np.nan, np.inf, "2", None, (1.0, 1.0), ()),
+        "forces": ((), (1.0, np.nan), ("a",), 3.0, "ab", ((1.0, 2.0), (3.0, 4.0)), (1.0, (2.0,)), (-2.1, 2.0)),
+        "qpos": ((1,), (0, 4), (0, 0), (1, 0), ("a", "b"), 3, (0, 1, 2)),
+        "wrapped": ((4,), (-1,), ("a",), 3),
+        "observation_space": (
+            *(Box(-1, 1, (count,)) for count in (2, 4)),
+            Box(-1, 1, (3,), np.float64),
+            Discrete(3),
+            3,
+        ),
+        "action_space": (Box(-1, 1, (2,)), Discrete(3), 3),
+        "options": (Undefaulted, Worded, dict, 3),
+        "paper name env_id": (3,),
+        "trials": (Trials((1.0,) * 4, ((0.0,),) * 4, (0.0,) * 3, 2, 1),),
+        "goal_hold": (-1.0, np.nan, "1"),
+    }
+)
 """(field, what is wrong with it): refused when the task is made."""
-LATE = [
-    ("initial_state", "return tuple(draws)"),
-    *itertools.product(
-        ("observation", "constrain"),
-        (
+LATE = pairs(
+    {
+        "initial_state": ("return tuple(draws)",),
+        "observation constrain": (
             "return ({0}) if state[0] < 10.0 else ({0}, 1.0)",
             "return ({0}) if state[0] < 10.0 else None",
             "x = float(np.linalg.norm(state)); return {0}",
         ),
-    ),
-    *itertools.product(
-        ("reward", "terminated"),
-        (
+        "reward terminated": (
             "return 1.0 if state[0] < 10.0 else None",
             "return 1.0 if state[0] < 10.0 else 'a'",
             "return float(np.linalg.norm(state))",
             "return len(open.__name__)",
         ),
-    ),
-]
+    }
+)
 """The same: refused by numba alone, because nothing is wrong with it on the numbers that it is tried with."""
 
 
@@ -226,37 +210,25 @@ class Reserved(NamedTuple):
     speed: float
 
 
-FAMILIES = [
-    *itertools.product(
-        ("advance",),
-        (
+FAMILIES = pairs(
+    {
+        "advance": (
             *("state", "inputs.desired_torque", "None", "state, 1.0", "1.0, 1.0, 1.0", "state, 1.0, Signals(1.0), 1.0"),
             *("(1.0,), 1.0, Signals(1.0)", "(1.0, 1.0, 1.0), 1.0, Signals(1.0)", "state, 1.0, ()", "state, 1.0, state"),
-            *(
-                "state, (1.0,), Signals(1.0)",
-                "state, 'a', Signals(1.0)",
-                "state, 1j, Signals(1.0)",
-                "state, None, Signals(1.0)",
-            ),
-            *(
-                "state, np.inf, Signals(1.0)",
-                "State(np.nan, 0.0), 1.0, Signals(1.0)",
-                "State('a', 1.0), 1.0, Signals(1.0)",
-            ),
-            *("[1.0, 1.0], 1.0, Signals(1.0)", "np.zeros(2), 1.0, Signals(1.0)", "state, np.zeros(1), Signals(1.0)"),
+            *(f"state, {torque}, Signals(1.0)" for torque in ("(1.0,)", "'a'", "1j", "None", "np.inf", "np.zeros(1)")),
+            *(f"State({value}), 1.0, Signals(1.0)" for value in ("np.nan, 0.0", "'a', 1.0")),
+            *(f"{state}, 1.0, Signals(1.0)" for state in ("[1.0, 1.0]", "np.zeros(2)")),
             *("state, inputs.torque_wanted, Signals(1.0)", "state, unknown, Signals(1.0)", "raise KeyError('gone')", 3),
         ),
-    ),
-    *itertools.product(
-        ("observe",), ("()", "(1.0,)", "(1.0, 2.0, 3.0)", "1.0", "[1.0, 2.0]", "('a', 1.0)", "None", "unknown", 3)
-    ),
-    *itertools.product(("State",), (One, Three, dict, 3)),
-    *itertools.product(("Signals",), (State, Three, Reserved, dict, 3)),
-    *itertools.product(("OBSERVED",), (("heat",), ("a", "b", "c"))),
-    *itertools.product(("SIGNAL_UNITS",), ({"haet": "W"},)),
-    *itertools.product(("RANDOM",), (("gian",),)),
-    *itertools.product(("gain",), ("much", dataclasses.field(), dataclasses.field(default=None))),
-]
+        "observe": ("()", "(1.0,)", "(1.0, 2.0, 3.0)", "1.0", "[1.0, 2.0]", "('a', 1.0)", "None", "unknown", 3),
+        "State": (One, Three, dict, 3),
+        "Signals": (State, Three, Reserved, dict, 3),
+        "OBSERVED": (("heat",), ("a", "b", "c")),
+        "SIGNAL_UNITS": ({"haet": "W"},),
+        "RANDOM": (("gian",),),
+        "gain": ("much", dataclasses.field(), dataclasses.field(default=None)),
+    }
+)
 LATE_FAMILIES = [
     ("advance", "x = float(np.linalg.norm(inputs.desired_torque)); return state, x, Signals(1.0)"),
     ("advance", "return (state, 1.0, Signals(1.0)) if state.a < 10.0 else ((1.0,), 1.0, Signals(1.0))"),

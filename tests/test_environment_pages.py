@@ -1,7 +1,6 @@
 """The environments' pages: that they are what the code says, and that what they say is what the code does."""
 
 import dataclasses
-import importlib.util
 import inspect
 import re
 import subprocess
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import environment_pages
 import page_pictures_tasks
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.config import EnvConfig
@@ -28,13 +28,6 @@ MORE = {"furuta": ("What to expect", "Where the numbers come from")}
 every_task = pytest.mark.parametrize("task", TASKS)
 
 
-def _generator():
-    spec = importlib.util.spec_from_file_location("environment_pages", ROOT / "scripts" / "environment_pages.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def _section(task, title):
     page = (FOLDER / f"{task}.md").read_text()
     return re.search(rf"^## {title}\n\n(.*?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL)[1]
@@ -46,11 +39,15 @@ def _table(text):
     return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows[2:]]
 
 
+def _facts(task):
+    return {row[0]: row[1] for row in _table((FOLDER / f"{task}.md").read_text())}
+
+
 # -- the pages are the code's -------------------------------------------------------------------------------
 
 
 def test_the_pages_are_what_the_code_says_and_there_are_no_others():
-    pages = _generator().pages()
+    pages = environment_pages.pages()
     assert pages.keys() == {"README.md", "arguments.md"} | {f"{task}.md" for task in TASKS}
     assert {path.name for path in FOLDER.glob("*.md")} == pages.keys()
     for name, text in pages.items():
@@ -68,14 +65,16 @@ def test_make_docs_writes_them(tmp_path):
 
 def test_the_index_links_to_every_page():
     links = dict(re.findall(r"\[(.*?)\]\((.*?)\)", (FOLDER / "README.md").read_text()))
-    assert links.pop("the same arguments") == "arguments.md"
-    assert links == {task.env_id.removeprefix("codrl_mj/"): f"{name}.md" for name, task in TASKS.items()}
+    own = {task.env_id.removeprefix("codrl_mj/"): f"{name}.md" for name, task in TASKS.items()}
+    assert links == own | {"the same arguments": "arguments.md"}
 
 
 @every_task
-def test_every_page_begins_with_a_film_of_some_seconds(task):
+def test_every_page_begins_with_a_film_of_some_seconds_and_has_the_same_sections(task):
     assert set(page_pictures_tasks.SCENES) == set(TASKS)
-    (shown,) = re.findall(r"!\[.*?\]\((.*?)\)", (FOLDER / f"{task}.md").read_text())
+    page = (FOLDER / f"{task}.md").read_text()
+    assert re.findall(r"^## (.*)$", page, re.MULTILINE) == [*SECTIONS, *MORE.get(task, ())]
+    (shown,) = re.findall(r"!\[.*?\]\((.*?)\)", page)
     assert f"environments/{shown}" in page_pictures_tasks.PICTURES
     assert (FOLDER / shown).stat().st_size < 400_000
     with Image.open(FOLDER / shown) as film:
@@ -89,8 +88,6 @@ def test_every_page_begins_with_a_film_of_some_seconds(task):
 
 
 def test_an_argument_that_nobody_documents_is_noticed(monkeypatch):
-    module = _generator()
-
     def fewer(self, task, actuator="paper"):  # noqa: D417
         """Build.
 
@@ -98,18 +95,12 @@ def test_an_argument_that_nobody_documents_is_noticed(monkeypatch):
             task: the task.
         """
 
-    monkeypatch.setattr(module.ActuatedEnv, "__init__", fewer)
+    monkeypatch.setattr(environment_pages.ActuatedEnv, "__init__", fewer)
     with pytest.raises(ValueError, match="ActuatedEnv documents task but takes actuator"):
-        module.common_arguments()
+        environment_pages.common_arguments()
 
 
 # -- what they say is what the code does --------------------------------------------------------------------
-
-
-@every_task
-def test_every_page_has_the_same_sections(task):
-    titles = re.findall(r"^## (.*)$", (FOLDER / f"{task}.md").read_text(), re.MULTILINE)
-    assert titles == [*SECTIONS, *MORE.get(task, ())]
 
 
 @every_task
@@ -121,8 +112,7 @@ def test_every_argument_is_in_the_page_with_its_default_and_the_tasks_own_option
     expected = {name: repr(parameter.default) for name, parameter in parameters.items()} | fields
     assert expected.pop("options") == "None"
     assert rows == {name: re.sub(r"\(.*\)$", "()", default) for name, default in expected.items()}
-    (own,) = (row[1] for row in _table((FOLDER / f"{task}.md").read_text()) if row[0] == "options of its own")
-    assert re.findall(r"`(\w+)`", own) == list(TASKS[task].options._fields)
+    assert re.findall(r"`(\w+)`", _facts(task)["options of its own"]) == list(TASKS[task].options._fields)
     for option in TASKS[task].options._fields:
         assert f"`{option}`" in _section(task, "Arguments")
 
@@ -148,12 +138,10 @@ def test_the_action_space_is_named(task):
     text = _section(task, "Action space")
     if isinstance(space, gymnasium.spaces.Discrete):
         assert f"`Discrete({space.n})`" in text
-        forces = TASKS[task].forces
-        assert all(re.search(rf"(?<![\d.]){force:g}(?![\d.])", text) for force in forces)
+        assert all(re.search(rf"(?<![\d.]){force:g}(?![\d.])", text) for force in TASKS[task].forces)
     else:
         assert f"`Box({space.low[0]:g}, {space.high[0]:g}, (1,), float32)`" in text
-    facts = {row[0]: row[1] for row in _table((FOLDER / f"{task}.md").read_text())}
-    assert facts["action space"] == f"`{space}`"
+    assert _facts(task)["action space"] == f"`{space}`"
 
 
 @every_rebuilt
@@ -164,7 +152,7 @@ def test_the_time_limit_is_the_registered_one_and_gymnasiums(task):
     steps, seconds = re.search(r"[Tt]runcated\safter\s(\d+)\ssteps\s\(([\d.]+)\ss\)", _section(task, "End")).groups()
     assert int(steps) == ours.max_episode_steps
     assert float(seconds) == pytest.approx(int(steps) * TASKS[task].step_duration)
-    facts = {row[0]: row[1] for row in _table((FOLDER / f"{task}.md").read_text())}
+    facts = _facts(task)
     assert facts["time limit"] == f"{steps} steps"
     if theirs.reward_threshold is not None:
         assert facts["solved at"] == f"a return of {theirs.reward_threshold:g}"
@@ -172,7 +160,7 @@ def test_the_time_limit_is_the_registered_one_and_gymnasiums(task):
 
 @every_task
 def test_the_integration_steps_are_those_of_the_environment(task):
-    facts = {row[0]: row[1] for row in _table((FOLDER / f"{task}.md").read_text())}
+    facts = _facts(task)
     with_motor, without = map(int, re.findall(r"\d+", facts["integration steps in it"]))
     for actuator, count in (("default", with_motor), ("ideal", without)):
         env = ActuatedEnv(task, actuator)

@@ -41,10 +41,8 @@ def test_a_family_with_a_slip_is_refused_at_every_door_before_it_is_compiled(par
     family = slips.family(**{part: value})
     monkeypatch.setattr(sys.modules[__name__], "FOUND", family)
     begins = r"slips?\.py:\d+, in |Slipped|unknown (signal SIGNAL_UNITS|field RANDOM)"
-    told = {
-        refused(door, begins) for door in (lambda: load_family(family), lambda: resolve(f"{__name__}:FOUND", None, ""))
-    }
-    assert len(told) == 1
+    doors = lambda: load_family(family), lambda: resolve(f"{__name__}:FOUND", None, "")
+    assert len({refused(door, begins) for door in doors}) == 1
 
 
 def test_a_family_that_is_no_dataclass_or_has_no_advance_is_refused():
@@ -68,12 +66,8 @@ def test_what_only_numba_can_refuse_is_a_sentence_too(name, body):
         told = refused(lambda: (load_family(family), compiled_observe(family)))
     else:
         task = slips.late_task(name, body)
-        told = refused(
-            lambda: (
-                compiled_outcomes(task),
-                compiled_constrain(task.constrain, task.state_names, task.qpos, task.qvel),
-            )
-        )
+        given = task.constrain, task.state_names, task.qpos, task.qvel
+        told = refused(lambda: (compiled_outcomes(task), compiled_constrain(*given)))
     assert f"in {name}: numba does not compile it: " in told or f"in {name}: returns " in told
 
 
@@ -83,15 +77,9 @@ def test_the_message_has_what_numba_says_of_it_and_where():
     assert told == "slip.py:3, in reward: numba does not compile it: np.linalg.norm() only supported for array types"
 
 
-def test_functions_that_a_function_calls_are_found():
-    task = slips.task(terminated="plain(state)")
-    terminated = compiled_outcomes(task).terminated
-    assert [terminated(np.array([position, 0.0, 0.0])) for position in (0.5, 1.5)] == [False, True]
-
-
-def test_so_are_those_of_a_package_that_is_named_whole():
-    task = slips.task(terminated="tests.slips.plain(state)")
-    terminated = compiled_outcomes(task).terminated
+@pytest.mark.parametrize("called", ["plain(state)", "tests.slips.plain(state)"])
+def test_functions_that_a_function_calls_are_found_by_their_names_or_their_package(called):
+    terminated = compiled_outcomes(slips.task(terminated=called)).terminated
     assert [terminated(np.array([position, 0.0, 0.0])) for position in (0.5, 1.5)] == [False, True]
 
 
@@ -121,40 +109,31 @@ def test_an_integer_or_a_flag_among_the_numbers_is_a_number():
     assert envs.step(np.zeros((2, 1), np.float32))[1].tolist() == [1.0, 1.0]
 
 
-def test_a_models_joints_and_integrator_are_compared_with_the_task(tmp_path):
-    model = (slips.ROOT / "own_project" / "arm.xml").read_text()
-    model = model.replace('<body name="upper">', '<body name="upper"><site name="tip"/>')
+SHOULDER, ARM = 'joint="shoulder"/', (slips.ROOT / "own_project" / "arm.xml").read_text()
+MODELS = [
+    # what stands in the model, what takes its place, and what is said of it
+    ("RK4", "Euler", ": its <option> has integrator EULER, so Task.integrators cannot have rk4"),
+    (SHOULDER, 'site="tip"/', ": actuator 'shoulder' must drive a hinge or a slide joint"),
+    ('name="elbow" axis', 'type="ball" name="elbow" axis', " has 5 positions and 4 velocities, and slip"),
+    ("<worldbody>", "<worldbdy>", ": XML parse error"),
+    (SHOULDER, 'joint="shoulder" gear="5"/', ": actuator 'shoulder': leave out its gear; "),
+    (SHOULDER, 'joint="shoulder" forcerange="-1 1"/', ": actuator 'shoulder': leave out its forcerange"),
+    (SHOULDER, 'joint="shoulder" delay="0.1" nsample="9"/', ": actuator 'shoulder': leave out its delay"),
+    ("<joint name", '<joint actuatorfrcrange="-1 1" name', ": .*leave out the actuatorfrcrange of joint 'shoulder'"),
+    ("<option", '<option actuatorgroupdisable="0"', ": actuator 'shoulder': leave out its group, which <option> dis"),
+]
+
+
+@pytest.mark.parametrize(("good", "bad", "message"), MODELS)
+def test_a_models_joints_and_integrator_are_compared_with_the_task(tmp_path, good, bad, message):
+    model = ARM.replace('<body name="upper">', '<body name="upper"><site name="tip"/>')
     path = tmp_path / "model.xml"
-    for good, bad, message in (
-        ("RK4", "Euler", ": its <option> has integrator EULER, so Task.integrators cannot have rk4"),
-        ('joint="shoulder"/', 'site="tip"/', ": actuator 'shoulder' must drive a hinge or a slide joint"),
-        (
-            '<joint name="elbow" axis',
-            '<joint type="ball" name="elbow" axis',
-            " has 5 positions and 4 velocities, and slip",
-        ),
-        ("<worldbody>", "<worldbdy>", ": XML parse error"),
-        ('joint="shoulder"/', 'joint="shoulder" gear="5"/', ": actuator 'shoulder': leave out its gear; "),
-        ('joint="shoulder"/', 'joint="shoulder" forcerange="-1 1"/', ": actuator 'shoulder': leave out its forcerange"),
-        (
-            'joint="shoulder"/',
-            'joint="shoulder" delay="0.1" nsample="9"/',
-            ": actuator 'shoulder': leave out its delay",
-        ),
-        (
-            '<joint name="shoulder"',
-            '<joint actuatorfrcrange="-1 1" name="shoulder"',
-            ": actuator 'shoulder': leave out the actuatorfrcrange of joint 'shoulder'",
-        ),
-        (
-            "<option",
-            '<option actuatorgroupdisable="0"',
-            ": actuator 'shoulder': leave out its group, which <option> dis",
-        ),
-    ):
-        path.write_text(model.replace(good, bad))
-        task = codrl_mj.register(slips.task(asset=str(path)))
-        refused(lambda task=task: gymnasium.make(task.env_id, actuator="ideal"), f"{path}{message}")
+    path.write_text(model.replace(good, bad, 1))
+    task = codrl_mj.register(slips.task(asset=str(path)))
+    refused(lambda: gymnasium.make(task.env_id, actuator="ideal"), f"{path}{message}")
+
+
+def test_a_model_that_is_not_there_is_refused_when_the_task_is_made():
     with pytest.raises(FileNotFoundError, match=r"no model file /nowhere/arm\.xml"):
         slips.task(asset="/nowhere/arm.xml")
 
@@ -165,27 +144,22 @@ def test_the_speeds_of_a_task_follow_from_its_model():
     assert [task.speeds for task in codrl_mj.tasks.TASKS.values() if task.name == "acrobot"] == [(3,)]
 
 
+def reset(task, **options):
+    gymnasium.make(f"codrl_mj/{task}-v0", actuator="ideal").reset(options=options)
+
+
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("door", "given", "message"),
     [
+        (codrl_mj.motorise, ("arm.xml", {}), r"spec = 'arm\.xml': must be .* mujoco\.MjSpec\.from_file\('arm\.xml'\)"),
+        (environments.make, ("codrl_mj/Pendulum-v0", {}), r"codrl_mj/Pendulum-v0: .* gymnasium\.make\('codrl_mj/Pend"),
         (
-            lambda: codrl_mj.motorise("arm.xml", {}),
-            r"spec = 'arm\.xml': must be .* mujoco\.MjSpec\.from_file\('arm\.xml'\)",
-        ),
-        (
-            lambda: environments.make("codrl_mj/Pendulum-v0", {}),
-            r"codrl_mj/Pendulum-v0: .* gymnasium\.make\('codrl_mj/Pend",
-        ),
-        (
-            lambda: reset("Pendulum", {"xinit": 0.1}),
+            lambda: reset("Pendulum", xinit=0.1),
+            (),
             r"unknown reset option xinit; did you mean x_init\? known: x_init, y_",
         ),
-        (lambda: reset("CartPole", {"low": 0.0, "hgih": 0.1}), r"unknown reset option hgih; did you mean high\?"),
+        (lambda: reset("CartPole", low=0.0, hgih=0.1), (), r"unknown reset option hgih; did you mean high\?"),
     ],
 )
-def test_other_doors_say_what_they_want(call, message):
-    refused(call, message)
-
-
-def reset(task, options):
-    gymnasium.make(f"codrl_mj/{task}-v0", actuator="ideal").reset(options=options)
+def test_other_doors_say_what_they_want(door, given, message):
+    refused(lambda: door(*given), message)

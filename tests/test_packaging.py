@@ -48,78 +48,80 @@ def built(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def wheel(built):
-    """The wheel."""
     (path,) = built.glob("*.whl")
-    return path
+    return zipfile.ZipFile(path)
 
 
 @pytest.fixture(scope="module")
-def environment(wheel, tmp_path_factory):
-    """The folder of programs of an environment that has the wheel, and of this one only what the wheel depends on."""
+def program(wheel, tmp_path_factory):
+    """Runs a program of an environment that has the wheel, and of this one only what the wheel depends on."""
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, symlinks=True)
     programs = folder / ("Scripts" if os.name == "nt" else "bin")
     python = programs / "python"
-    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps", str(wheel)]
+    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps", wheel.filename]
     subprocess.run(install, check=True, timeout=240)
     where = "import sysconfig; print(sysconfig.get_path('purelib'))"
     own = Path(subprocess.run([python, "-c", where], capture_output=True, text=True, check=True).stdout.strip())
-    (own / "dependencies.pth").write_text("\n".join([*site.getsitepackages(), *filter(_is_site, sys.path)]))
-    return programs
+    paths = [path for path in sys.path if Path(path).name == "site-packages"]
+    (own / "dependencies.pth").write_text("\n".join([*site.getsitepackages(), *paths]))
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+
+    def run(name, *arguments, cwd):
+        words = [programs / name, *arguments]
+        done = subprocess.run(words, cwd=cwd, env=clean, capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 0, f"{arguments}: {done.stdout[-1000:]}{done.stderr[-1000:]}"
+        return done.stdout
+
+    run.folder = folder
+    return run
 
 
-def _is_site(path):
-    return Path(path).name == "site-packages"
+@pytest.fixture(scope="module")
+def metadata(wheel):
+    """Its lines that say what it is."""
+    (name,) = (name for name in wheel.namelist() if name.endswith("METADATA"))
+    return wheel.read(name).decode().splitlines()
 
 
 def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
-    names = set(zipfile.ZipFile(wheel).namelist())
+    names = set(wheel.namelist())
     package, assets = REPOSITORY / "codrl_mj", REPOSITORY / "assets"
-    modules = {path.relative_to(REPOSITORY).as_posix() for path in package.rglob("*.py")}
+
+    def of_ours(pattern, least):
+        found = {path.relative_to(REPOSITORY).as_posix() for path in package.glob(pattern)}
+        assert len(found) >= least
+        return found
+
     models = {f"codrl_mj/_assets/{path.relative_to(assets).as_posix()}" for path in assets.rglob("*") if path.is_file()}
-    settings = {path.relative_to(REPOSITORY).as_posix() for path in (package / "rl_zoo3").glob("*.yml")}
-    presets = {path.relative_to(REPOSITORY).as_posix() for path in (package / "agents" / "presets").glob("*.toml")}
+    assert len(models) >= 5
     pages = {f"codrl_mj/pages/{name}" for name in ("page.html.jinja", "parts.html.jinja", "page.css", "page.js")}
     pages |= {f"codrl_mj/pages/uplot/{name}" for name in ("uPlot.iife.min.js", "uPlot.min.css", "LICENSE")}
-    assert len(modules) > 30
-    assert len(settings) == 5
-    assert len(presets) == 6
-    assert len(models) >= 5
-    replay = {f"codrl_mj/replay/{name}" for name in ("page.html", "replay.css", "replay.js")}
-    three = {f"codrl_mj/replay/three/{name}" for name in ("three.min.js", "LICENSE", "README.md")}
+    pages |= {f"codrl_mj/replay/{name}" for name in ("page.html", "replay.css", "replay.js")}
+    pages |= {f"codrl_mj/replay/three/{name}" for name in ("three.min.js", "LICENSE", "README.md")}
     others = {"codrl_mj/py.typed", *(f"codrl_mj/_assets/study/{one}/runs.csv" for one in ("actuators", "insurance"))}
-    assert names >= modules | models | settings | presets | replay | three | pages | others
+    settings = of_ours("rl_zoo3/*.yml", 5) | of_ours("agents/presets/*.toml", 6)
+    assert names >= of_ours("**/*.py", 30) | models | settings | pages | others
     assert not [name for name in names if name.startswith(("tests", "scripts", "assets", "docs"))]
 
 
-def test_the_wheel_has_the_program_the_version_and_the_license(wheel):
-    archive = zipfile.ZipFile(wheel)
-    (info,) = {name.split("/")[0] for name in archive.namelist() if ".dist-info/" in name}
-    assert "codrl-mj = codrl_mj.cli:main" in archive.read(f"{info}/entry_points.txt").decode()
-    metadata = archive.read(f"{info}/METADATA").decode()
+def test_the_wheel_has_the_program_the_version_and_the_license(wheel, metadata):
+    (info,) = {name.split("/")[0] for name in wheel.namelist() if ".dist-info/" in name}
+    assert "codrl-mj = codrl_mj.cli:main" in wheel.read(f"{info}/entry_points.txt").decode()
     version = (REPOSITORY / "codrl_mj" / "__init__.py").read_text().partition('__version__ = "')[2].partition('"')[0]
     assert f"Version: {version}" in metadata
-    assert f"{info}/licenses/LICENSE" in archive.namelist()
+    assert f"{info}/licenses/LICENSE" in wheel.namelist()
 
 
-def test_the_training_and_rendering_libraries_are_extras(wheel):
-    archive = zipfile.ZipFile(wheel)
-    (name,) = (name for name in archive.namelist() if name.endswith("METADATA"))
-    needed = [line for line in archive.read(name).decode().splitlines() if line.startswith("Requires-Dist: ")]
-    core = {line.split()[1].split("<")[0].split(">")[0] for line in needed if "extra ==" not in line}
+def test_the_training_and_rendering_libraries_are_extras(metadata):
+    needed = [line for line in metadata if line.startswith("Requires-Dist: ") and "extra ==" not in line]
+    core = {line.split()[1].split("<")[0].split(">")[0] for line in needed}
     assert core == {"gymnasium", "mujoco", "numba", "numpy", "pint", "platformdirs", "rich", "tyro"}
 
 
-def test_the_unpacked_wheel_steps_and_draws_every_task_from_another_folder(wheel, tmp_path):
-    site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
-    zipfile.ZipFile(wheel).extractall(site)
-    elsewhere.mkdir()
-    environment = os.environ | {"PYTHONPATH": str(site)}
-    options = {"cwd": elsewhere, "env": environment, "capture_output": True, "text": True, "timeout": 120}
-    done = subprocess.run([sys.executable, "-c", USE], check=False, **options)
-    assert done.returncode == 0, done.stderr
-    first, has_evidence, *tasks = done.stdout.splitlines()
-    assert Path(first).is_relative_to(site)
+def test_the_wheel_alone_steps_and_draws_every_task(program, tmp_path):
+    first, has_evidence, *tasks = program("python", "-c", USE, cwd=tmp_path).splitlines()
+    assert Path(first).is_relative_to(program.folder)
     assert has_evidence == "True"
     assert len(tasks) == 6
     assert all(line.endswith("(48, 64, 3) True True") for line in tasks), tasks
@@ -142,17 +144,10 @@ def test_an_index_would_take_both(built):
     assert done.stdout.count("PASSED") == 2
 
 
-def test_the_readme_works_with_the_wheel_alone(environment, tmp_path):
+def test_the_readme_works_with_the_wheel_alone(program, tmp_path):
     """Its Python, and its commands with fewer steps, by the program that the wheel installed."""
-    clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    options = {"cwd": tmp_path, "env": clean, "capture_output": True, "text": True, "timeout": 300}
-    where = subprocess.run([environment / "python", "-c", "import codrl_mj; print(codrl_mj.__file__)"], **options)
-    assert Path(where.stdout.strip()).is_relative_to(environment.parent), where.stderr
     (block,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
-    done = subprocess.run([environment / "python", "-c", block], **options)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split()[0] == "10.0"
+    assert program("python", "-c", block, cwd=tmp_path).split()[0] == "10.0"
     for command in RUN["README.md"]:
-        done = subprocess.run([environment / "codrl-mj", *shortened(command)], **options)
-        assert done.returncode == 0, f"{command}: {done.stdout[-1000:]}{done.stderr[-1000:]}"
+        program("codrl-mj", *shortened(command), cwd=tmp_path)
     assert {"mine.html", "points", "runs"} <= {path.name for path in tmp_path.iterdir()}

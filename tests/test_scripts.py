@@ -1,12 +1,17 @@
-"""The short programs in `scripts/` that use nothing but the public interface."""
+"""The programs in `scripts/`: short ones by the public interface, the demonstration, the benchmark and the soak."""
 
+import json
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import imageio
 import pytest
 
+from codrl_mj.actuators import IDEAL
+from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import read_run
 from codrl_mj.training import load_config
 
@@ -14,11 +19,21 @@ pytestmark = pytest.mark.matrix
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 
 
-def run(name, *arguments):
-    command = [sys.executable, str(SCRIPTS / name), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def command(name, *arguments):
+    return [sys.executable, str(SCRIPTS / name), *map(str, arguments)]
+
+
+def run(name, *arguments, status=0):
+    """What a program prints, or what it says when it ends with another status."""
+    done = subprocess.run(command(name, *arguments), capture_output=True, text=True, timeout=300)
+    assert done.returncode == status, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr if status else done.stdout
 
 
 def test_a_training_and_its_rollouts(tmp_path):
@@ -69,3 +84,96 @@ def test_from_a_bench_log_to_a_policy(tmp_path):
     config = load_config(tmp_path / "identified-0")
     assert len(config.env.randomize) >= 5
     assert printed.splitlines()[-1].startswith("| identified |")
+
+
+RUNS = ("ideal-seed4", "weaker-seed4")
+
+
+DEMO = "demo.py", "--seed", 4, "--total-steps", 2048, "--episodes", 2, "--out"
+
+
+@pytest.fixture(scope="module")
+def demonstrated(tmp_path_factory):
+    """The folder of a demonstration that was stopped while it trained and then run again, and what was printed."""
+    out = tmp_path_factory.mktemp("demo") / "out"
+    with subprocess.Popen(command(*DEMO, out), stdout=subprocess.PIPE) as killed:
+        while not (out / RUNS[1] / "progress.csv").exists():
+            assert killed.poll() is None
+            time.sleep(0.05)
+        killed.kill()
+        killed.communicate(timeout=20)  # its processes hold the pipe too: none outlives it
+    return out, run(*DEMO, out)
+
+
+def test_the_demonstration_leaves_two_runs_and_a_film(demonstrated):
+    out, _ = demonstrated
+    assert {path.name for path in out.iterdir()} == {*RUNS, "side_by_side.mp4"}
+    ideal, weaker = (load_config(out / name) for name in RUNS)
+    assert ideal.actuator == IDEAL
+    assert weaker.actuator.controller.kp == 0.2
+    assert ideal.agent == weaker.agent
+    assert ideal.seed == weaker.seed == 4
+    for name in RUNS:
+        load_policy(out / name)
+        assert (out / name / "learning_curve.png").is_file()
+    with imageio.get_reader(out / "side_by_side.mp4") as reader:
+        assert reader.get_meta_data()["codec"] == "h264"
+        width, height = reader.get_meta_data()["size"]
+    assert width == 2 * 480
+    assert height > 360
+
+
+def test_the_demonstration_prints_the_validation_and_all_four_results_and_where_to_look(demonstrated):
+    out, text = demonstrated
+    assert "FAILED" not in text
+    assert text.count("passed") == 25
+    for trained in ("ideal", "weaker"):
+        for deployed in ("ideal", "weaker"):
+            assert f"trained on {trained}, run on {deployed}" in text
+        assert str(out / f"{trained}-seed4" / "learning_curve.png") in text.replace("\n", "")
+    assert f"Open {out / 'side_by_side.mp4'}" in text
+
+
+def test_a_second_demonstration_reuses_the_trainings(demonstrated):
+    out, _ = demonstrated
+    weights = [out / name / "policy.safetensors" for name in RUNS]
+    before = [path.stat().st_mtime_ns for path in weights]
+    (out / "side_by_side.mp4").unlink()
+    text = run(*DEMO, out)
+    assert text.count("is trained already") == 2
+    assert [path.stat().st_mtime_ns for path in weights] == before
+    assert (out / "side_by_side.mp4").is_file()
+
+
+@pytest.mark.parametrize(
+    ("group", "least", "own"),
+    [("vector: mountain_car_continuous", 3, 2), ("single: pendulum", 3, 2), ("engine: pendulum", 4, 0)],
+)
+def test_a_group_of_the_benchmark_is_measured_against_its_first_member(group, least, own, tmp_path):
+    out = tmp_path / "bench.json"
+    printed = run("benchmark.py", "--duration", 0.02, "--turns", 2, "--only", group, "--out", out)
+    content = json.loads(out.read_text())
+    assert content["results"].keys() == {group}
+    members = content["results"][group]
+    assert len(members) >= least
+    assert sum(name.startswith("ours") for name in members) == own
+    assert next(iter(members.values()))["ratio"] == [1.0, 1.0, 1.0]
+    for name, numbers in members.items():
+        for median, lowest, highest in numbers.values():
+            assert 0 < lowest <= median <= highest, name
+    # what is not installed is skipped, and named
+    for library in ("envpool", "electric_motor"):
+        here = any(library.split("_")[-1] in name.lower() for name in members)
+        wanted = group.startswith({"envpool": "vector", "electric_motor": "single"}[library])
+        assert not wanted or here or f"skipped: {library}" in printed
+
+
+def test_a_short_soak_finds_nothing_wrong_on_one_and_two_threads():
+    printed = run("soak.py", "--task", "cartpole", "--num-envs", 64, "--steps", 6400)
+    assert "FAIL" not in printed
+    assert printed.count("ok  ") == 5
+
+
+@pytest.mark.parametrize(("script", "flag"), [("benchmark.py", "--turns"), ("soak.py", "--steps")])
+def test_bad_arguments_are_refused(script, flag):
+    assert f"{flag} 0: must be >= 1" in run(script, flag, 0, status=2)

@@ -18,6 +18,7 @@ from codrl_mj.deploy.board import TARGETS, missing_tools
 from codrl_mj.deploy.wire import Wire
 from codrl_mj.envs.config import EnvConfig
 from tests.deploy.test_export import trained
+from tests.deploy.test_run import with_sensors
 from tests.matrix import but
 
 pytestmark = pytest.mark.skipif(bool(missing_tools("host")), reason="NOT RUN: no C compiler: apt-get install gcc")
@@ -63,28 +64,29 @@ def test_episodes_on_the_board_are_those_of_onnxruntime(folder, target):
     np.testing.assert_allclose(done.returns[:, 0], done.returns[:, 1], rtol=1e-3)
 
 
+def spoilt(folder, out, before, inserted, file="controller.c"):
+    """A copy of an exported folder with something written into its C."""
+    shutil.copytree(folder, out, dirs_exist_ok=True)
+    begin, line, rest = (folder / file).read_text().partition(before)
+    assert line
+    (out / file).write_text(f"{begin}{line}{inserted}{rest}")
+    return out
+
+
 @of_furuta
 def test_a_weight_changed_in_the_c_changes_what_the_simulation_does(folder, tmp_path):
-    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
-    source = tmp_path / "controller.c"
-    begin, _, rest = source.read_text().partition("bias_0[64] = {")
-    source.write_text(f"{begin}bias_0[64] = {{9.0f + {rest}")
-    done = board_test(tmp_path, episodes=1)
+    done = board_test(spoilt(folder, tmp_path, "bias_0[64] = {", "9.0f + "), episodes=1)
     assert not np.array_equal(done.on_board[0].action, done.in_python[0].action)
 
 
 @pytest.mark.parametrize("folder", but(["furuta"], AGENTS), indirect=True)
 def test_a_gain_changed_in_the_c_changes_what_the_motor_does(folder, tmp_path):
-    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
-    source = tmp_path / "controller.c"
-    begin, line, rest = source.read_text().partition("  const real asked = ")
-    source.write_text(f"{begin}{line}0.001f * {rest}")
     off = []
-    for where in (folder, tmp_path):
+    for where in (folder, spoilt(folder, tmp_path, "  const real asked = ", "0.001f * ")):
         done = board_test(where, episodes=1)
         assert done.samples > 0
-        currents = [side[0].signals["current"] for side in (done.on_board, done.in_python)]
-        off.append((np.abs(currents[0][:20] - currents[1][:20]).max(), abs(done.returns[0, 0] - done.returns[0, 1])))
+        ours, theirs = (side[0].signals["current"][:20] for side in (done.on_board, done.in_python))
+        off.append((np.abs(ours - theirs).max(), abs(done.returns[0, 0] - done.returns[0, 1])))
     (same, alike), (changed, other) = off
     assert same < 1e-4 < 1e-3 < changed
     assert alike < other
@@ -94,19 +96,12 @@ def test_a_gain_changed_in_the_c_changes_what_the_motor_does(folder, tmp_path):
 FURUTA = EnvConfig("furuta")
 (DRIVE,) = FURUTA.driven.values()
 CLAMPING = DRIVE.replaced({"controller.anti_windup": "clamping"})
+LATE_AND_SAGGING = {"controller.delayed": True, "controller.deadband": 0.3, "supply.resistance": 1.5}
+OWN_GAINS = {"controller.kp": 6.0, "controller.ki": 900.0}
+GEARED = {"motor.thermal_resistance_winding": 5.0, "motor.gear_efficiency": 0.8, "motor.stribeck_friction": 1e-3}
 LOOPS = {
-    "late, with a dead band, sagging, clamping": CLAMPING.replaced(
-        {"controller.delayed": True, "controller.deadband": 0.3, "supply.resistance": 1.5}
-    ),
-    "own gains, warming, geared": DRIVE.replaced(
-        {
-            "controller.kp": 6.0,
-            "controller.ki": 900.0,
-            "motor.thermal_resistance_winding": 5.0,
-            "motor.gear_efficiency": 0.8,
-            "motor.stribeck_friction": 1e-3,
-        }
-    ),
+    "late, with a dead band, sagging, clamping": CLAMPING.replaced(LATE_AND_SAGGING),
+    "own gains, warming, geared": DRIVE.replaced(OWN_GAINS | GEARED),
     "servo": Servo(DRIVE.motor, DRIVE.controller, DRIVE.supply, ServoLoop(servo_rate=500.0, velocity_gain=0.004)),
     "the paper's": Actuator(Motor(), CurrentLoop(kp=2.0, ki=5.0, kd=1e-4, substeps=3, current_bias=0.02, kff=0.1)),
 }
@@ -184,6 +179,8 @@ def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
     policy, _ = trained("furuta", "ppo")
     export(policy, FURUTA, "ppo", tmp_path / "out", 1, limits=limits)
     contract, python = Contract.read(tmp_path / "out"), OnnxPolicy(tmp_path / "out")
+    assert contract.limits == {"arm_velocity": [-4.0, 4.0], "cos_rod": [pytest.approx(np.cos(3.0)), None]}
+    assert "arm_velocity, at least -4, at most 4" in (tmp_path / "out/controller.h").read_text()
     angles = np.random.default_rng(0).uniform(-np.pi, np.pi, 200)
     rows = np.array([[1.0, 0.0, np.cos(one), np.sin(one), 3.0 * one, 0.0] for one in angles])
     fine = (np.abs(angles) < 3.0) & (np.abs(3.0 * angles) < 4.0)
@@ -195,9 +192,13 @@ def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
     assert not commands[~fine].any()
     assert commands[fine].all()
     np.testing.assert_allclose(python.predict(rows)[0], commands, atol=1e-6)
-    for limit, says in {"arm_velocit": "did you mean arm_velocity", "rod": "must be > 0 and < pi"}.items():
+    for name, limit, says in (
+        ("arm_velocit", 4.0, "did you mean arm_velocity"),
+        ("arm_velocity", -4.0, "arm_velocity = -4: must be > 0"),
+        ("rod", 4.0, "must be > 0 and < pi"),
+    ):
         with pytest.raises(ValueError, match=says):
-            export(policy, FURUTA, "ppo", tmp_path / "other", 1, limits={limit: 4.0})
+            export(policy, FURUTA, "ppo", tmp_path / "other", 1, limits={name: limit})
 
 
 @pytest.mark.skipif(bool(missing_tools("cortex-m4f")), reason=f"NOT RUN: {missing_tools('cortex-m4f')}")
@@ -249,20 +250,14 @@ def form_of(folder):
     return struct.Struct(f"<HBBI{len(contract.observations) + 4 * len(contract.actions)}{kind_of(folder)}H")
 
 
-def command_of(folder, numbers):
-    contract = Contract.read(folder)
-    count = len(contract.observations)
-    return numbers[count : count + len(contract.actions)]
-
-
 def asked(folder, program, sent):
     """Statuses and commands that the program answers to bytes, read as frames with a checksum of their own."""
-    form = form_of(folder)
+    form, contract = form_of(folder), Contract.read(folder)
     got = subprocess.run([program], input=sent, capture_output=True, check=True, timeout=20).stdout
     answers = []
     for one in range(0, len(got), form.size):
         start, sequence, status, stamp, *numbers, check = form.unpack(got[one : one + form.size])
-        command = command_of(folder, numbers)
+        command = numbers[len(contract.observations) :][: len(contract.actions)]
         assert start == 0x5AA5
         assert check == binascii.crc_hqx(got[one + 2 : one + form.size - 2], 0xFFFF)
         answers.append((sequence, status, stamp, command))
@@ -279,9 +274,9 @@ def program(folder, tmp_path_factory):
     return built
 
 
-def frame(folder, sequence, stamp, row):
-    content = struct.pack(f"<BBI{len(row)}{kind_of(folder)}", sequence, 0, stamp % 2**32, *row)
-    return b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF))
+def frame(folder, sequence, stamp, row, kind=0, spoilt=False):
+    content = struct.pack(f"<BBI{len(row)}{kind_of(folder)}", sequence, kind, stamp % 2**32, *row)
+    return b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF) ^ spoilt)
 
 
 def test_every_frame_damaged_doubled_late_or_old_is_told_and_the_next_is_understood(folder, program):
@@ -303,38 +298,6 @@ def test_every_frame_damaged_doubled_late_or_old_is_told_and_the_next_is_underst
 
 
 @of_furuta
-def test_spoilt_frames_come_through_a_pseudo_terminal_as_they_do_through_a_pipe(folder, program):
-    tty = pytest.importorskip("tty")
-    rows = Contract.read(folder).golden["observations"][:40]
-    good = [frame(folder, n, 20_000 * n + 1, row) for n, row in enumerate(rows)]
-    random, sent = np.random.default_rng(1), []
-    for one in good:
-        flipped = bytearray(one)
-        flipped[int(random.integers(2, len(one)))] ^= 1 << int(random.integers(8))
-        sent.append([one, bytes(flipped), one + one, b"", one[:-3], bytes(one)][int(random.integers(6))])
-    sent = b"".join([*sent, *good[-3:]])
-    ours, theirs = os.openpty()
-    tty.setraw(theirs)
-    with subprocess.Popen([program], stdin=theirs, stdout=theirs) as running:
-        want = asked(folder, program, sent)
-        for one in range(0, len(sent), 50):
-            os.write(ours, sent[one : one + 50])
-        got, size = b"", form_of(folder).size
-        while len(got) < size * len(want):
-            got += os.read(ours, size * len(want) - len(got))
-        running.kill()
-    os.close(ours)
-    os.close(theirs)
-    answers = [form_of(folder).unpack(got[one : one + size]) for one in range(0, len(got), size)]
-    assert [(answer[1], answer[2], list(command_of(folder, answer[4:-1]))) for answer in answers] == [
-        (sequence, status, list(command)) for sequence, status, _, command in want
-    ]
-    assert {status for _, status, *_ in want} >= {OK, DAMAGED}
-    assert any(status & OLD for _, status, *_ in want)
-    assert any(status & LATE for _, status, *_ in want)
-
-
-@of_furuta
 @pytest.mark.parametrize("lacking", [1, 9])
 def test_a_frame_of_which_bytes_are_lost_is_refused_and_those_after_it_come_through(folder, program, lacking):
     rows = Contract.read(folder).golden["observations"]
@@ -346,30 +309,12 @@ def test_a_frame_of_which_bytes_are_lost_is_refused_and_those_after_it_come_thro
 
 
 WATCHING, DRIVING = 1, 2
-SENSORS = """
-#include "wire.h"
-real given[CONTROLLER_COMMANDS];
-int wire_sense(real observation[CONTROLLER_OBSERVATIONS]) {
-  for (int k = 0; k < CONTROLLER_OBSERVATIONS; k++) observation[k] = 0.3f;
-  return 1;
-}
-void wire_measure(real motors[3 * CONTROLLER_COMMANDS]) {
-  for (int k = 0; k < 3 * CONTROLLER_COMMANDS; k++) motors[k] = 0;
-}
-void wire_apply(const real command[CONTROLLER_COMMANDS]) {
-  for (int k = 0; k < CONTROLLER_COMMANDS; k++) given[k] = command[k];
-}
-"""
 
 
 @pytest.fixture
 def wired(folder, tmp_path):
     """Functions of the exported wire: to send a frame of a kind at a stamp [us], to ask the watchdog; what is given."""
-    (tmp_path / "sensors.c").write_text(SENSORS)
-    sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
-    line = ["cc", "-std=c99", "-shared", "-fPIC", "-DBOARD_SENSORS", f"-I{folder}", *sources]
-    library = str(tmp_path / "wire.so")
-    subprocess.run([*line, str(tmp_path / "sensors.c"), "-lm", "-o", library], check=True)
+    library = with_sensors(folder, tmp_path, "-shared", "-fPIC", "-DBAD=0", "-DWORSE=0", "-DGONE=0")
     wire, contract = ctypes.CDLL(library), Contract.read(folder)
     real = {"f": ctypes.c_float, "d": ctypes.c_double}[kind_of(folder)]
     given = (real * len(contract.actions)).in_dll(wire, "given")
@@ -377,10 +322,7 @@ def wired(folder, tmp_path):
     wire.wire_reset(state)
 
     def send(stamp, kind, spoilt=False):
-        row = contract.golden["observations"][0]
-        content = struct.pack(f"<BBI{len(row)}{kind_of(folder)}", 1, kind, stamp % 2**32, *row)
-        crc = binascii.crc_hqx(content, 0xFFFF) ^ spoilt
-        for byte in b"\xa5\x5a" + content + struct.pack("<H", crc):
+        for byte in frame(folder, 1, stamp, contract.golden["observations"][0], kind, spoilt):
             wire.wire_byte(state, byte, answer)
         return answer[3], any(given)
 
@@ -427,9 +369,6 @@ def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(
     assert header[sent + 1 :] == ["motor_voltage:V", "motor_current:A", "motor_position:rad"]
     refused = {
         "order": ([header[0], header[2], header[1], *header[3:]], rows),
-        "missing": ([header[0], *header[2:]], [[row[0], *row[2:]] for row in rows]),
-        "unit": ([*header[:1], header[1].partition(":")[0] + ":deg", *header[2:]], rows),
-        "knows none": ([*header[:1], "height:m", *header[2:]], rows),
         "rate": (header, [[str(2.0 * float(row[0])), *row[1:]] for row in rows]),
         "convert it": ([*header[:sent], "motor:kg", *header[sent + 1 :]], rows),
         "increase": (header, [rows[1], rows[0], *rows[2:]]),
@@ -437,29 +376,30 @@ def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(
         "a number": (header, [["soon", *rows[0][1:]], *rows[1:]]),
         "no column 'motor'": (header[:sent], [row[:sent] for row in rows]),
     }
+
+    def text(header, rows, end="\n"):
+        return end.join(",".join(row) for row in (header, *rows))
+
     for says, table in refused.items():
-        log.write_text("\n".join(",".join(row) for row in (table[0], *table[1])))
+        log.write_text(text(*table))
         with pytest.raises(ValueError, match=says):
             check_log(folder, log)
-    text = "\r\n".join(",".join(row) for row in (header, *rows))
-    log.write_text("\ufeff" + text + "\r\n\r\n", encoding="utf-8")  # as a spreadsheet saves it
+    log.write_text("\ufeff" + text(header, rows, "\r\n") + "\r\n\r\n", encoding="utf-8")  # as a spreadsheet saves it
     assert check_log(folder, log) == found
     for row in rows:
         row[sent] = str(float(row[sent]) + 0.01)
-    log.write_text("\n".join(",".join(row) for row in (header, *rows)))
+    log.write_text(text(header, rows))
     assert check_log(folder, log).differing == len(rows)
     assert main(["board", "check", str(folder), str(log)]) == 1
 
 
 @of_furuta
 def test_a_program_that_ends_is_an_error(folder, tmp_path, capsys):
-    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
-    source = (folder / "board.c").read_text()
     for line, says in {
-        "wire_reset(&wire);": "the board's program ended at frame 1",
-        "current_state state;\n  while": "the board's current loop did not answer at sample",
+        "wire_reset(&wire);\n": "the board's program ended at frame 1",
+        "current_state state;\n": "the board's current loop did not answer at sample",
     }.items():
-        (tmp_path / "board.c").write_text(source.replace(line, f"if (sizeof(real) > 0) return 3;\n  {line}"))
+        spoilt(folder, tmp_path, line, "  if (sizeof(real) > 0) return 3;\n", "board.c")
         assert main(["board", "test", str(tmp_path), "--episodes", "1"]) == 2
         assert says in capsys.readouterr().err
 
@@ -484,15 +424,11 @@ def test_what_cannot_be_run_is_said(folder, tmp_path, monkeypatch, capsys):
 
 
 @of_furuta
-@pytest.mark.parametrize("weight", ["0.0f / 0.0f", "1.5f"])
+@pytest.mark.parametrize("weight", ["0.0f / 0.0f + ", "1.5f + "])
 def test_a_wrong_weight_fails_the_golden_check_and_fast_math_does_not_compile(folder, tmp_path, weight):
     program = tmp_path / "golden"
-    spoilt = tmp_path / "controller.c"
-    text = (folder / "controller.c").read_text()
-    start = text.index("bias_0[")
-    brace = text.index("{", start) + 1
-    spoilt.write_text(f"{text[:brace]}{weight}, {text[text.index(',', brace) + 1 :]}")
-    sources = [str(spoilt), str(folder / "main.c")]
+    controller = spoilt(folder, tmp_path, "bias_0[64] = {", weight) / "controller.c"
+    sources = [str(controller), str(folder / "main.c")]
     subprocess.run(["cc", "-std=c99", f"-I{folder}", *sources, "-lm", "-o", str(program)], check=True)
     assert subprocess.run([program], check=False, capture_output=True).returncode == 1
     for flag in ("-ffast-math", "-ffinite-math-only"):

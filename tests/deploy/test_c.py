@@ -32,29 +32,30 @@ def each(names, in_float):
     return but([(in_float, False), *((name, True) for name in names)], itertools.product(names, KINDS))
 
 
-def compiled(folder, *flags):
-    """The controller of a folder as a library."""
-    library = folder / "controller.so"
-    files = [str(folder / "controller.c"), "-lm", "-o", str(library)]
-    subprocess.run([COMPILERS[0], *STRICT, *flags, "-shared", "-fPIC", *files], check=True)
-    return ctypes.CDLL(str(library))
-
-
-def written(folder, task, agent, settings, double, **changes):
+def written(folder, task, agent="ppo", settings=(), double=False, **changes):
     """The C files of a policy with random weights, the policy, and its contract."""
-    env = EnvConfig(task, **changes)
-    policy, _ = trained(task, agent, **settings)
-    contract = Contract.of(policy, env, agent, 1, double=double)
+    policy, _ = trained(task, agent, **dict(settings))
+    contract = Contract.of(policy, EnvConfig(task, **changes), agent, 1, double=double)
     for name, content in c_files(network_of(policy), contract).items():
         (folder / name).write_text(content)
     return policy, contract
+
+
+def compiled(folder, double, *functions):
+    """The controller of a folder as a library, of which some functions return a number; and the kind of its numbers."""
+    out = ["-shared", "-fPIC", str(folder / "controller.c"), "-lm", "-o", str(folder / "controller.so")]
+    subprocess.run([COMPILERS[0], *STRICT, *out], check=True)
+    library = ctypes.CDLL(out[-1])
+    for name in functions:
+        getattr(library, name).restype = KINDS[double]
+    return library, KINDS[double]
 
 
 @pytest.mark.parametrize("double", [False, True])
 @pytest.mark.parametrize(("task", "agent", "settings"), EACH)
 def test_the_policy_in_c_is_the_policy(tmp_path, task, agent, settings, double):
     policy, contract = written(tmp_path, task, agent, settings, double)
-    library, kind = compiled(tmp_path), KINDS[double]
+    library, kind = compiled(tmp_path, double)
     seen = observed(policy.observation_space, 2000)
     network = network_of(policy)
     expected = network(seen, np.float64) if double else policy.predict(seen, deterministic=True)[0]
@@ -73,7 +74,7 @@ def test_the_policy_in_c_is_the_policy(tmp_path, task, agent, settings, double):
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize(("task", "agent"), [("furuta", "sac"), ("acrobot", "dqn"), ("acrobot", "sarsa")])
 def test_golden_commands_are_computed_again_without_a_warning(tmp_path, compiler, task, agent):
-    written(tmp_path, task, agent, {}, double=False)
+    written(tmp_path, task, agent)
     program = str(tmp_path / "main")
     files = [str(tmp_path / name) for name in ("controller.c", "main.c")]
     subprocess.run([compiler, *STRICT, "-fsanitize=undefined", *files, "-lm", "-o", program], check=True)
@@ -95,15 +96,14 @@ LOOPS = {
 @pytest.mark.parametrize(("name", "double"), each(LOOPS, "late"))
 def test_the_current_loop_in_c_is_the_drive_s_sample_by_sample(tmp_path, name, double):
     (usual,) = EnvConfig("furuta").driven.values()
-    controller = dataclasses.replace(usual.controller, **LOOPS[name])
-    motor = dataclasses.replace(usual.motor, load_inertia=np.inf)  # a held speed, as the engine gives it
-    drive = dataclasses.replace(usual, controller=controller, motor=motor)
-    written(tmp_path, "furuta", "ppo", {}, double, actuator=drive)
-    library, kind = compiled(tmp_path), KINDS[double]
-    library.current_step.restype = library.current_reference.restype = kind
+    changed = {f"controller.{field}": value for field, value in LOOPS[name].items()}
+    drive = usual.replaced(changed | {"motor.load_inertia": np.inf})  # a held speed, as the engine gives it
+    motor = drive.motor
+    written(tmp_path, "furuta", double=double, actuator=drive)
+    library, kind = compiled(tmp_path, double, "current_step", "current_reference")
     state = (kind * 2)()
     library.current_reset(state)
-    parameters, period = parameters_type(Drive)(*drive.numbers), 1.0 / controller.sample_rate
+    parameters, period = parameters_type(Drive)(*drive.numbers), 1.0 / drive.controller.sample_rate
     ours, decay = State(*[0.0] * 9), np.exp(-motor.resistance * period / motor.inductance)
     random = np.random.default_rng(0)
     saturated = 0
@@ -140,9 +140,8 @@ def test_the_paper_s_loop_in_c_is_the_actuator_s_sample_by_sample(tmp_path, name
     controller = dataclasses.replace(usual.controller, **PID[name])
     supply = Supply(12.0, 0.5) if name == "sagging" else usual.supply
     actuator = dataclasses.replace(usual, controller=controller, supply=supply)
-    written(tmp_path, "cartpole", "dqn", {}, double, actuator=actuator)
-    library, kind = compiled(tmp_path), KINDS[double]
-    library.current_step.restype = library.current_reference.restype = kind
+    written(tmp_path, "cartpole", "dqn", double=double, actuator=actuator)
+    library, kind = compiled(tmp_path, double, "current_step", "current_reference")
     parameters = parameters_type(Actuator)(*actuator.numbers)
     header = (tmp_path / "controller.h").read_text()
     period = 1.0 / float(header.partition("CONTROLLER_CURRENT_RATE ")[2].partition(" ")[0].rstrip("f"))
@@ -181,9 +180,8 @@ def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name,
     (drive,) = EnvConfig("furuta").driven.values()
     loop = ServoLoop(servo_rate=500.0, **SERVOS[name])
     servo = Servo(dataclasses.replace(drive.motor, gear_ratio=3.0), drive.controller, drive.supply, loop)
-    written(tmp_path, "furuta", "ppo", {}, double, actuator=servo, action=loop.controls)
-    library, kind = compiled(tmp_path), KINDS[double]
-    library.servo_step.restype = library.servo_target.restype = kind
+    written(tmp_path, "furuta", double=double, actuator=servo, action=loop.controls)
+    library, kind = compiled(tmp_path, double, "servo_step", "servo_target")
     assert library.servo_target(kind(0.5)) == pytest.approx(0.5 * 3.0)
     state, random, limited, free = (kind * 1)(), np.random.default_rng(0), 0, 0
     library.servo_reset(state)
@@ -197,9 +195,8 @@ def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name,
         rate = (target - ours.target) / period if ours.due > 0.0 else 0.0
         if not double:
             state[0] = ours.velocity_integral
-        ours, _, signals = Servo.advance(
-            parameters, period, ours, Inputs(target, position, speed, sample * period, 0.0)
-        )
+        inputs = Inputs(target, position, speed, sample * period, 0.0)
+        ours, _, signals = Servo.advance(parameters, period, ours, inputs)
         reference = library.servo_step(state, kind(target), kind(rate), kind(position), kind(speed))
         assert reference == pytest.approx(signals.reference_current, rel=0, abs=1e-12 if double else 5e-6)
         assert state[0] == pytest.approx(ours.velocity_integral, rel=0, abs=1e-12 if double else 1e-7)
@@ -218,26 +215,25 @@ def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name,
 )
 def test_without_a_drive_s_loop_there_is_the_policy_alone(tmp_path, task, changes):
     assert current_loop(EnvConfig(task, **changes)) is None
-    written(tmp_path, task, "ppo", {}, False, **changes)
+    written(tmp_path, task, **changes)
     assert "current_step" not in (tmp_path / "controller.h").read_text()
 
 
-def test_a_policy_that_does_not_fit_is_refused_with_both_sizes():
-    policy, _ = trained("pendulum", "ppo", hidden=(128, 128))
-    network = network_of(policy)
+MLP, SARSA = ("pendulum", "ppo"), ("acrobot", "sarsa")
+
+
+@pytest.mark.parametrize(
+    ("board", "policy", "hidden", "double", "says"),
+    [
+        ("arduino-uno", MLP, 128, False, r"arduino-uno: .* needs about \d+ bytes of flash, must be at most 32256"),
+        ("arduino-uno", MLP, 48, False, r"arduino-uno: .* needs about 1\d+ bytes of RAM, must be at most 2048"),
+        ("arduino-uno", MLP, 48, True, "double has 4 bytes"),
+        ("arduino-uno", SARSA, None, False, r"train a smaller one \(--agent.tilings 4\), or name a larger"),
+        ("arduino-un", MLP, 48, False, "did you mean arduino-uno"),
+    ],
+)
+def test_a_policy_that_does_not_fit_is_refused_with_both_sizes(board, policy, hidden, double, says):
+    network = network_of(trained(*policy, **({"hidden": (hidden, hidden)} if hidden else {}))[0])
     check_board("nucleo-f446re", network, double=False)
-    with pytest.raises(
-        ValueError, match=r"arduino-uno: the policy needs about \d+ bytes of flash, must be at most 32256"
-    ):
-        check_board("arduino-uno", network)
-    small = network_of(trained("pendulum", "ppo", hidden=(48, 48))[0])
-    with pytest.raises(
-        ValueError, match=r"arduino-uno: the policy needs about 1\d+ bytes of RAM, must be at most 2048"
-    ):
-        check_board("arduino-uno", small)  # whose constants are copied there
-    with pytest.raises(ValueError, match="double has 4 bytes"):
-        check_board("arduino-uno", small, double=True)
-    with pytest.raises(ValueError, match=r"train a smaller one \(--agent.tilings 4\), or name a larger"):
-        check_board("arduino-uno", network_of(trained("acrobot", "sarsa")[0]))
-    with pytest.raises(ValueError, match="did you mean arduino-uno"):
-        check_board("arduino-un", network)
+    with pytest.raises(ValueError, match=says):
+        check_board(board, network, double)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.cli import main
-from codrl_mj.deploy import Contract, OnnxPolicy, check_log, export, run_board
+from codrl_mj.deploy import OnnxPolicy, check_log, export, run_board
 from codrl_mj.deploy.board import missing_tools
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.identify.reading import read_log
@@ -19,42 +19,49 @@ pytestmark = pytest.mark.skipif(bool(missing_tools("host")), reason="NOT RUN: no
 SENSORS = """
 #include "wire.h"
 static int asked;
-static real given;
+real given[CONTROLLER_COMMANDS];
 int wire_sense(real observation[CONTROLLER_OBSERVATIONS]) {
   asked++;
   for (int k = 0; k < CONTROLLER_OBSERVATIONS; k++) observation[k] = 0.01f * (real)asked;
   observation[0] = observation[2] = 1;
-  if (asked == BAD) observation[4] = WORSE;
+  if (asked == BAD) observation[CONTROLLER_OBSERVATIONS - 2] = WORSE;
   return asked != GONE;
 }
 void wire_measure(real motors[3 * CONTROLLER_COMMANDS]) {
-  motors[0] = given;
+  motors[0] = given[0];
   motors[1] = 0.5f;
   motors[2] = 0.1f * (real)asked;
 }
-void wire_apply(const real command[CONTROLLER_COMMANDS]) { given = command[0]; }
+void wire_apply(const real command[CONTROLLER_COMMANDS]) { given[0] = command[0]; }
 """
+
+
+def with_sensors(folder, out, *flags):
+    """The board's program of an exported folder, compiled with these sensors; its path."""
+    (out / "sensors.c").write_text(SENSORS)
+    sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
+    line = ["cc", "-std=c99", "-DBOARD_SENSORS", *flags, f"-I{folder}", *sources, str(out / "sensors.c")]
+    subprocess.run([*line, "-lm", "-o", str(out / "board")], check=True)
+    return str(out / "board")
+
+
+def exported(out, fastest):
+    export(trained("furuta", "ppo")[0], EnvConfig("furuta"), "ppo", out, 1, limits={"arm_velocity": fastest})
+    return out
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    out = tmp_path_factory.mktemp("exported") / "furuta"
-    export(trained("furuta", "ppo")[0], EnvConfig("furuta"), "ppo", out, 1, limits={"arm_velocity": 20.0})
-    return out
+    return exported(tmp_path_factory.mktemp("exported") / "furuta", 20.0)
 
 
 @pytest.fixture
 def port(folder, tmp_path):
     """Starts a board, and says where it is; BAD is the question to which an arm's velocity of WORSE is the answer."""
-    tty = pytest.importorskip("tty")
-    running, opened = [], []
+    tty, running, opened = pytest.importorskip("tty"), [], []
 
     def start(bad=0, worse="0", gone=0):
-        (tmp_path / "sensors.c").write_text(SENSORS)
-        program = str(tmp_path / "board")
-        sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
-        flags = ["-DBOARD_SENSORS", f"-DBAD={bad}", f"-DWORSE={worse}", f"-DGONE={gone}", f"-I{folder}"]
-        subprocess.run(["cc", *flags, *sources, str(tmp_path / "sensors.c"), "-lm", "-o", program], check=True)
+        program = with_sensors(folder, tmp_path, f"-DBAD={bad}", f"-DWORSE={worse}", f"-DGONE={gone}")
         ours, theirs = os.openpty()
         tty.setraw(theirs)
         tty.setraw(ours)
@@ -117,9 +124,7 @@ def test_a_board_that_drives_is_stopped_when_something_is_wrong(folder, port, tm
 def test_a_second_run_does_not_drive_with_the_command_of_the_first(folder, port, tmp_path):
     board = port()
     assert run_board(folder, board, tmp_path / "first.csv", seconds=0.5).why == "told to"
-    again = run_board(
-        folder, board, tmp_path / "again.csv", drive=True, seconds=5.0
-    )  # without a watchdog: stamps are old
+    again = run_board(folder, board, tmp_path / "again.csv", drive=True, seconds=5.0)  # no watchdog: stamps are old
     assert "took a frame for old" in again.why
     _, rows = table_of(tmp_path / "again.csv")
     assert not rows[:, 8].any()  # what the drive got
@@ -150,9 +155,8 @@ def test_a_number_that_is_none_is_named_with_its_line(folder, port, tmp_path):
 def test_any_key_ends_it(folder, port, tmp_path):
     keys, terminal = os.openpty()
     line = [sys.executable, "-m", "codrl_mj", "board", "run", str(folder), "--port", port()]
-    with subprocess.Popen(
-        [*line, "--out", str(tmp_path / "log.csv")], stdin=terminal, stdout=subprocess.PIPE
-    ) as running:
+    line += ["--out", str(tmp_path / "log.csv")]
+    with subprocess.Popen(line, stdin=terminal, stdout=subprocess.PIPE) as running:
         assert b"any key ends it" in running.stdout.readline()
         time.sleep(1.0)
         os.write(keys, b" ")
@@ -163,10 +167,8 @@ def test_any_key_ends_it(folder, port, tmp_path):
 
 
 def test_in_python_too_limits_are_kept(folder, port, tmp_path):
-    looser = tmp_path / "looser"
-    policy, _ = trained("furuta", "ppo")
-    export(policy, EnvConfig("furuta"), "ppo", looser, 1, limits={"arm_velocity": 0.05})
-    done = run_board(looser, port(), tmp_path / "log.csv", drive=True, seconds=5.0)  # whose C allows 20 rad/s
+    tighter = exported(tmp_path / "tighter", 0.05)
+    done = run_board(tighter, port(), tmp_path / "log.csv", drive=True, seconds=5.0)  # whose C allows 20 rad/s
     assert "beyond the limits" in done.why
     _, rows = table_of(tmp_path / "log.csv")
     assert len(rows) == 6 - done.missed
@@ -186,9 +188,3 @@ def test_a_board_without_sensors_an_answer_or_a_port_is_said(folder, port, tmp_p
     assert (done.rows, done.missed) == (0, 3)
     for one in (ours, theirs):
         os.close(one)
-
-
-def test_the_contract_has_the_limits(folder):
-    contract = Contract.read(folder)
-    assert contract.limits == {"arm_velocity": [-20.0, 20.0]}
-    assert "arm_velocity, at least -20, at most 20" in (folder / "controller.h").read_text()

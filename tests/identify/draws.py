@@ -6,10 +6,7 @@
 import argparse
 import collections
 import dataclasses
-import json
 import math
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -30,19 +27,13 @@ NAMES = {
 }
 GOALS = {"R": 0.02, "L": 0.1, "kE": 0.02, "J": 0.05, "Coulomb": 0.05, "viscous": 0.05, "friction": 0.05}
 """Relative errors within which what is identified is asked to be."""
+KINDS = ("prbs", "locked_prbs", "chirp", "square", "slow_sine")
+SLOW = {"rate": 1000.0}
 ROWS = {
-    f"{kind} {rate // 1000} kHz{', ' + voltage if voltage != 'mean' else ''}": {
-        "kind": kind,
-        "rate": float(rate),
-        "voltage": voltage,
-    }
-    for kind, rate, voltage in [
-        *((kind, 5000, "mean") for kind in ("prbs", "locked_prbs", "chirp", "square", "slow_sine")),
-        *((kind, 1000, "mean") for kind in ("prbs", "locked_prbs", "chirp", "square", "slow_sine")),
-        *((kind, 5000, "instantaneous") for kind in ("prbs", "locked_prbs", "chirp", "square", "slow_sine")),
-        *((kind, 1000, "together") for kind in ("prbs", "locked_prbs")),
-    ]
-} | {
+    **{f"{kind} 5 kHz": {"kind": kind} for kind in KINDS},
+    **{f"{kind} 1 kHz": {"kind": kind, **SLOW} for kind in KINDS},
+    **{f"{kind} 5 kHz, instantaneous": {"kind": kind, "voltage": "instantaneous"} for kind in KINDS},
+    **{f"{kind} 1 kHz, together": {"kind": kind, "voltage": "together", **SLOW} for kind in KINDS[:2]},
     "prbs 5 kHz, jitter 10 %": {"jitter": 0.1},
     "prbs 5 kHz, encoder of 512 steps": {"encoder": 512},
 }
@@ -108,6 +99,14 @@ def uniform(log):
     return dataclasses.replace(log, time=np.arange(len(log.time)) * log.step)
 
 
+def called(log, mean):
+    return dataclasses.replace(log, mean_voltage=mean)
+
+
+def largest(draw):
+    return VOLTS / motor_of(draw).resistance
+
+
 def spiky(log, name):
     """A signal with 0.5 % of outliers."""
     random, values = np.random.default_rng(0), log.signals[name].copy()
@@ -116,14 +115,12 @@ def spiky(log, name):
 
 
 FAULTS = {
-    "none": lambda draw: logged(draw),
+    "none": logged,
     "voltage 1 row early": lambda draw: late(logged(draw), 1),
     "voltage 6 rows early": lambda draw: late(logged(draw), 6),
     "supply sags by 0.15 R": lambda draw: logged(draw, sag=0.15),
     "current 10 % too large": lambda draw: scaled(logged(draw), current=1.1),
-    "current offset by 2 % of its largest": lambda draw: logged(
-        draw, current={"bias": 0.02 * VOLTS / motor_of(draw).resistance}
-    ),
+    "current offset by 2 % of its largest": lambda draw: logged(draw, current={"bias": 0.02 * largest(draw)}),
     "5 % of the rows missing": lambda draw: logged(draw, dropped=0.05),
     "missing rows, taken for uniform": lambda draw: uniform(logged(draw, dropped=0.05)),
     "stamps jitter by 10 %": lambda draw: logged(draw, jitter=0.1),
@@ -138,30 +135,19 @@ FAULTS = {
     "mA for A": lambda draw: scaled(logged(draw), current=1e3),
     "degrees for radians": lambda draw: scaled(logged(draw), position=180.0 / math.pi),
     "time in ms": lambda draw: dataclasses.replace(logged(draw), time=1e3 * logged(draw).time),
-    "a voltage of the rows' times, called mean": lambda draw: dataclasses.replace(
-        logged(draw, voltage="instantaneous"), mean_voltage=True
-    ),
-    "a mean, called the voltage of the row": lambda draw: dataclasses.replace(logged(draw), mean_voltage=False),
+    "a voltage of the rows' times, called mean": lambda draw: called(logged(draw, voltage="instantaneous"), True),
+    "a mean, called the voltage of the row": lambda draw: called(logged(draw), False),
 }
 
 
-class Found(NamedTuple):
-    """What one draw gave."""
-
-    numbers: dict[str, tuple[str, float, bool]]
-    """Short name -> status, relative error, whether the truth is within the interval."""
-    said: list[str]
-    """By the checks and the fit."""
-
-
 def tried(make, draw):
-    """One draw."""
+    """Of one draw: short name -> status, relative error, whether the truth is within the interval; and what is said."""
     motor, log = motor_of(draw), make(draw)
     said = [f"{one.check} ({one.severity})" for one in check(log) if one.severity != "info"]
     try:
         found = identify([log], "free" if log.has("position") else None, seed=draw)
     except ValueError as error:
-        return Found({}, [*said, str(error)[:40]])
+        return {}, [*said, str(error)[:40]]
     said += ["residuals" for text in found.warnings if "residuals" in text][:1]
     said += [f"{part} {rows:+g} rows" for part, rows in found.delays.items() if rows]
     named, numbers = {one.name: one for one in found.estimates}, {}
@@ -169,7 +155,7 @@ def tried(make, draw):
         if name in named:
             one, truth = named[name], _truth(motor, named, name)
             numbers[short] = one.status, one.value / truth - 1.0, one.low <= truth <= one.high
-    return Found(numbers, sorted(set(said)))
+    return numbers, sorted(set(said))
 
 
 def _truth(motor, named, name):
@@ -195,31 +181,20 @@ def main():
     parser.add_argument("--draws", type=int, default=100)
     parser.add_argument("--faults", action="store_true")
     parser.add_argument("--only", nargs="*", help="rows, by their whole names")
-    parser.add_argument("--log", type=Path, help="file with a line for each draw, from which a run goes on")
     options = parser.parse_args()
     rows = FAULTS if options.faults else {name: lambda draw, row=row: logged(draw, **row) for name, row in ROWS.items()}
-    lines = options.log.read_text().splitlines() if options.log and options.log.exists() else []
-    known = {(row, draw): Found(*found) for row, draw, found in map(json.loads, lines)}
     print(f"of {options.draws} draws: identified, of these within the interval, largest error; rough: the same")
     print(f"| | {' | '.join(NAMES)} | beyond the goal | said |\n| --- | {'--- | ' * (len(NAMES) + 1)}--- |")
-    for name, make in rows.items():
-        if options.only and name not in options.only:
-            continue
-        for draw in range(options.draws):
-            if (name, draw) not in known:
-                known[name, draw] = tried(make, draw)
-                if options.log:
-                    with options.log.open("a") as file:
-                        file.write(json.dumps([name, draw, known[name, draw]], default=bool) + "\n")
-        found = [known[name, draw] for draw in range(options.draws)]
-        by_name = {short: [one.numbers[short] for one in found if short in one.numbers] for short in NAMES}
-        off = {
-            short: count
-            for short, several in by_name.items()
-            if (count := sum(one == "identified" and abs(error) > GOALS[short] for one, error, _ in several))
-        }
-        said = dict(collections.Counter(text for one in found for text in one.said))
-        print(f"| {name} | {' | '.join(map(cell, by_name.values()))} | {off or ''} | {said} |", flush=True)
+    for name in options.only or rows:
+        found = [tried(rows[name], draw) for draw in range(options.draws)]
+        cells, off = [], {}
+        for short in NAMES:
+            several = [numbers[short] for numbers, _ in found if short in numbers]
+            cells.append(cell(several))
+            if count := sum(one == "identified" and abs(error) > GOALS[short] for one, error, _ in several):
+                off[short] = count
+        said = dict(collections.Counter(text for _, texts in found for text in texts))
+        print(f"| {name} | {' | '.join(cells)} | {off or ''} | {said} |", flush=True)
 
 
 if __name__ == "__main__":

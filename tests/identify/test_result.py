@@ -42,12 +42,11 @@ def test_the_file_is_the_actuator_and_randomize_draws_within_the_intervals(tmp_p
     drive = resolve(str(written[0]), None, "a test")
     assert isinstance(drive, Drive)
     assert (drive.motor.resistance, drive.motor.inductance, drive.motor.coulomb_friction) == (1.2, 1e-3, 1e-3)
-    ranges = identified_ranges(written[0])
-    assert set(ranges) == {
-        f"motor.{n}" for n in ("resistance", "back_emf_constant", "torque_constant", "coulomb_friction")
+    assert identified_ranges(written[0]) == {
+        "motor.resistance": "loguniform(1.1, 1.3)",
+        **{f"motor.{side}_constant": "loguniform(0.049, 0.051)" for side in ("back_emf", "torque")},
+        "motor.coulomb_friction": "uniform(0.0, 0.002)",
     }
-    assert ranges["motor.resistance"] == "loguniform(1.1, 1.3)"
-    assert ranges["motor.coulomb_friction"] == "uniform(0.0, 0.002)"
     assert json.loads(written[1].read_text())["estimates"][0]["high"] == 1.3
 
 
@@ -130,13 +129,12 @@ def write_csv(path, log):
 
 def test_the_command_line_identifies_and_draws_within_the_intervals(tmp_path, capsys):
     log = write_csv(tmp_path / "bench.csv", bench.motor_log("locked", 2000, 2.5))
-    columns = "time=t:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
-    out = tmp_path / "motor"
-    known = ["--known", "torque_constant=0.05", "back_emf_constant=0.05", "rotor_inertia=2e-5"]
     wrong = bench.motor_log("locked", 2000, 1.0)
     wrong = write_csv(tmp_path / "wrong.csv", replaced(wrong, "current", -wrong.signals["current"]))
-    given = ["identify", log, "--columns", columns, *known, "--out", str(out), "--holdout", wrong]
-    assert main(given) == 0
+    columns = "time=t:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
+    known = "torque_constant=0.05 back_emf_constant=0.05 rotor_inertia=2e-5"
+    line, out = f"identify {log} --columns {columns} --known", tmp_path / "motor"
+    assert main(f"{line} {known} --out {out} --holdout {wrong}".split()) == 0
     shown = capsys.readouterr().out
     assert "wrong, which is held out, has errors, and is left out" in shown
     assert "supply 3 V: the largest of the logs" in shown
@@ -155,5 +153,5 @@ def test_the_command_line_identifies_and_draws_within_the_intervals(tmp_path, ca
     verb = tyro.cli(train_verb(words), args=words)
     with pytest.raises(ValueError, match="identified: draws within the intervals of a file"):
         environment(verb, "pendulum", verb.actuator_name, EnvConfig("pendulum"))
-    assert main(["identify", log, "--columns", columns, "--known", "mgl"]) == 2
+    assert main(f"{line} mgl".split()) == 2
     assert "must be NAME=NUMBER" in capsys.readouterr().err

@@ -32,35 +32,11 @@ def test_the_winding_is_exact_over_uneven_steps():
         assert currents[row + 1] == pytest.approx(here, abs=1e-7)
 
 
-def test_a_pendulum_without_dry_friction_is_that_of_scipy():
-    moved = STILL._replace(gravity=3.6, viscous=0.05, constant_torque=0.1)
-    times = np.linspace(0.0, 1.0, 101)
-    positions, speeds = simulate(moved, times, 0.7, 0.4, -1.0)
-    slope = lambda _, state: [state[1], (0.7 - 0.1 - 3.6 * np.sin(state[0]) - 0.05 * state[1]) / 0.2]  # noqa: E731
-    found = solve_ivp(slope, (0.0, 1.0), [0.4, -1.0], t_eval=times, rtol=1e-10, atol=1e-12).y
-    np.testing.assert_allclose(positions, found[0], atol=2e-6)
-    np.testing.assert_allclose(speeds, found[1], atol=1e-5)
-
-
-def test_coulomb_friction_stops_a_shaft_after_the_time_and_the_way_that_it_takes():
-    times = np.linspace(0.0, 1.0, 1001)
-    positions, speeds = simulate(STILL._replace(coulomb=0.4), times, 0.0, 0.0, 1.0)
-    # decelerates by 0.4/0.2 rad/s^2: 0.5 s and 0.25 rad
-    np.testing.assert_allclose(speeds, np.maximum(1.0 - 2.0 * times, 0.0), atol=1e-9)
-    assert positions[-1] == pytest.approx(0.25, abs=1e-6)
-
-
 @pytest.mark.parametrize(("torque", "slides"), [(0.029, False), (0.031, True)])
 def test_a_shaft_breaks_loose_beyond_coulomb_and_stribeck_friction_together(torque, slides):
     moved = STILL._replace(coulomb=0.01, stribeck_friction=0.02, stribeck_speed=1.0)
     positions, _ = simulate(moved, np.linspace(0.0, 0.5, 51), torque)
     assert bool(positions[-1] > 0.0) is slides
-
-
-def test_a_gear_takes_its_share_of_what_drives():
-    moved = STILL._replace(gear_efficiency=0.8)
-    _, speeds = simulate(moved, np.linspace(0.0, 0.5, 51), 0.4)
-    assert speeds[-1] == pytest.approx(0.8 * 0.4 / 0.2 * 0.5, rel=1e-9)
 
 
 def test_a_voltage_brakes_by_its_back_emf():

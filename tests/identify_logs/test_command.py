@@ -37,36 +37,27 @@ def test_a_simulated_log_is_checked_by_the_columns_that_are_printed(capsys, tmp_
     assert "error" not in text
 
 
-def test_a_log_that_is_named_twice_is_checked_once(capsys):
-    said(capsys, "simulate quanser-qube-servo-2 --out log.csv --duration 1")
-    line = "check log.csv {} --columns time=time:s,voltage=voltage:V,current=current:A"
-    assert said(capsys, line.format("log.csv")) == said(capsys, line.format(""))
+QUBE = "simulate quanser-qube-servo-2 --out log.csv --duration 1"
+COLUMNS = "--columns time=time:s,voltage=voltage:V,current=current:A,position=position:rad"
 
 
-def test_a_log_that_is_there_is_simulated_anew_and_a_folder_is_refused(capsys, tmp_path):
+def test_a_log_is_simulated_anew_checked_once_and_has_no_findings(capsys):
     for _ in range(2):
-        said(capsys, "simulate quanser-qube-servo-2 --out log.csv --duration 1")
-    (tmp_path / "logs").mkdir()
-    error = said(capsys, "simulate quanser-qube-servo-2 --out logs --duration 1", 2)
-    assert "cannot write logs: it is a folder: name a file" in error
+        said(capsys, f"{QUBE} --sensor current:noise=0.01")
+    once = said(capsys, f"check log.csv {COLUMNS}")
+    assert "nothing is wrong" in once
+    assert said(capsys, f"check log.csv log.csv {COLUMNS}") == once
 
 
 def test_errors_are_an_exit_status_and_json(capsys):
-    said(capsys, "simulate quanser-qube-servo-2 --out log.csv --duration 1 --sensor current:gain=-1")
-    columns = "--columns time=time:s,voltage=voltage:V,current=current:A,position=position:rad"
-    findings = json.loads(said(capsys, f"check log.csv {columns} --json", 1))
+    said(capsys, f"{QUBE} --sensor current:gain=-1")
+    findings = json.loads(said(capsys, f"check log.csv {COLUMNS} --json", 1))
     assert [one["check"] for one in findings if one["severity"] == "error"] == ["sign"]
     assert {"log", "severity", "check", "row", "message", "remedy"} == findings[0].keys()
 
 
-def test_a_log_without_findings_says_so(capsys):
-    said(capsys, "simulate quanser-qube-servo-2 --out log.csv --duration 1 --sensor current:noise=0.01")
-    columns = "time=time:s,voltage=voltage:V,current=current:A,position=position:rad"
-    assert "nothing is wrong" in said(capsys, f"check log.csv --columns {columns}")
-
-
 def test_columns_are_proposed_with_the_line_to_type_next(capsys):
-    said(capsys, "simulate quanser-qube-servo-2 --out log.csv --duration 1")
+    said(capsys, QUBE)
     text = said(capsys, "columns log.csv")
     assert "to be checked: current: no unit is stated, A is a guess" in text
     line = text.splitlines()[-1].removeprefix("codrl-mj identify ")
@@ -97,15 +88,13 @@ def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path, monkeypa
         ("plan maxon", "unknown"),
         ("plan maxon-ec45-flat-50w --duration 0.1", "log for longer"),
         ("simulate quanser-qube-servo-2 --out log.txt", "must end in .csv"),
-        ("simulate quanser-qube-servo-2 --out log.csv --sensor current:nois=1", "did you mean noise"),
-        ("simulate quanser-qube-servo-2 --out log.csv --sensor current:noise=a", "SIGNAL:FIELD=NUMBER"),
-        ("simulate quanser-qube-servo-2 --out log.csv --sensor currant:noise=1", "did you mean current"),
-        (
-            "simulate quanser-qube-servo-2 --out log.csv --sensor current:noise=1 current:bias=1",
-            "current is given twice",
-        ),
-        ("simulate quanser-qube-servo-2 --out log.csv --amplitude -19", "must be at most the supply's 18 V"),
-        ("simulate quanser-qube-servo-2 --out log.csv --rate 0", "rate"),
+        ("simulate quanser-qube-servo-2 --out .", "cannot write .: it is a folder: name a file"),
+        (f"{QUBE} --sensor current:nois=1", "did you mean noise"),
+        (f"{QUBE} --sensor current:noise=a", "SIGNAL:FIELD=NUMBER"),
+        (f"{QUBE} --sensor currant:noise=1", "did you mean current"),
+        (f"{QUBE} --sensor current:noise=1 current:bias=1", "current is given twice"),
+        (f"{QUBE} --amplitude -19", "must be at most the supply's 18 V"),
+        (f"{QUBE} --rate 0", "rate"),
     ],
 )
 def test_what_is_refused_says_why(capsys, tmp_path, line, says):

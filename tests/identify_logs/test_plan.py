@@ -94,9 +94,7 @@ def test_what_is_written_is_what_was_planned(planned, tmp_path):
     time, voltage = np.loadtxt(tmp_path / "excitation.csv", delimiter=",", skiprows=1).T
     assert (tmp_path / "excitation.csv").read_text().startswith("time,voltage\n")
     np.testing.assert_allclose(np.diff(time), 1.0 / planned.best.rate, rtol=1e-3)
-    inside = time + 0.4 / planned.best.rate
-    if "prbs" not in planned.best.excitation.kind:
-        inside = time
+    inside = time + (0.4 / planned.best.rate if "prbs" in planned.best.excitation.kind else 0.0)
     assert np.corrcoef(voltage, planned.best.excitation.voltage(inside))[0, 1] > 0.999
     assert voltage[-1] == 0.0
 

@@ -26,7 +26,7 @@ class Parsed(HTMLParser):
                 self.ids.append(value)
             if name in ("src", "href", "xlink:href", "data", "poster") and not value.startswith("data:"):
                 (self.targets if value.startswith("#") else self.fetched).append(value)
-        assert tag not in ("link", "iframe", "object")
+        assert tag not in ("iframe", "object")
 
     def handle_endtag(self, tag):
         assert self.open.pop()[0] == tag

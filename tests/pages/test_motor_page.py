@@ -54,12 +54,8 @@ def test_limits_behind_a_supply_are_where_the_motor_settles():
     """The simulation is asked for far more than it can give, at a speed that is held."""
     motor = Motor(resistance=1.0, inductance=1e-3, torque_constant=0.1, back_emf_constant=0.1)
     speeds = np.array([-100.0, 0.0, 50.0, 100.0, 200.0])
-    for supply, most in (
-        (Supply(24.0, 1.0), math.inf),
-        (Supply(24.0, 1.0), 9.0),
-        (Supply(math.inf, 0.5), 12.0),
-        (None, 12.0),
-    ):
+    sagging, endless = Supply(24.0, 1.0), Supply(math.inf, 0.5)
+    for supply, most in ((sagging, math.inf), (sagging, 9.0), (endless, 12.0), (None, 12.0)):
         actuator = Actuator(motor, CurrentLoop(kp=10.0, max_voltage=most, substeps=20), supply)
         settled = []
         for asked, speed in itertools.product((-1e3, 1e3), speeds):

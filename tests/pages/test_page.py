@@ -19,23 +19,11 @@ def small(*parts, title="t"):
 
 def test_names_with_markup_show_as_text_everywhere():
     plot = Plot(EVIL, EVIL, EVIL, (Curve(EVIL, np.arange(3.0), np.arange(3.0)),), clock=True)
-    parts = (
-        *(
-            page.paragraph(EVIL),
-            page.note(EVIL),
-            page.heading(EVIL),
-            page.judged(True, EVIL, "p", "verdict"),
-            page.plot(plot),
-        ),
-        *(page.definitions([(EVIL, EVIL)]), page.folded(EVIL, page.paragraph("p"))),
-        *(page.table(EVIL, (EVIL, "b"), [(EVIL, EVIL)], cards=True), page.part("selector", EVIL, "run", [EVIL], None)),
-        *(
-            page.part("film", EVIL, b"film", 20.0, None),
-            page.part("image", b"image", EVIL),
-            page.part("transport", "1", "0.1"),
-            EVIL,
-        ),
-    )
+    parts = [kind(EVIL) for kind in (page.paragraph, page.note, page.heading)]
+    parts += [page.judged(True, EVIL, "p", "verdict"), page.plot(plot), page.definitions([(EVIL, EVIL)])]
+    parts += [page.folded(EVIL, page.paragraph("p")), page.table(EVIL, (EVIL, "b"), [(EVIL, EVIL)], cards=True)]
+    parts += [page.part("selector", EVIL, "run", [EVIL], None), page.part("film", EVIL, b"film", 20.0, None)]
+    parts += [page.part("image", b"image", EVIL), page.part("transport", "1", "0.1"), EVIL]
     text = page.page(EVIL, EVIL, page.paragraph(EVIL), [page.Section("s", EVIL, page.joined(parts), EVIL)])
     parsed = check_alone(text)
     assert "<img src=http" not in text

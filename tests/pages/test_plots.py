@@ -68,9 +68,8 @@ def test_a_reference_may_leave_a_logarithmic_picture_and_a_result_may_not():
 
 
 def test_names_cannot_end_the_script_that_holds_the_data():
-    plot = Plot(
-        "</script><b>", "x", "y", (Curve("<!--", np.zeros(1), np.zeros(1)),), shades=(Shade("</", np.ones((1, 2))),)
-    )
+    curves, shades = (Curve("<!--", np.zeros(1), np.zeros(1)),), (Shade("</", np.ones((1, 2))),)
+    plot = Plot("</script><b>", "x", "y", curves, shades=shades)
     assert "<" not in as_json(plot)
     assert read(plot)[0]["title"] == "</script><b>"
 

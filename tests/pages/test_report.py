@@ -28,17 +28,14 @@ from codrl_mj.training import load_config
 from tests.pages.parsed import Parsed, check_alone
 
 RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
-
-
-def no_film(*_, **__):
-    raise RenderingUnavailableError("cannot make an OpenGL context: none here")
+PENDULUM = RUNS / "pendulum"
 
 
 @pytest.fixture(scope="module")
 def text(tmp_path_factory):
     """The report of a finished run, by the command."""
     out = tmp_path_factory.mktemp("report") / "report.html"
-    assert main(["report", str(RUNS / "pendulum"), "--out", str(out)]) == 0
+    assert main(["report", str(PENDULUM), "--out", str(out)]) == 0
     return out.read_text()
 
 
@@ -60,8 +57,7 @@ def test_a_report_is_one_small_file_with_every_section(text):
 
 def test_the_plots_show_the_episode_that_the_film_shows(text):
     """The oracle: the same episode, run anew."""
-    run = RUNS / "pendulum"
-    (episode,) = run_episodes(load_policy(run), load_config(run).evaluation_env.make, 1, 0)
+    (episode,) = run_episodes(load_policy(PENDULUM), load_config(PENDULUM).evaluation_env.make, 1, 0)
     drawn = curves(text, "Torque at the shaft")
     arm = episode.actuator.arm_radius
     np.testing.assert_allclose(drawn["actual"][1][:-1], episode.trace["actual_force"] * arm, rtol=1e-6)
@@ -99,61 +95,63 @@ def test_it_says_which_loops_it_leaves_out_and_why_there_is_none():
     assert "m: assumed, for none is given: supply.voltage = 24 V" in str(reports._loop([run({"m": Drive()})]))
 
 
+@pytest.fixture
+def run(tmp_path):
+    """A copy of a finished run."""
+    return shutil.copytree(PENDULUM, tmp_path / "a<b> & run")
+
+
+def of(*runs, **options):
+    """The page of runs, read."""
+    return check_alone(report(runs, runs[-1].with_name("r.html"), filmed=False, **options).read_text())
+
+
 def test_without_opengl_there_is_no_film_and_everything_else(tmp_path, monkeypatch):
+    def no_film(*_, **__):
+        raise RenderingUnavailableError("cannot make an OpenGL context: none here")
+
     monkeypatch.setattr(episodes, "clip", no_film)
-    text = report([RUNS / "pendulum"], tmp_path / "r.html").read_text()
+    text = report([PENDULUM], tmp_path / "r.html").read_text()
     parsed = check_alone(text)
     assert "No film of pendulum: RenderingUnavailableError: cannot make an OpenGL context" in parsed.text
     assert "<video" not in text
     assert len(parsed.data) > 8
 
 
-def test_an_unfinished_run_says_so_and_shows_what_there_is(tmp_path):
-    run = tmp_path / "a<b> & run"
-    shutil.copytree(RUNS / "pendulum", run)
+def test_an_unfinished_run_says_so_and_shows_what_there_is(run):
     for name in ("result.json", "evaluation.json", "policy.json", "policy.safetensors"):
         (run / name).unlink()
-    parsed = check_alone(report([run], tmp_path / "r.html").read_text())
+    parsed = of(run)
     assert "The training is not finished" in parsed.text
     assert "No episode of a<b> & run: the run has no policy yet" in parsed.text
     assert "a<b> & run has no evaluation" in parsed.text
     assert "Return while learning" in parsed.text
+    (run / "best").mkdir()
+    for name in ("policy.json", "policy.safetensors"):
+        shutil.copy(PENDULUM / name, run / "best")
+    assert "the policy of its best evaluation acts" in of(run).text
 
 
-def test_a_damaged_run_says_what_is_damaged(tmp_path):
-    shutil.copytree(RUNS / "cartpole", tmp_path / "run")
+def test_a_damaged_run_says_what_is_damaged(run):
     for name in ("evaluation.json", "certificate.json"):
-        (tmp_path / "run" / name).write_text("{")
-    content = json.loads((tmp_path / "run" / "config.json").read_text())
+        (run / name).write_text("{")
+    content = json.loads((run / "config.json").read_text())
     content["train"]["agent"]["learning_rate"] = "nonsense"
-    (tmp_path / "run" / "config.json").write_text(json.dumps(content))
-    parsed = check_alone(report([tmp_path / "run"], tmp_path / "r.html").read_text())
+    (run / "config.json").write_text(json.dumps(content))
+    parsed = of(run)
     assert "The run folder is damaged" in parsed.text
     assert "evaluation.json is not a policy evaluation: it is truncated" in parsed.text
     assert "certificate.json is no certificate" in parsed.text
-    assert "No episode of run" in parsed.text
+    assert "No episode of a<b> & run" in parsed.text
 
 
-def test_a_page_says_that_the_best_policy_acts(tmp_path):
-    run = tmp_path / "run"
-    shutil.copytree(RUNS / "pendulum", run)
-    says = "the policy of its best evaluation acts"
-    (run / "result.json").unlink()
-    (run / "best").mkdir()
-    for name in ("policy.json", "policy.safetensors"):
-        shutil.copy(run / name, run / "best")
-    assert says in check_alone(report([run], tmp_path / "r.html", filmed=False).read_text()).text
-
-
-def test_several_runs_stand_side_by_side(tmp_path, monkeypatch):
-    monkeypatch.setattr(episodes, "clip", no_film)
-    shutil.copytree(RUNS / "pendulum", tmp_path / "other")
-    certificate = {"verdict": "passed", "subject": "pendulum", "made": "then", "quick": True,
-                   "checks": [{"group": "motor", "passed": True}]}  # fmt: skip
-    (tmp_path / "other" / "certificate.json").write_text(json.dumps(certificate))
-    text = report([RUNS / "pendulum", tmp_path / "other"], tmp_path / "r.html").read_text()
+def test_several_runs_stand_side_by_side(run):
+    checks = [{"group": "motor", "passed": True}]
+    certificate = {"verdict": "passed", "subject": "pendulum", "made": "then", "quick": True, "checks": checks}
+    (run / "certificate.json").write_text(json.dumps(certificate))
+    text = report([PENDULUM, run], run.with_name("r.html"), filmed=False).read_text()
     parsed = check_alone(text)
-    assert {"pendulum: actual", "other: actual"} <= curves(text, "Torque at the shaft").keys()
+    assert {"pendulum: actual", "a<b> & run: actual"} <= curves(text, "Torque at the shaft").keys()
     assert text.count('name="show-run"') == 2
     assert "passed: 1 of 1 checks" in parsed.text
     assert "What differs between the runs" in parsed.text
@@ -166,23 +164,18 @@ def motors_of(section):
 
 
 def test_several_motors_can_be_chosen():
-    env = load_config(RUNS / "pendulum").evaluation_env
-    (one,) = run_episodes(load_policy(RUNS / "pendulum"), env.make, 1, 0)
+    env = load_config(PENDULUM).evaluation_env
+    (one,) = run_episodes(load_policy(PENDULUM), env.make, 1, 0)
     arrays = {
         field: {name: np.stack([values, 2.0 * values], axis=1) for name, values in getattr(one, field).items()}
         for field in ("trace", "signals")
     }
-    both = {
-        "actuator": (one.actuator,) * 2,
-        "motors": ("left", "right"),
-        "first_speeds": np.repeat(one.first_speeds, 2),
-    }
-    two = dataclasses.replace(one, **arrays, **both)
+    arrays |= {"first_speeds": np.repeat(one.first_speeds, 2)}
+    two = dataclasses.replace(one, actuator=(one.actuator,) * 2, motors=("left", "right"), **arrays)
     section = str(episode_section([Shown("arm", env, two, None, "none was asked for", 0)]))
-    expected = [
+    assert motors_of(section) == [
         (f"{side}: {what}", f"motor:{place}") for place, side in enumerate(two.motors) for what in ("actual", "desired")
     ]
-    assert motors_of(section) == expected
     assert section.count('name="show-motor"') == 2
     assert "No film of arm: none was asked for" in Parsed(section).text
 
@@ -197,19 +190,18 @@ def test_an_ideal_actuator_beside_a_motor_has_a_force():
 
 
 def test_a_plot_is_shaded_where_its_own_limit_is_met():
-    drive = dataclasses.replace(
-        find_drive("maxon-ec45-flat-50w", gear_ratio=20.0), controller=SampledLoop(max_current=0.1)
-    )
+    geared = find_drive("maxon-ec45-flat-50w", gear_ratio=20.0)
+    drive = dataclasses.replace(geared, controller=SampledLoop(max_current=0.1))
     env = EnvConfig("pendulum", drive, max_episode_steps=10)
     section = str(episode_section([show("limited", env, RandomPolicy("pendulum"), 0, filmed=False)]))
-    plots = {one["title"]: [shade["label"] for shade in one["shades"]] for one in Parsed(section).data}
-    assert plots["Torque at the shaft"] == ["saturated"]
-    assert plots["Current and its reference"] == ["current saturated", "temperature saturated"]
-    assert plots["Voltage and its limit"] == ["voltage saturated"]
     met = {
-        one["title"]: [len(one["arrays"][shade["spans"]]) for shade in one["shades"]] for one in Parsed(section).data
+        one["title"]: {shade["label"]: len(one["arrays"][shade["spans"]]) for shade in one["shades"]}
+        for one in Parsed(section).data
     }
-    assert met["Current and its reference"][0] > met["Voltage and its limit"][0] == 0
+    assert list(met["Torque at the shaft"]) == ["saturated"]
+    assert list(met["Current and its reference"]) == ["current saturated", "temperature saturated"]
+    assert met["Voltage and its limit"] == {"voltage saturated": 0}
+    assert met["Current and its reference"]["current saturated"] > 0
 
 
 def test_states_of_every_kind_of_joint_have_units(monkeypatch):
@@ -249,16 +241,19 @@ def test_motors_of_somebody_elses_robot_are_filmed():
     assert "State: target x, target y" in Parsed(section).text
 
 
-def test_bad_input_is_refused_before_anything_is_run(tmp_path):
-    with pytest.raises(ValueError, match="runs: none was given"):
-        report([], tmp_path / "r.html")
-    with pytest.raises(ValueError, match="seed = -1: must be >= 0"):
-        report([RUNS / "pendulum"], tmp_path / "r.html", seed=-1)
-    with pytest.raises(ValueError, match=r"must be \.html"):
-        report([RUNS / "pendulum"], tmp_path / "r.pdf")
-    (tmp_path / "certificate.json").write_text("{}")
-    with pytest.raises(ValueError, match="is no certificate: KeyError: 'checks'"):
-        report([RUNS / "pendulum"], tmp_path / "r.html", certificate=tmp_path)
-    (tmp_path / "certificate.json").unlink()
-    with pytest.raises(FileNotFoundError, match="no run at"):
-        report([tmp_path], tmp_path / "r.html")
+@pytest.mark.parametrize(
+    ("runs", "out", "options", "message"),
+    [
+        ([], "r.html", {}, "runs: none was given"),
+        ([PENDULUM], "r.html", {"seed": -1}, "seed = -1: must be >= 0"),
+        ([PENDULUM], "r.pdf", {}, r"must be \.html"),
+        ([PENDULUM], "r.html", {"certificate": Path("certificate.json")}, "is no certificate: KeyError: 'checks'"),
+        ([Path("nowhere")], "r.html", {}, "no run at"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_run(tmp_path, monkeypatch, runs, out, options, message):
+    monkeypatch.chdir(tmp_path)
+    Path("certificate.json").write_text("{}")
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        report(runs, Path(out), **options)
+    assert [path.name for path in tmp_path.iterdir()] == ["certificate.json"]

@@ -3,6 +3,7 @@
 import asyncio
 import http.client
 import socket
+import sys
 import time
 
 import msgspec
@@ -38,7 +39,8 @@ def connect(server, **options):
     )
 
 
-def test_it_listens_on_this_machine_alone(server):
+def test_it_listens_on_this_machine_alone_and_asks_nobody_to_share_it(server):
+    assert server.request_share_url() is None
     assert server.get_host() == "127.0.0.1"
     address = socket.gethostbyname(socket.gethostname())
     if not address.startswith("127."):
@@ -70,19 +72,8 @@ def test_pages_of_others_cannot_open_a_socket(server, origin):
         asyncio.run(attempt())
 
 
-def test_it_asks_nobody_to_share_it(server):
-    assert server.request_share_url() is None
-
-
 def test_malformed_messages_and_clients_that_vanish_do_it_no_harm(server):
-    bad = [
-        b"",
-        b"\x00\xff\x13",
-        b"\xc1",
-        msgspec.msgpack.encode({"type": "Nonsense"}),
-        msgspec.msgpack.encode([1, 2]),
-        "text",
-    ]
+    bad = [b"", b"\x00\xff\x13", b"\xc1", *map(msgspec.msgpack.encode, ({"type": "Nonsense"}, [1, 2])), "text"]
 
     async def attempt():
         for message in bad:
@@ -111,8 +102,6 @@ def test_malformed_messages_and_clients_that_vanish_do_it_no_harm(server):
 
 
 def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys):
-    import sys
-
     monkeypatch.setitem(sys.modules, "codrl_mj.view.browser", None)
     monkeypatch.setitem(sys.modules, "viser", None)
     monkeypatch.delitem(sys.modules, "codrl_mj.view.browser")

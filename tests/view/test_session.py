@@ -4,11 +4,13 @@ import dataclasses
 import shutil
 import signal
 from pathlib import Path
+from typing import ClassVar
 
 import mujoco
 import numpy as np
 import pytest
 
+from codrl_mj.actuators import Actuator
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.view.session import PUSH_DURATION, Session, controls
@@ -71,7 +73,6 @@ def test_a_setting_goes_into_the_simulation_and_the_motion_goes_on(motorised):
     assert not motorised.waits
     np.testing.assert_array_equal((motorised.data.qpos, motorised.data.qvel), before)
     motorised.choose("random")
-    voltages = []
     for _ in range(20):
         motorised.step()
     voltages = [row[0, motorised.recorder.trace_names.index("voltage")] for _, row in motorised.signals]
@@ -96,14 +97,17 @@ def test_what_is_unstable_is_said_and_not_simulated(motorised):
     assert motorised.step()
 
 
-def test_a_simulation_that_left_the_numbers_waits_for_a_reset():
+@pytest.mark.parametrize("anew", [Session.reset, lambda made: made.set_disturbance(("command_delay",), 0.04)])
+def test_a_simulation_that_left_the_numbers_waits_for_a_reset_or_another_setting(anew):
     made = session("ideal")
+    assert made.step()
     made.data.qvel[:] = np.nan
     assert not made.step()
     assert made.waits
-    made.set_disturbance(("command_delay",), 0.04)
-    made.reset()
+    anew(made)
     assert not made.waits
+    assert (made.time, made.total) == (0.0, 0.0)
+    np.testing.assert_array_equal(made.observation, np.append(made.data.qpos, made.data.qvel))
     assert made.step()
     assert np.isfinite(made.data.qpos).all()
 
@@ -119,17 +123,6 @@ def test_a_force_of_somebody_elses_stays():
     assert made.data.xfrc_applied[pole, 0] == 3.0
     made.reset()
     assert not made.data.xfrc_applied.any()
-
-
-def test_another_setting_after_it_left_the_numbers_begins_anew():
-    made = session("ideal")
-    assert made.step()
-    made.data.qvel[:] = np.nan
-    assert not made.step()
-    made.set_disturbance(("command_delay",), 0.04)
-    assert (made.time, made.total) == (0.0, 0.0)
-    np.testing.assert_array_equal(made.observation, np.append(made.data.qpos, made.data.qvel))
-    assert made.step()
 
 
 def test_a_policy_for_another_environment_is_refused(motorised):
@@ -154,73 +147,61 @@ def test_controls_are_the_fields_with_their_bounds_and_units(motorised):
     assert found["controller", "anti_windup"].options == ("back_calculation", "clamping", "none")
     assert found["controller", "delayed"].value is False
     for path, one in found.items():
-        if one.low is not None and one.high is not None:  # both ends can be set
-            for end in (one.low, one.high):
-                part = getattr(actuator, path[0]) if len(path) > 1 else actuator
-                (field,) = [each for each in dataclasses.fields(part) if each.name == path[-1]]
-                holds, *_ = field.metadata["bound"]
-                assert holds(type(one.value)(one.parsed(end))), path
+        part = getattr(actuator, path[0]) if len(path) > 1 else actuator
+        fields = {field.name: field for field in dataclasses.fields(part)}
+        for end in (one.low, one.high) if None not in (one.low, one.high) else ():  # both can be set
+            holds, *_ = fields[path[-1]].metadata["bound"]
+            assert holds(type(one.value)(one.parsed(end))), path
 
 
 def test_an_endless_voltage_ends_at_the_end_of_its_slider():
-    from codrl_mj.actuators import Actuator
-
-    (voltage,) = [one for one in controls(Actuator(), 48.0) if one.path == ("supply", "voltage")]
+    voltage = {one.path: one for one in controls(Actuator(), 48.0)}["supply", "voltage"]
     assert voltage.high == 48.0
     assert voltage.parsed(48.0) == np.inf
     assert voltage.parsed(12.0) == 12.0
     assert ("supply", "voltage") not in [one.path for one in controls(Actuator())]
 
 
+class Shown:
+    """Takes the place of a browser; what it is given, and what is done with it."""
+
+    url = "http://127.0.0.1:0"
+    seen: ClassVar = []
+
+    def __init__(self, session, _port, title):  # noqa: D107
+        self.session, self.title, self.done = session, title, []
+        self.seen.append(self)
+
+    def run(self, until):
+        self.done.append(f"asked to end: {until()}")
+        assert self.session.step()
+
+    def close(self):
+        self.done.append("closed")
+
+
 def test_a_ctrl_c_waits_for_the_end_of_a_step_and_closes_the_server(monkeypatch, capsys):
-    done = []
-
-    class Fake:
-        url = "http://127.0.0.1:0"
-
-        def __init__(self, *_):
-            pass
-
+    class Interrupted(Shown):
         def run(self, until):
             signal.raise_signal(signal.SIGINT)
-            done.append(f"asked to end: {until()}")
+            super().run(until)
 
-        def close(self):
-            done.append("closed")
-
-    monkeypatch.setattr("codrl_mj.view.browser.Browser", Fake)
+    monkeypatch.setattr("codrl_mj.view.browser.Browser", Interrupted)
     assert main(["view", "cartpole"]) == 130
-    assert done == ["asked to end: True", "closed"]
+    assert Shown.seen.pop().done == ["asked to end: True", "closed"]
     assert "stopped" in capsys.readouterr().err
 
 
 def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch, capsys, tmp_path):
-    seen = {}
-
-    class Fake:
-        url = "http://127.0.0.1:0"
-
-        def __init__(self, session, _port, title):
-            seen.update(session=session, title=title)
-
-        def run(self, until):
-            assert not until()
-            assert seen["session"].step()
-
-        def close(self):
-            seen["closed"] = True
-
-    monkeypatch.setattr("codrl_mj.view.browser.Browser", Fake)
+    monkeypatch.setattr("codrl_mj.view.browser.Browser", Shown)
     run = Path(__file__).parents[1] / "fixtures" / "runs" / "cartpole"
     other = shutil.copytree(run, tmp_path / "other" / "cartpole")
     assert main(["view", str(run), "--policies", str(run), str(other), "--actuator", "weaker"]) == 0
-    made = seen["session"]
+    shown = Shown.seen.pop()
+    assert (shown.title, shown.done) == ("cartpole on weaker", ["asked to end: False", "closed"])
     names = ["last", "runs/cartpole", "other/cartpole", "random"]  # none of its actions does nothing
-    assert list(made.policies) == names
-    assert made.chosen == "last"
-    made.choose("other/cartpole")
-    assert made.step()
-    assert seen["title"] == "cartpole on weaker"
+    assert (list(shown.session.policies), shown.session.chosen) == (names, "last")
+    shown.session.choose("other/cartpole")
+    assert shown.session.step()
     assert main(["view", "cartpole", "--policies", str(run), "--env.action", "voltage", "--env.levels", "-5", "5"]) == 2
     assert "was trained with 'force'" in capsys.readouterr().err
-    assert seen["closed"]

@@ -1,0 +1,116 @@
+"""Actuators of any family on the command line, and families and models of somebody's own."""
+
+import dataclasses
+import importlib
+import sys
+from pathlib import Path
+
+import gymnasium
+import pytest
+
+from codrl_mj import register
+from codrl_mj.actuators import Lag
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.tasks import find_task
+from codrl_mj.training import TrainConfig, folder, load_config
+from tests.cli.lines import SMALL_FILM, TINY, helped, ran, read, refused
+
+OWN_FAMILY = """
+import dataclasses
+from pathlib import Path
+
+from codrl_mj.actuators import Lag
+from codrl_mj.fields import real
+
+Path("executed").touch()
+
+
+@dataclasses.dataclass(frozen=True)
+class Slow(Lag):
+    family = "slow"
+
+    time_constant: float = real(0.5, least=0.0, unit="s")
+    \"\"\"Half a second, if nothing else is said.\"\"\"
+"""
+
+
+@pytest.fixture
+def own_family(tmp_path, monkeypatch):
+    """A module of a user's with a family of actuators; a function that forgets having imported it."""
+    (tmp_path / "modules").mkdir()
+    (tmp_path / "modules" / "own_family.py").write_text(OWN_FAMILY)
+    monkeypatch.syspath_prepend(str(tmp_path / "modules"))
+
+    def forget():
+        sys.modules.pop("own_family", None)
+        (tmp_path / "executed").unlink(missing_ok=True)
+
+    yield forget
+    forget()
+
+
+@pytest.mark.parametrize("first", ["train cartpole", "evaluate RUN", "render RUN"])
+def test_the_family_that_is_named_decides_on_the_flags(capsys, first, trained, own_family):
+    for actuator, flags in {
+        "lag": ("--actuator.time-constant", "--actuator.delay"),
+        "torque_speed": ("--actuator.stall-torque", "--actuator.no-load-speed", "--actuator.max-torque"),
+        "weaker": ("--actuator.motor.inductance", "--actuator.supply.resistance"),
+        "own_family:Slow": ("--actuator.time-constant", "Half a second"),
+    }.items():
+        text = helped(capsys, *first.replace("RUN", str(trained)).split(), "--actuator", actuator)
+        assert [flag for flag in flags if flag not in text] == []
+        assert ("--actuator.motor" in text) == (actuator == "weaker")
+
+
+def test_fields_of_a_family_are_set_by_its_flags():
+    ran(f"train cartpole --actuator lag --actuator.time-constant 0.1 --actuator.delay 0.02 {TINY} --out run")
+    assert load_config(Path("run")).actuator == Lag(0.1, 0.02)
+    ran("evaluate run --episodes 1 --out e.json --actuator.delay 0.04")
+    described = {"family": "lag", "time_constant": 0.1, "delay": 0.04, "gain": 1.0}
+    assert read("e.json")["conditions"]["env"]["actuator"] == described
+    Path("slow.yaml").write_text("{family: lag, time_constant: 0.3}")
+    for subject in ("run", "pendulum --actuator slow.yaml"):
+        ran(f"render {subject} --actuator.delay 0.05 --out film.gif {SMALL_FILM}")
+
+
+def test_a_module_that_a_run_names_is_imported_only_on_trust(capsys, own_family):
+    ran(f"train pendulum --actuator own_family:Slow {TINY} --out run")
+    own_family()
+    for line in ("evaluate run --episodes 1", "render run", "train --resume run", "train --config run/config.json"):
+        assert "own_family:Slow': needs the module own_family" in refused(capsys, line)
+    ran("runs . --out runs.json")
+    assert [run["actuator"] for run in read("runs.json")["runs"]] == ["own_family:Slow"]
+    assert not Path("executed").exists()
+    ran("evaluate run --episodes 1 --trust --actuator.delay 0.05")
+    assert Path("executed").exists()
+
+
+def code_of(env):
+    """What stands in a run folder of the code that it was made with."""
+    importlib.invalidate_caches()
+    folder._code_digest.cache_clear()
+    code = folder.provenance(TrainConfig(env))["code"]
+    folder._code_digest.cache_clear()
+    return code
+
+
+def test_the_source_of_a_family_is_part_of_what_a_run_was_made_with(own_family, tmp_path):
+    digests = {code_of(EnvConfig("pendulum"))}
+    for text in (OWN_FAMILY, OWN_FAMILY.replace("0.5", "0.6")):
+        own_family()
+        (tmp_path / "modules" / "own_family.py").write_text(text)
+        digests.add(code_of(EnvConfig("pendulum", "own_family:Slow")))
+    assert len(digests) == 3
+
+
+def test_so_is_the_file_of_a_model_of_somebody_s_own(tmp_path):
+    arm, path = find_task("tests.own_project.arm:TASK"), tmp_path / "arm.xml"
+    path.touch()
+    register(dataclasses.replace(arm, name="copied_arm", env_id="tests/CopiedArm-v0", asset=str(path)))
+    own, foreign = EnvConfig("copied_arm", "lag"), EnvConfig("HalfCheetah-v5", options={"xml_file": str(path)})
+    digests = set()
+    model = (Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml").read_text()
+    for text in (model, f"{model}<!-- changed -->"):
+        path.write_text(text)
+        digests |= {code_of(own), code_of(foreign)}
+    assert len(digests) == 4
