@@ -21,7 +21,7 @@ from codrl_mj.agents import PPOConfig
 from codrl_mj.agents.sarsa_algorithm import CompiledEpisodes
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.evaluation import RandomPolicy, evaluate, run_episodes
+from codrl_mj.evaluation import evaluate
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, history, load_config, train, watcher
 from codrl_mj.training.folder import owned
@@ -59,20 +59,7 @@ def same_weights(first, second):
     return all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
 
 
-def mean_return(policy, actuator, episodes=20):
-    return np.mean([e.total for e in run_episodes(policy, EnvConfig("cartpole", actuator).make, episodes, seed=1000)])
-
-
 # -- learning -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.matrix
-def test_ppo_learns_to_balance(tmp_path):
-    ppo = PPOConfig(rollout_steps=1024, batch_size=128, learning_rate=3e-3, hidden=(32, 32))
-    config = TrainConfig(EnvConfig("cartpole", "ideal"), ppo, seed=0, total_steps=16_000)
-    out = train(config, tmp_path / "run")
-    assert mean_return(RandomPolicy("cartpole"), "ideal") < 40
-    assert mean_return(load_policy(out), "ideal") > 400
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others(run, tmp_path):
@@ -95,12 +82,13 @@ def test_the_actuator_and_the_task_option_reach_the_training(run, tmp_path):
 # -- the run folder -----------------------------------------------------------------------------------------
 
 
-def test_the_run_folder_has_what_is_documented(run):
+def read_csv(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_run_folder_has_the_best_policy_and_a_picture(run):
     out, _ = run
-    folders = {"best", "checkpoints", "tensorboard"}
-    tables = {"progress.csv", "episodes.csv"}
-    files = {"config.json", "evaluation.json", "result.json", "learning_curve.png", "policy.json", "policy.safetensors"}
-    assert {path.name for path in out.iterdir()} == {".lock", *folders, *tables, *files}
     assert {path.name for path in (out / "best").iterdir()} == {"evaluation.json", "policy.json", "policy.safetensors"}
     with Image.open(out / "learning_curve.png") as image:
         assert image.size == (900, 525)
@@ -110,35 +98,23 @@ def test_the_run_folder_has_what_is_documented(run):
 def test_the_configuration_records_what_was_resolved_and_the_versions(run):
     out, _ = run
     content = json.loads((out / "config.json").read_text())
-    assert content["train"]["env"]["actuator"]["controller"]["kp"] == 0.2
-    assert content["train"]["env"]["actuator"]["motor"]["arm_radius"] == 0.15
-    assert content["train"]["env"]["options"] == {"center_radius": 0.1}
-    assert content["train"]["agent"]["rollout_steps"] == 256
-    assert content["train"]["agent"]["name"] == "ppo"
-    assert content["versions"]["numpy"] == np.__version__
-    assert content["versions"]["python"] == platform.python_version()
+    env, agent = content["train"]["env"], content["train"]["agent"]
+    assert (env["actuator"]["controller"]["kp"], env["actuator"]["motor"]["arm_radius"]) == (0.2, 0.15)
+    assert (env["options"], agent["name"], agent["rollout_steps"]) == ({"center_radius": 0.1}, "ppo", 256)
+    versions = content["versions"]
+    assert (versions["numpy"], versions["python"]) == (np.__version__, platform.python_version())
     assert len(content["code"]) == 64
     assert load_config(out) == TINY
 
 
-def read_csv(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
 def test_progress_is_reported_and_written_at_the_ends_of_rollouts(run):
-    out, reports = run
-    assert [report.steps for report in reports] == [512]  # 500 rounded up to whole rollouts
+    out, (report,) = run
+    assert report.steps == 512  # 500 rounded up to whole rollouts
     (row,) = read_csv(out / "progress.csv")
-    (report,) = reports
-    assert row.keys() == {field.name for field in dataclasses.fields(report)}
-    for name, value in row.items():
-        assert float(value) == getattr(report, name)
+    assert {name: float(value) for name, value in row.items()} == dataclasses.asdict(report)
     assert 0 <= report.mean_return <= report.mean_length  # at most 1 a step, nothing beyond the radius
     assert 8 <= report.mean_length <= 100
-    assert report.torque_error > 0
-    assert report.steps_per_second > 0
-    assert report.seconds > 0
+    assert min(report.torque_error, report.steps_per_second, report.seconds) > 0
 
 
 def test_every_episode_is_in_the_table(run):
@@ -148,8 +124,7 @@ def test_every_episode_is_in_the_table(run):
     steps = [int(row["steps"]) for row in rows]
     assert steps == sorted(steps)
     assert steps[-1] <= report.steps
-    last = [float(row["return"]) for row in rows[-100:]]
-    assert report.mean_return == pytest.approx(np.mean(last), rel=1e-12)
+    assert report.mean_return == pytest.approx(np.mean([float(row["return"]) for row in rows[-100:]]), rel=1e-12)
     lengths = sum(int(row["length"]) for row in rows)
     assert report.steps - TINY.num_envs * 500 < lengths <= report.steps  # the rest is in episodes that go on
 
@@ -159,8 +134,7 @@ def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_pol
     result, evaluation = (json.loads((out / f"{name}.json").read_text()) for name in ("result", "evaluation"))
     anew = evaluate(load_policy(out), EnvConfig("cartpole", "weaker"), episodes=5, seed=EVALUATION_SEED)
     assert evaluation["returns"]["mean"] == anew.returns.mean == result["evaluation_return"]
-    assert result["steps"] == report.steps
-    assert result["episodes"] == report.episodes
+    assert (result["steps"], result["episodes"]) == (report.steps, report.episodes)
     assert result["best"] == {"return": anew.returns.mean, "steps": 512}  # the only evaluation
 
 
@@ -230,32 +204,33 @@ def test_episodes_can_be_counted_instead_of_steps(tmp_path):
     assert json.loads((out / "result.json").read_text())["episodes"] == 20
 
 
-def test_the_saved_policy_plays(run):
-    out, _ = run
-    assert 8 <= mean_return(load_policy(out), "weaker", episodes=3) <= 500
-
-
 # -- refusals -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("begun", [False, True], ids=["somebody's", "begun"])
-@pytest.mark.parametrize("holds", ["precious.txt", "tensorboard/mine", "best/policy.json", "policy.json"])
+@pytest.mark.parametrize(
+    ("holds", "begun"),
+    [
+        (["precious.txt"], False),
+        (["tensorboard/mine"], False),
+        (["best/policy.json"], False),
+        (["policy.json"], False),
+        *((["notes.txt", theirs], False) for theirs in ("config.json", ".lock", "best", "tensorboard/events")),
+        # what a training has before it learned anything is a folder to begin in, but not with something else
+        *(([theirs], True) for theirs in ("precious.txt", "best/policy.json", "policy.json")),
+    ],
+)
 def test_a_folder_that_holds_something_is_refused_and_untouched(tmp_path, holds, begun):
-    """But for what a training has before it learned anything, and only where it is one's."""
-    if begun and holds == "tensorboard/mine":
-        return
     out = tmp_path / "run"
-    (out / holds).parent.mkdir(parents=True)
-    (out / holds).write_text("mine")
+    for name in holds:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text("mine")
     if begun:
         begin(tmp_path / "new", TINY)
         (tmp_path / "new/config.json").rename(out / "config.json")
-    before = sorted(out.rglob("*"))
-    with pytest.raises(FileExistsError, match="exists already") as caught:
+    before = {path: path.is_dir() or path.read_bytes() for path in out.rglob("*")}
+    with pytest.raises(FileExistsError, match=f"{out} exists already"):
         train(TINY, out)
-    assert str(out) in str(caught.value)
-    assert sorted(out.rglob("*")) == before
-    assert (out / holds).read_text() == "mine"
+    assert {path: path.is_dir() or path.read_bytes() for path in out.rglob("*")} == before
 
 
 @pytest.mark.parametrize(
@@ -286,18 +261,6 @@ def test_a_training_that_breaks_off_before_it_learned_anything_does_not_block_th
                 train(TINY, path)
     assert (out.parent.exists(), list(kept.iterdir())) == (False, [])  # what was there stays
     assert json.loads((train(TINY, out) / "result.json").read_text())["steps"] == 512
-
-
-@pytest.mark.parametrize("theirs", ["config.json", ".lock", "best", "tensorboard/events"])
-def test_what_a_folder_holds_is_neither_used_nor_deleted(tmp_path, monkeypatch, theirs):
-    """Of somebody else's, and of a training that was killed, which --resume continues."""
-    path = tmp_path / "run" / theirs
-    path.parent.mkdir(parents=True)
-    path.write_text("mine")
-    (tmp_path / "run" / "notes.txt").touch()
-    with pytest.raises(FileExistsError, match="exists already"):
-        train(TINY, tmp_path / "run")
-    assert path.read_text() == "mine"
 
 
 def test_weights_that_are_no_numbers_are_named_and_not_kept(tmp_path, monkeypatch):
