@@ -1,7 +1,6 @@
 """What cannot be trained, continued or loaded costs one line that says why and what to do, and changes nothing."""
 
 import json
-import pickle
 import shutil
 from pathlib import Path
 
@@ -11,7 +10,6 @@ from stable_baselines3 import PPO
 
 from codrl_mj.cli import main
 from codrl_mj.training import history, load_config
-from tests.damage import Bomb
 
 TINY = "--total-steps 128 --num-envs 2 --agent.rollout-steps 64 --agent.batch-size 32 --agent.epochs 1 --agent.hidden 8"
 TINY += " --evaluation-episodes 1 --no-tensorboard"
@@ -126,6 +124,7 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
         # a zip does not say what it is, and is loaded only on trust
         ("evaluate model.zip --task cartpole --agent ppo", "Pass --trust if that author is you"),
         ("render model.zip --task cartpole --agent ppo --out film.gif", "Pass --trust if that author is you"),
+        ("evaluate nowhere.zip --task cartpole --agent ppo", "no model at nowhere.zip"),
         ("evaluate model.zip --agent ppo --trust", "name its task with --task"),
         ("evaluate model.zip --task cartpole --trust", "name it with --agent"),
         ("evaluate model.zip --task cartpole --agent dqn --trust", "is not a model of dqn"),
@@ -140,14 +139,6 @@ def test_what_cannot_be_done_is_named(capsys, line, expected):
 @pytest.mark.parametrize("folder", [*DAMAGED, "bad versions"])
 def test_a_damaged_configuration_is_named(capsys, folder):
     assert f"{folder}/config.json" in refused(capsys, "train", "--resume", folder)
-
-
-@pytest.mark.parametrize("place", ["run", "run/best"])
-@pytest.mark.parametrize("name", POLICY)
-def test_a_pickle_in_place_of_a_policy_is_not_executed(capsys, place, name):
-    Path(place, name).write_bytes(pickle.dumps(Bomb(Path("exploded"))))
-    which = "best" if "best" in place else "last"
-    assert f"{place}/{name}" in refused(capsys, "evaluate", "run", "--which", which)
 
 
 @pytest.mark.parametrize(

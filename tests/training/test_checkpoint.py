@@ -109,6 +109,7 @@ DAMAGES = {  # what is done to the run, and the remedy that is told for each che
     "a pickle": (last(lambda _: BOMB), [BACK]),
     "a pickle with the right digest": (forged(BOMB), [BACK]),
     "tensors with the right digest": (forged(save({"a": np.zeros(3)})), [BACK]),
+    "another program's": (forged(save({"a": np.zeros(3)}, metadata={"format": "pt"})), [BACK]),
     "another run's": (replace_by_another_runs, [BACK]),
     "all truncated": (truncate_all, [BACK, ANEW]),
     "none left": (lambda out: shutil.rmtree(out / "checkpoints"), []),
