@@ -7,16 +7,12 @@ import pytest
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from codrl_mj.evaluation.measures import (
     bootstrap_mean,
     delay,
-    electrical_energy,
     holds_since,
-    integral_of_square,
     interquartile_mean,
-    mechanical_work,
     quartiles,
     sign_changes,
     wilson_rate,
@@ -104,13 +100,6 @@ def test_motors_whose_torques_have_means_of_their_own_lag_as_each_of_them():
     assert delay(desired, actual, 0.01, motors=2) == pytest.approx(0.04, abs=1e-3)
 
 
-@given(st.floats(0.01, 100.0), st.floats(-100.0, 100.0))
-def test_neither_scale_nor_offset_changes_a_delay(scale, offset):
-    times = np.arange(500)
-    expected = delay([swing(times)], [swing(times - 2.3)], 1.0)
-    assert delay([swing(times)], [scale * swing(times - 2.3) + offset], 1.0) == pytest.approx(expected, abs=1e-6)
-
-
 NOISE, OTHER = np.random.default_rng(4).normal(size=(2, 1000))
 STILL = np.full(9, 2.0)
 
@@ -130,53 +119,7 @@ def test_what_does_not_follow_has_no_delay_and_what_leads_no_negative_one(desire
     assert delay([desired], [actual], 1.0) == expected
 
 
-# -- energies -----------------------------------------------------------------------------------------------
-
-SAMPLES = arrays(float, 12, elements=st.floats(-50, 50))
-
-
-@pytest.mark.parametrize("duration", [0.05, 0.3, 2.0])
-def test_the_energies_of_a_stalled_motor_are_those_of_its_exponential(duration):
-    voltage, resistance, time_constant = 6.0, 1.5, 0.1
-    final = voltage / resistance
-    count = round(duration / time_constant * 1000)
-    timestep = duration / count
-    current = final * (1 - np.exp(-np.linspace(0, duration, count + 1) / time_constant))
-    decay = math.exp(-duration / time_constant)
-    drawn, returned = electrical_energy(np.full(count, voltage), current, timestep)
-    # linear interpolation of an exponential errs by (dt/T)^2/12 = 1e-7
-    assert drawn == pytest.approx(voltage * final * (duration - time_constant * (1 - decay)), rel=1e-5)
-    assert returned == 0.0
-    heat = resistance * integral_of_square(current, timestep)
-    squares = duration - 2 * time_constant * (1 - decay) + time_constant / 2 * (1 - decay**2)
-    assert heat == pytest.approx(resistance * final**2 * squares, rel=1e-5)
-    magnetic = time_constant * resistance * current[-1] ** 2 / 2
-    assert drawn == pytest.approx(heat + magnetic, rel=1e-5)
-
-
-@given(SAMPLES, SAMPLES, st.floats(-50, 50))
-def test_energy_returned_is_what_is_drawn_with_the_voltage_reversed(voltage, current, first):
-    current = np.append(first, current)
-    drawn, returned = electrical_energy(voltage, current, 0.1)
-    assert drawn >= 0
-    assert returned >= 0
-    assert electrical_energy(-voltage, current, 0.1) == (returned, drawn)
-
-
-@given(st.floats(-50, 50), st.floats(-50, 50), st.integers(1, 40))
-def test_the_integral_of_the_square_of_a_ramp_is_exact(begin, end, count):
-    samples = np.linspace(begin, end, count + 1)
-    assert integral_of_square(samples, 2.0 / count) == pytest.approx(
-        2.0 * (begin**2 + begin * end + end**2) / 3, rel=1e-9, abs=1e-9
-    )
-
-
-@given(SAMPLES, st.floats(-50, 50))
-def test_the_work_on_a_free_mass_is_its_kinetic_energy(force, first):
-    mass, timestep = 2.5, 0.05
-    speed = np.append(first, first + np.cumsum(force) * timestep / mass)
-    kinetic = mass / 2 * (speed[-1] ** 2 - speed[0] ** 2)
-    assert mechanical_work(force, speed, timestep) == pytest.approx(kinetic, rel=1e-9, abs=1e-9)
+# -- reversals ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

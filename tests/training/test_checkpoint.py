@@ -82,12 +82,10 @@ def forged(content):
 
 
 def replace_by_another_runs(out):
-    """The last checkpoint is one that is intact, of a run with another seed, at the same step."""
-    path, other = checkpoints(out)[-1], out.parent / "other"
-    interrupt(dataclasses.replace(CONFIG, seed=4), other, 180, TERMINATE)
-    (same_step,) = (one for one in checkpoints(other) if one.name[:17] == path.name[:17])
-    path.unlink()
-    shutil.copy(same_step, path.parent)
+    """Checkpoints that are intact, of a run with another seed."""
+    interrupt(dataclasses.replace(CONFIG, seed=4), out.parent / "other", 180, TERMINATE)
+    shutil.rmtree(out / "checkpoints")
+    shutil.copytree(out.parent / "other/checkpoints", out / "checkpoints")
 
 
 def truncate_all(out):
@@ -110,7 +108,7 @@ DAMAGES = {  # what is done to the run, and the remedy that is told for each che
     "a pickle with the right digest": (forged(BOMB), [BACK]),
     "tensors with the right digest": (forged(save({"a": np.zeros(3)})), [BACK]),
     "another program's": (forged(save({"a": np.zeros(3)}, metadata={"format": "pt"})), [BACK]),
-    "another run's": (replace_by_another_runs, [BACK]),
+    "another run's": (replace_by_another_runs, [BACK, ANEW]),
     "all truncated": (truncate_all, [BACK, ANEW]),
     "none left": (lambda out: shutil.rmtree(out / "checkpoints"), []),
     "half a report": (half_a_row("progress.csv"), []),

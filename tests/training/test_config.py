@@ -12,7 +12,6 @@ from codrl_mj.agents import AGENTS, DDPGConfig, PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, PRESETS
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.fields import differing
 from codrl_mj.tasks import named_actuator
 from codrl_mj.training import TrainConfig, load_config, read_config
 
@@ -74,16 +73,6 @@ env:
     for seed, overriding in ((5, {}), (6, {"seed": 6})):
         expected = dataclasses.replace(default, env=env, agent=agent, seed=seed)
         assert read_config(path, **overriding) == expected
-
-
-def test_differences_are_named_field_by_field():
-    other = dataclasses.replace(
-        TINY, seed=2, agent=PPOConfig(hidden=(8, 8), gamma=0.5), env=EnvConfig("cartpole", None)
-    )
-    found = differing(TINY.as_mapping(), other.as_mapping())
-    assert (found["seed"], found["agent.gamma"]) == ((1, 2), (0.99, 0.5))
-    assert found["env.actuator.motor.inductance"] == (0.1, "absent")
-    assert differing(TINY.as_mapping(), dataclasses.replace(TINY).as_mapping()) == {}
 
 
 # -- what is wrong ------------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from safetensors.torch import load_file
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.agents import PPOConfig
@@ -49,42 +48,22 @@ def quick(monkeypatch):
 def run(tmp_path_factory):
     """A tiny run, and the progress that it reported."""
     reports = []
-    out = train(TINY, tmp_path_factory.mktemp("runs") / "a" / "run", reports.append)
-    return out, reports
-
-
-def same_weights(first, second):
-    weights = [load_file(folder / "policy.safetensors") for folder in (first, second)]
-    assert weights[0].keys() == weights[1].keys()
-    return all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
-
-
-# -- learning -----------------------------------------------------------------------------------------------
-
-
-def test_the_same_seed_gives_the_same_weights_and_another_seed_others(run, tmp_path):
-    out, _ = run
-    torch.manual_seed(99)  # what the process drew before does not matter, nor that torch had more threads
-    np.random.seed(99)
     torch.set_num_threads(2)
-    assert same_weights(out, train(TINY, tmp_path / "again"))
-    assert torch.get_num_threads() == 1
-    assert not same_weights(out, train(dataclasses.replace(TINY, seed=2), tmp_path / "other"))
-
-
-def test_the_actuator_and_the_task_option_reach_the_training(run, tmp_path):
-    out, _ = run
-    assert not same_weights(out, train(within(actuator="ideal"), tmp_path / "ideal"))
-    free = train(within(options=None), tmp_path / "free")
-    assert not same_weights(out, free)
-
-
-# -- the run folder -----------------------------------------------------------------------------------------
+    out = train(TINY, tmp_path_factory.mktemp("runs") / "a" / "run", reports.append)
+    assert torch.get_num_threads() == 1  # networks this small are slower on two
+    return out, reports
 
 
 def read_csv(path):
     with path.open() as file:
         return list(csv.DictReader(file))
+
+
+def read(path):
+    return json.loads(path.read_text())
+
+
+# -- the run folder -----------------------------------------------------------------------------------------
 
 
 def test_the_run_folder_has_the_best_policy_and_a_picture(run):
@@ -96,46 +75,39 @@ def test_the_run_folder_has_the_best_policy_and_a_picture(run):
 
 
 def test_the_configuration_records_what_was_resolved_and_the_versions(run):
-    out, _ = run
-    content = json.loads((out / "config.json").read_text())
-    env, agent = content["train"]["env"], content["train"]["agent"]
-    assert (env["actuator"]["controller"]["kp"], env["actuator"]["motor"]["arm_radius"]) == (0.2, 0.15)
-    assert (env["options"], agent["name"], agent["rollout_steps"]) == ({"center_radius": 0.1}, "ppo", 256)
+    content = read(run[0] / "config.json")
+    assert load_config(run[0]) == TINY
+    assert content["train"] == json.loads(json.dumps(TINY.as_mapping()))
+    assert content["train"]["env"]["actuator"]["controller"]["kp"] == 0.2  # of `weaker`
     versions = content["versions"]
     assert (versions["numpy"], versions["python"]) == (np.__version__, platform.python_version())
     assert len(content["code"]) == 64
-    assert load_config(out) == TINY
 
 
-def test_progress_is_reported_and_written_at_the_ends_of_rollouts(run):
+def test_progress_is_reported_and_written_at_the_ends_of_rollouts_and_every_episode_is_in_its_table(run):
     out, (report,) = run
     assert report.steps == 512  # 500 rounded up to whole rollouts
     (row,) = read_csv(out / "progress.csv")
     assert {name: float(value) for name, value in row.items()} == dataclasses.asdict(report)
-    assert 0 <= report.mean_return <= report.mean_length  # at most 1 a step, nothing beyond the radius
-    assert 8 <= report.mean_length <= 100
-    assert min(report.torque_error, report.steps_per_second, report.seconds) > 0
-
-
-def test_every_episode_is_in_the_table(run):
-    out, (report,) = run
-    rows = read_csv(out / "episodes.csv")
-    assert [int(row["episode"]) for row in rows] == list(range(1, report.episodes + 1))
-    steps = [int(row["steps"]) for row in rows]
+    assert 8 <= report.mean_return < report.mean_length <= 100  # at most 1 a step, nothing beyond the radius
+    assert min(report.torque_error, report.steps_per_second, report.seconds) > 0  # the actuator is not ideal
+    episodes = read_csv(out / "episodes.csv")
+    assert [int(row["episode"]) for row in episodes] == list(range(1, report.episodes + 1))
+    steps = [int(row["steps"]) for row in episodes]
     assert steps == sorted(steps)
     assert steps[-1] <= report.steps
-    assert report.mean_return == pytest.approx(np.mean([float(row["return"]) for row in rows[-100:]]), rel=1e-12)
-    lengths = sum(int(row["length"]) for row in rows)
+    assert report.mean_return == pytest.approx(np.mean([float(row["return"]) for row in episodes[-100:]]), rel=1e-12)
+    lengths = sum(int(row["length"]) for row in episodes)
     assert report.steps - TINY.num_envs * 500 < lengths <= report.steps  # the rest is in episodes that go on
 
 
 def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_policy(run):
     out, (report,) = run
-    result, evaluation = (json.loads((out / f"{name}.json").read_text()) for name in ("result", "evaluation"))
-    anew = evaluate(load_policy(out), EnvConfig("cartpole", "weaker"), episodes=5, seed=EVALUATION_SEED)
-    assert evaluation["returns"]["mean"] == anew.returns.mean == result["evaluation_return"]
+    result = read(out / "result.json")
+    anew = evaluate(load_policy(out), EnvConfig("cartpole", "weaker"), episodes=5, seed=EVALUATION_SEED).returns.mean
+    assert read(out / "evaluation.json")["returns"]["mean"] == anew == result["evaluation_return"]
     assert (result["steps"], result["episodes"]) == (report.steps, report.episodes)
-    assert result["best"] == {"return": anew.returns.mean, "steps": 512}  # the only evaluation
+    assert result["best"] == {"return": anew, "steps": 512}  # the only evaluation
 
 
 def test_a_report_has_the_evaluation_that_took_place_then_and_no_other(tmp_path, monkeypatch):
@@ -151,7 +123,7 @@ def test_the_best_policy_is_kept_though_a_worse_one_comes_last(tmp_path):
     config = dataclasses.replace(TINY, agent=ppo, total_steps=3000, evaluation_interval=256, evaluation_episodes=5)
     out = train(config, tmp_path / "run")
     evaluations = [float(row["evaluation_return"]) for row in read_csv(out / "progress.csv")]
-    result = json.loads((out / "result.json").read_text())
+    result = read(out / "result.json")
     assert result["best"]["return"] >= max(evaluations) > result["evaluation_return"]
     best = evaluate(load_policy(out / "best"), EnvConfig("cartpole", "weaker"), episodes=5, seed=EVALUATION_SEED)
     assert best.returns.mean == result["best"]["return"]
@@ -189,8 +161,8 @@ def test_weights_and_biases_gets_the_configuration(tmp_path, monkeypatch):
     fake.init, fake.__spec__ = init, ModuleSpec("wandb", None)
     monkeypatch.setitem(sys.modules, "wandb", fake)
     train(TINY, tmp_path / "run", wandb="motors")
-    ((project, name, config),) = [(call["project"], call["name"], call["config"]) for call in calls]
-    assert (project, name, config) == ("motors", "run", TINY.as_mapping())
+    (call,) = calls
+    assert (call["project"], call["name"], call["config"]) == ("motors", "run", TINY.as_mapping())
     monkeypatch.delitem(sys.modules, "wandb")
     with pytest.raises(ValueError, match="pip install wandb"):
         train(TINY, tmp_path / "other", wandb="motors")
@@ -201,7 +173,7 @@ def test_episodes_can_be_counted_instead_of_steps(tmp_path):
     config = dataclasses.replace(TINY, total_steps=None, total_episodes=20, num_envs=1)
     out = train(config, tmp_path / "run")
     assert len(read_csv(out / "episodes.csv")) == 20
-    assert json.loads((out / "result.json").read_text())["episodes"] == 20
+    assert read(out / "result.json")["episodes"] == 20
 
 
 # -- refusals -----------------------------------------------------------------------------------------------
@@ -260,7 +232,7 @@ def test_a_training_that_breaks_off_before_it_learned_anything_does_not_block_th
             with pytest.raises(ZeroDivisionError):
                 train(TINY, path)
     assert (out.parent.exists(), list(kept.iterdir())) == (False, [])  # what was there stays
-    assert json.loads((train(TINY, out) / "result.json").read_text())["steps"] == 512
+    assert read(train(TINY, out) / "result.json")["steps"] == 512
 
 
 def test_weights_that_are_no_numbers_are_named_and_not_kept(tmp_path, monkeypatch):
@@ -286,22 +258,16 @@ def test_weights_that_are_no_numbers_are_named_and_not_kept(tmp_path, monkeypatc
     assert [path.name[:17] for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["step-000000000256"]
 
 
-@pytest.mark.parametrize("line", ["train cartpole --out run", "train --resume run", "train --resume run --seed 4"])
-def test_a_folder_in_use_or_of_another_training_is_refused_before_anything_is_made(tmp_path, monkeypatch, capsys, line):
+@pytest.mark.parametrize("line", ["train cartpole --out run", "train --resume run"])
+def test_a_folder_in_use_is_refused_before_anything_is_made(tmp_path, monkeypatch, capsys, line):
     monkeypatch.chdir(tmp_path)
     begin(tmp_path / "run", TrainConfig.preset("cartpole", "ppo"))
     monkeypatch.setattr(PPOConfig, "make_model", lambda *_: pytest.fail("it was made"))
-    with contextlib.nullcontext() if "4" in line else owned(tmp_path / "run"):
+    with owned(tmp_path / "run"):
         assert main(line.split()) == 2
     shown = capsys.readouterr()
     assert shown.out == ""
-    said = "with another configuration" if "4" in line else "another process is training in it; wait for it"
-    assert said in shown.err
-
-
-def test_an_unstable_actuator_can_be_trained_on_when_allowed(tmp_path):
-    config = within(actuator=UNSTABLE, allow_unstable=True, inner_steps=1)
-    assert (train(config, tmp_path / "run") / "policy.safetensors").is_file()
+    assert "another process is training in it; wait for it" in shown.err
 
 
 def test_a_folder_that_cannot_be_made_is_named_before_training(tmp_path):
