@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.logger import configure
 
 import codrl_mj
+from codrl_mj.actuators import Actuator, CurrentLoop, Motor
 from codrl_mj.agents.sarsa import SARSAConfig
 from codrl_mj.agents.sarsa_algorithm import FORGOTTEN, SARSA
 from codrl_mj.physics.base import SimulationDivergedError
@@ -104,21 +105,6 @@ def test_epsilon_is_the_share_of_random_actions():
     assert abs((actions == 0).mean() - 0.15) < 5 * np.sqrt(0.15 * 0.85 / 20_000)
 
 
-def test_epsilon_fades_from_episode_to_episode():
-    model = SARSAConfig(epsilon=0.5, epsilon_decay=0.9, **TABLE).make_model(Chain(), 0)
-    seen = []
-
-    class Look(BaseCallback):
-        def _on_rollout_start(self):
-            seen.append(self.model.exploration_rate)
-
-        def _on_step(self):
-            return True
-
-    model.learn(100, Look())
-    np.testing.assert_allclose(seen, 0.5 * 0.9 ** np.arange(len(seen)))
-
-
 # -- as an algorithm of Stable-Baselines3 -----------------------------------------------------------------------
 
 
@@ -127,6 +113,27 @@ def _car(seed_of_env=None, **arguments):
     if seed_of_env is not None:
         env.seed(seed_of_env)
     return env
+
+
+def _model(config=SARSAConfig(epsilon=0.2), compiled=True, **arguments):  # noqa: B008
+    model = config.make_model(_car(**arguments), 0)
+    model.compiled = compiled
+    return model
+
+
+class Watched(BaseCallback):
+    """What a callback is shown: steps and epsilon when an episode begins, and the locals of every step."""
+
+    def _init_callback(self):
+        self.begun, self.steps = [], []
+
+    def _on_rollout_start(self):
+        assert self.model._last_episode_starts.all()
+        self.begun.append((self.num_timesteps, self.model.exploration_rate))
+
+    def _on_step(self):
+        self.steps.append({name: self.locals[name] for name in ("dones", "infos", "signals")})
+        return True
 
 
 def test_the_agents_draws_are_not_the_environments():
@@ -151,10 +158,9 @@ def test_many_predictions_are_each_the_one():
     model = SARSAConfig().make_model(_car(), 0).learn(2000)
     space = model.observation_space
     observations = np.random.default_rng(0).uniform(space.low, space.high, (200, 2)).astype(np.float32)
-    actions, _ = model.predict(observations, deterministic=True)
-    assert actions.shape == (200,)
-    assert set(actions.tolist()) == {0, 1, 2}
-    assert [model.predict(one, deterministic=True)[0].item() for one in observations] == actions.tolist()
+    actions = model.predict(observations, deterministic=True)[0].tolist()
+    assert set(actions) == {0, 1, 2}
+    assert [model.predict(one, deterministic=True)[0].item() for one in observations] == actions
 
 
 def test_no_evaluation_changes_the_training():
@@ -164,24 +170,14 @@ def test_no_evaluation_changes_the_training():
     assert evaluate.last_mean_reward == -200.0
 
 
-def test_callbacks_and_loggers_work(tmp_path):
-    model = SARSAConfig().make_model(_car(), 0)
+def test_callbacks_see_every_episode_and_its_epsilon_and_loggers_work(tmp_path):
+    model = SARSAConfig(epsilon=0.5, epsilon_decay=0.9).make_model(_car(), 0)
     model.set_logger(configure(str(tmp_path), ["csv"]))
-    begun, every = [], []
-
-    class Count(BaseCallback):
-        def _on_rollout_start(self):
-            assert self.model._last_episode_starts.all()
-            begun.append(self.num_timesteps)
-
-        def _on_step(self):
-            assert self.locals["dones"].shape == (1,)
-            return True
-
+    watched, every = Watched(), []
     often = EveryNTimesteps(400, ConvertCallback(lambda locals_, _: every.append(locals_) or True))
     save = CheckpointCallback(2, str(tmp_path / "checkpoints"))
-    model.learn(10**9, [Count(), often, save, StopTrainingOnMaxEpisodes(5)], log_interval=1)
-    assert begun == [0, 200, 400, 600, 800]
+    model.learn(10**9, [watched, often, save, StopTrainingOnMaxEpisodes(5)], log_interval=1)
+    assert watched.begun == [(200 * episode, pytest.approx(0.5 * 0.9**episode)) for episode in range(5)]
     assert len(every) == 2
     assert model.num_timesteps == sum(episode["l"] for episode in model.ep_info_buffer) == 1000
     assert list((tmp_path / "checkpoints").iterdir())
@@ -212,63 +208,43 @@ LEVELS = {"actuator": "paper", "observe_actuator": True, "action": "current", "l
     ids=["motor", "with traces", "currents", "disturbed"],
 )
 def test_compiled_episodes_are_those_taken_step_by_step(settings, arguments):
-    outcomes = []
+    states, seen = [], []
     for compiled in (False, True):
-        model = SARSAConfig(epsilon=0.2, **settings).make_model(_car(**arguments), 0)
-        model.compiled = compiled
-        seen = []
-        model.learn(10**9, [StopTrainingOnMaxEpisodes(5), _Record(seen)])
-        outcomes.append((model, seen))
-    (one, steps), (other, episodes) = outcomes
-    np.testing.assert_array_equal(_table(one), _table(other))
-    assert one.snapshot()["generator"].tolist() == other.snapshot()["generator"].tolist()
-    for name, values in one.env.snapshot().items():
-        np.testing.assert_array_equal(values, other.env.snapshot()[name])
-    np.testing.assert_array_equal(one._last_obs, other._last_obs)
-    assert [*one.env.signals] == [*other.env.signals]
-    for name, values in one.env.signals.items():
-        np.testing.assert_array_equal(values, other.env.signals[name])
-    assert one.num_timesteps == other.num_timesteps == len(steps)
+        model, watched = _model(SARSAConfig(epsilon=0.2, **settings), compiled, **arguments), Watched()
+        model.learn(10**9, [StopTrainingOnMaxEpisodes(5), watched])
+        signals = {f"signals.{name}": values for name, values in model.env.signals.items()}
+        own = {"table": _table(model), "observation": model._last_obs, "steps": model.num_timesteps}
+        states.append({**own, **model.snapshot(), **model.env.snapshot(), **signals})
+        seen.append(watched.steps)
+    assert [*states[0]] == [*states[1]]
+    for name, values in states[0].items():
+        np.testing.assert_array_equal(values, states[1][name], err_msg=name)
+    steps, episodes = seen
+    assert len(steps) == states[0]["steps"]
     assert len(episodes) == 5
     ended = [step for step in steps if step["dones"][0]]
     for step, episode in zip(ended, episodes, strict=True):
         assert episode["dones"].tolist() == [True]
-        for name in ("terminal_observation", "TimeLimit.truncated"):
-            np.testing.assert_array_equal(step["infos"][0][name], episode["infos"][0][name])
-        assert step["infos"][0]["episode"] | {"t": 0} == episode["infos"][0]["episode"] | {"t": 0}
+        (one,), (other,) = step["infos"], episode["infos"]
+        np.testing.assert_array_equal(one["terminal_observation"], other["terminal_observation"])
+        assert one["TimeLimit.truncated"] == other["TimeLimit.truncated"]
+        assert one["episode"] | {"t": 0} == other["episode"] | {"t": 0}
     for signal in ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated"):
-        np.testing.assert_array_equal(
-            *(np.concatenate([s["signals"][signal] for s in each]) for each in (steps, episodes))
-        )
+        np.testing.assert_array_equal(*(np.concatenate([s["signals"][signal] for s in each]) for each in seen))
 
 
 def test_episodes_on_a_hill_that_was_rewritten_are_not_those_of_a_simulation_of_its_own():
     tables = []
     for compiled in (False, True):
-        env = _car(max_episode_steps=300)
-        env.set_attr("gravity", 1e-4)
-        model = SARSAConfig(epsilon=0.2).make_model(env, 0)
-        model.compiled = compiled
-        model.learn(10**9, [StopTrainingOnMaxEpisodes(3)])
-        tables.append(_table(model))
+        model = _model(compiled=compiled, max_episode_steps=300)
+        model.env.set_attr("gravity", 1e-4)
+        tables.append(_table(model.learn(10**9, StopTrainingOnMaxEpisodes(3))))
     np.testing.assert_array_equal(*tables)
 
 
-class _Record(BaseCallback):
-    def __init__(self, into):
-        super().__init__()
-        self.into = into
-
-    def _on_step(self):
-        names = ("dones", "infos", "signals")
-        self.into.append({name: self.locals[name] for name in names})
-        return True
-
-
 def test_an_episode_that_was_left_is_finished_step_by_step():
-    models = [SARSAConfig(epsilon=0.2).make_model(_car(), 0) for _ in range(2)]
+    models = [_model(compiled=False) for _ in range(2)]
     for model in models:
-        model.compiled = False
         model.learn(10**9, lambda locals_, _: locals_["self"].num_timesteps < 50)
         assert model.num_timesteps == 50
     models[1].compiled = True
@@ -280,12 +256,9 @@ def test_an_episode_that_was_left_is_finished_step_by_step():
 
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_diverging_simulation_is_an_error(compiled):
-    loop = codrl_mj.actuators.CurrentLoop(kp=1.0, kd=0.2, max_voltage=np.inf)
-    env = _car(actuator=codrl_mj.actuators.Actuator(codrl_mj.actuators.Motor(), loop), allow_unstable=True)
-    model = SARSAConfig().make_model(env, 0)
-    model.compiled = compiled
+    actuator = Actuator(Motor(), CurrentLoop(kp=1.0, kd=0.2, max_voltage=np.inf))
     with pytest.raises(SimulationDivergedError, match="mountain_car"):
-        model.learn(10_000)
+        _model(compiled=compiled, actuator=actuator, allow_unstable=True).learn(10_000)
 
 
 # -- refusals -----------------------------------------------------------------------------------------------------
@@ -325,10 +298,3 @@ def test_the_actuators_currents_are_ignored_or_tiled_as_the_intervals_say():
     assert SARSAConfig().make_model(env, 0).policy.table.shape == (648, 3)
     ends = {"low": (*space.low[:2].tolist(), -1.0, -1.0), "high": (*space.high[:2].tolist(), 1.0, 1.0)}
     assert SARSAConfig(intervals=(8, 8, 2, 2), **ends).make_model(env, 0).policy.table.shape == (648 * 9, 3)
-
-
-def test_any_number_of_levels_can_be_chosen_from():
-    env = _car(actuator="paper", action="current", levels=(-1, -0.5, 0, 0.5, 1))
-    model = SARSAConfig(epsilon=1.0).make_model(env, 0).learn(400)
-    assert ((model.policy.table != 0).sum(axis=0) > 0).all()
-    assert model.policy.table.shape == (648, 5)
