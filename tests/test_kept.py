@@ -268,15 +268,6 @@ def test_versions_cpu_settings_and_this_packages_source_are_in_the_key(place, tm
     kept._foundation.cache_clear()
 
 
-def test_an_offset_of_mujocos_structures_is_in_the_key(place):
-    """What reads a field has the offset in its closure."""
-    from codrl_mj.engine.layout import DATA, MODEL
-
-    paths = {kept._path("field", (one,)) for one in (MODEL.nv, MODEL.nu, DATA.time)}
-    assert len(paths) == 3
-    assert None not in paths
-
-
 def test_what_was_not_used_for_long_makes_room(place, monkeypatch):
     function(1.5)(1.0)
     (old,) = place.iterdir()

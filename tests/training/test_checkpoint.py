@@ -16,9 +16,10 @@ import pytest
 from safetensors.numpy import save
 
 from codrl_mj.cli import main
+from codrl_mj.envs.sb3 import make_sb3_vec_env
 from codrl_mj.runs.files import writing
 from codrl_mj.training import TrainConfig, history, watcher
-from codrl_mj.training.checkpoint import State, load_checkpoint, save_checkpoint
+from codrl_mj.training.checkpoint import State, capture, load_checkpoint, restore, save_checkpoint
 from tests.damage import Bomb, damage
 from tests.training.interruptions import CASES, TERMINATE, differing, interrupt, outcome, resume
 
@@ -172,6 +173,19 @@ def test_however_a_few_bytes_are_damaged_the_one_before_is_loaded_whole(tmp_path
             loaded = load_checkpoint(tmp_path, "a run")
         assert loaded.facts == {"num_timesteps": 10, "number": 0}
         assert loaded.arrays["array"].tolist() == [10.0] * 4
+
+
+@pytest.mark.parametrize("name", ["ppo, state-dependent noise", "ddpg, several environments", "sarsa, traces"])
+def test_a_state_that_lacks_anything_is_refused(name):
+    config = CASES[name]
+    envs = make_sb3_vec_env(config.env, config.num_envs)
+    model = config.agent.make_model(envs, config.seed).learn(60)
+    state = capture(model, envs)
+    restore(model, envs, state)
+    for entry in {*state.arrays, *state.facts}:
+        lacking = ({key: value for key, value in part.items() if key != entry} for part in state)
+        with pytest.raises(ValueError, match="of another configuration"):
+            restore(model, envs, State(*lacking))
 
 
 # -- what a killed process leaves --------------------------------------------------------------------------

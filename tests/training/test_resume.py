@@ -25,7 +25,7 @@ from tests.training.interruptions import (
     resume,
 )
 
-RESUMED = ["ppo, one optimiser", "ddpg, several environments", "sarsa, traces"]
+RESUMED = ["ppo, an episode budget", "ddpg", "sarsa, traces"]
 """One case of every kind of agent."""
 
 
@@ -133,7 +133,6 @@ def test_the_second_ctrl_c_stops_at_once(tmp_path):
 
 @pytest.mark.parametrize("entry", ["marks", "squares", "samples", "best", "watch.episodes", "watch.reports"])
 def test_what_the_watcher_remembers_matters(tmp_path, uninterrupted, monkeypatch, entry):
-    """As tests/training/test_state.py shows of what the model remembers."""
     name, out = "ppo, one optimiser", tmp_path / "run"
     expected = uninterrupted(name)
     interrupt(CASES[name], out, 180, TERMINATE)
