@@ -6,7 +6,6 @@ import json
 import pickle
 import random
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -16,24 +15,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from codrl_mj.agents import AGENTS, PPOConfig
 from codrl_mj.runs.policies import load_policy, load_sb3_zip, save_policy
+from tests.agents.small import Sampled
 from tests.damage import Bomb, damage
 
 WEIGHTS, DESCRIPTION = "policy.safetensors", "policy.json"
-
-
-class Spaces(gymnasium.Env):
-    """An environment that consists of its spaces."""
-
-    def __init__(self, observation_space, action_space):
-        """Take the spaces."""
-        self.observation_space, self.action_space = observation_space, action_space
-
-    def reset(self, *, seed=None, options=None):  # noqa: ARG002 - Gymnasium's signature
-        super().reset(seed=seed)
-        return self.observation_space.sample(), {}
-
-    def step(self, action):  # noqa: ARG002 - Gymnasium's signature
-        return self.observation_space.sample(), 0.0, False, False, {}
 
 
 HIGH = np.array([4.8, np.inf, 0.4, np.inf], np.float32)
@@ -48,7 +33,7 @@ SMALL = PPOConfig(rollout_steps=8, batch_size=8, hidden=(8, 8))
 
 def make_model(action_space=DISCRETE, observation_space=BOUNDED, agent=SMALL):
     torch.set_num_threads(1)
-    model = agent.make_model(DummyVecEnv([lambda: Spaces(observation_space, action_space)]), 3)
+    model = agent.make_model(DummyVecEnv([lambda: Sampled(observation_space, action_space)]), 3)
     with torch.no_grad():  # initial weights hardly tell observations apart: make the actions vary
         for parameter in model.policy.parameters():
             parameter.add_(0.5 * torch.randn_like(parameter))

@@ -2,13 +2,12 @@
 
 import copy
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import NatureCNN
@@ -17,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from codrl_mj import make_sb3_vec_env
 from codrl_mj.agents import PPOConfig
 from codrl_mj.agents.fast_ppo import FastPPO
+from tests.agents.small import Sampled
 
 CASES = {
     "discrete": ("CartPole", {"entropy_coefficient": 0.01, "target_kl": None}),
@@ -29,13 +29,6 @@ CASES = {
     ),
 }
 FILLED = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs", "advantages", "returns")
-
-
-class Nothing(BaseCallback):
-    """Watches nothing."""
-
-    def _on_step(self) -> bool:
-        return True
 
 
 def pair(case):
@@ -68,23 +61,28 @@ def pair(case):
 def collect(model):
     model.env.seed(1)
     model.set_logger(Logger(None, []))
-    _, callback = model._setup_learn(0, Nothing())
+    _, callback = model._setup_learn(0, ConvertCallback(lambda *_: True))
     assert model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
+
+
+def learn_alike(rollout, *models):
+    """What each has learned by an update from the same rollout, in the same minibatches."""
+    for model in models:
+        model.set_logger(Logger(None, []))
+        model.rollout_buffer = copy.deepcopy(rollout)
+        np.random.seed(3)
+        model.train()
+    return [dict(model.policy.state_dict()) for model in models]
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_learns_what_stable_baselines3_learns_from_the_same_rollout(case):
     ours, theirs, _ = pair(case)
     collect(ours)
-    theirs.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
-    theirs.set_logger(Logger(None, []))
     start = copy.deepcopy(theirs.policy.state_dict())
-    for model in (ours, theirs):
-        np.random.seed(3)
-        model.train()
+    learnt, taught = learn_alike(ours.rollout_buffer, ours, theirs)
     assert ours._n_updates == theirs._n_updates
-    learnt, taught = (model.policy.state_dict() for model in (ours, theirs))
-    torch.testing.assert_close(dict(learnt), dict(taught), rtol=0, atol=1e-5)
+    torch.testing.assert_close(learnt, taught, rtol=0, atol=1e-5)
     assert max(float((taught[name] - start[name]).abs().max()) for name in taught) > 3e-3
 
 
@@ -143,18 +141,12 @@ def test_a_saved_model_goes_on_in_stable_baselines3_and_theirs_here(case, tmp_pa
     """Weights and Adam's moments are in the file: the next update is the same."""
     ours, theirs, envs = pair(case)
     collect(ours)
-    theirs.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
+    rollout = ours.rollout_buffer
     for saved, reader in ((ours, PPO), (ours, FastPPO), (theirs, FastPPO)):
-        saved.set_logger(Logger(None, []))
-        saved.train()
+        learn_alike(rollout, saved)
         saved.save(tmp_path / "model")
         read = reader.load(tmp_path / "model", env=envs, device="cpu")
-        read.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
-        read.set_logger(Logger(None, []))
-        for model in (saved, read):
-            np.random.seed(3)
-            model.train()
-        torch.testing.assert_close(dict(read.policy.state_dict()), dict(saved.policy.state_dict()), rtol=0, atol=1e-5)
+        torch.testing.assert_close(*learn_alike(rollout, read, saved), rtol=0, atol=1e-5)
 
 
 def test_moments_of_other_networks_are_refused():
@@ -162,23 +154,6 @@ def test_moments_of_other_networks_are_refused():
     other, _, _ = pair("state-dependent")
     with pytest.raises(ValueError, match=r"12 parameters are optimised: must be 13|13 .* must be 12"):
         ours.policy.optimizer.load_state_dict(other.policy.optimizer.state_dict())
-
-
-class Sampled(gymnasium.Env):
-    """Observations at random from a space; takes none but its own actions."""
-
-    def __init__(self, observation_space, action_space):
-        """Take the spaces."""
-        self.observation_space, self.action_space = observation_space, action_space
-        observation_space.seed(0)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed, options=options)
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action)
-        return self.observation_space.sample(), float(np.sum(action)), False, self.np_random.random() < 0.1, {}
 
 
 def box(*shape, dtype=np.float32):
