@@ -15,8 +15,8 @@ from tests.agents.small import make_envs, make_model
 EVERY = [(agent, task, name) for (agent, task), of in PRESETS.items() for name in of if task != ELSEWHERE]
 
 
-def policy_of(config, task):
-    envs = make_envs(task)
+def policy_of(config, task, **arguments):
+    envs = make_envs(task, **arguments)
     return config.make_policy(envs.observation_space, envs.action_space)
 
 
@@ -39,6 +39,7 @@ def observations(task, count=50):
     return np.random.default_rng(0).uniform(low, high, (count, *space.shape)).astype(np.float32)
 
 
+CAR = "mountain_car_continuous"
 TWO_STREAMS = [(3, 1), "ReLU", (1, 32), "ReLU", (33, 256), "ReLU", (256, 256), "ReLU", (256, 1)]
 ACTOR = [(64, 64), "ReLU", (64, 1), "Tanh"]
 
@@ -49,13 +50,8 @@ ACTOR = [(64, 64), "ReLU", (64, 1), "Tanh"]
         (paper("ddpg", "pendulum"), "pendulum", "actor", [(3, 64), "ReLU", *ACTOR]),
         (paper("ddpg", "pendulum"), "pendulum", "critic", TWO_STREAMS),
         (paper("ddpg", "pendulum"), "pendulum", "critic_target", TWO_STREAMS),
-        (paper("ddpg", "mountain_car_continuous"), "mountain_car_continuous", "actor", [(2, 64), "ReLU", *ACTOR]),
-        (
-            paper("ddpg", "mountain_car_continuous"),
-            "mountain_car_continuous",
-            "critic",
-            [(2, 64), "ReLU", (65, 64), "ReLU", (64, 1)],
-        ),
+        (paper("ddpg", CAR), CAR, "actor", [(2, 64), "ReLU", *ACTOR]),
+        (paper("ddpg", CAR), CAR, "critic", [(2, 64), "ReLU", (65, 64), "ReLU", (64, 1)]),
         (paper("dqn", "acrobot"), "acrobot", "q_net", [(6, 64), "ReLU", (64, 128), "ReLU", (128, 3)]),
         (paper("ppo", "cartpole"), "cartpole", "mlp_extractor.policy_net", [(4, 64), "Tanh", (64, 64), "Tanh"]),
         (paper("ppo", "cartpole"), "cartpole", "mlp_extractor.value_net", [(4, 64), "Tanh", (64, 64), "Tanh"]),
@@ -75,20 +71,20 @@ def test_the_critic_of_two_streams_is_the_function_that_the_paper_describes():
     (values,) = policy.critic(states, actions)
     tensors = {name: tensor.numpy() for name, tensor in policy.critic.state_dict().items()}
 
-    def through(stream, inputs, *indices, last=0):
-        for index in indices:
-            weight, bias = (tensors[f"qf0.{stream}.{index}.{part}"] for part in ("weight", "bias"))
-            inputs = inputs @ weight.T + bias
-            inputs = inputs if index == last else np.maximum(inputs, 0)
-        return inputs
+    def apply(layer, inputs):
+        weight, bias = (tensors[f"qf0.{layer}.{part}"] for part in ("weight", "bias"))
+        return inputs @ weight.T + bias
 
-    state, action = states.numpy(), actions.numpy()
-    joint = [through("state_stream", state, 0, 2, last=None), through("action_stream", action, 0, last=None)]
-    expected = through("joint", np.concatenate(joint, axis=1), 0, 2, 4, last=4)
+    def relu(x):
+        return np.maximum(x, 0)
+
+    state = relu(apply("state_stream.2", relu(apply("state_stream.0", states.numpy()))))
+    joint = np.concatenate([state, relu(apply("action_stream.0", actions.numpy()))], axis=1)
+    expected = apply("joint.4", relu(apply("joint.2", relu(apply("joint.0", joint)))))
     np.testing.assert_allclose(values.detach().numpy(), expected, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize(("task", "limit"), [("pendulum", 2.0), ("mountain_car_continuous", 1.0)])
+@pytest.mark.parametrize(("task", "limit"), [("pendulum", 2.0), (CAR, 1.0)])
 def test_ddpg_acts_within_the_range_that_tanh_spans(task, limit):
     policy = policy_of(paper("ddpg", task), task)
     policy.actor.mu[-2].bias.data.fill_(100.0)
@@ -98,7 +94,7 @@ def test_ddpg_acts_within_the_range_that_tanh_spans(task, limit):
 @pytest.mark.parametrize("agent", ["ppo", "ddpg", "td3", "sac"])
 def test_factors_on_the_input_are_those_on_the_observation(agent):
     """A network with factors, on observations, is the network without them on observations times the factors."""
-    task, factors = "mountain_car_continuous", (0.5, 10.0)
+    task, factors = CAR, (0.5, 10.0)
     plain, scaled = (policy_of(AGENTS[agent](input_scale=scale), task) for scale in (None, factors))
     scaled.load_state_dict(plain.state_dict())
     seen = observations(task)
@@ -113,19 +109,15 @@ def test_factors_on_the_input_are_those_on_the_observation(agent):
 
 def test_entries_without_a_factor_stay_as_they_are():
     """With the actuator observed, an observation has more entries than the settings have factors."""
-    envs = make_envs("mountain_car_continuous", observe_actuator=True)
-    policy = DDPGConfig(input_scale=(1.0, 10.0)).make_policy(envs.observation_space, envs.action_space)
+    policy = policy_of(DDPGConfig(input_scale=(1.0, 10.0)), CAR, observe_actuator=True)
     assert policy.actor.features_extractor.factors.tolist() == [1, 10, 1, 1]
 
 
 @pytest.mark.matrix
 @pytest.mark.parametrize(("command", "largest"), [("force", 0.084), ("voltage", 18.0)])
 def test_unit_actions_are_those_of_a_plain_actor_times_the_largest(command, largest):
-    envs = make_envs("furuta", action=command)
-    plain, units = (
-        PPOConfig(log_std_init=-0.5, unit_actions=given).make_policy(envs.observation_space, envs.action_space)
-        for given in (False, True)
-    )
+    configs = (PPOConfig(log_std_init=-0.5, unit_actions=given) for given in (False, True))
+    plain, units = (policy_of(config, "furuta", action=command) for config in configs)
     units.load_state_dict(plain.state_dict())
     seen = torch.as_tensor(observations("furuta"))
     ours, theirs = units.get_distribution(seen).distribution, plain.get_distribution(seen).distribution
