@@ -96,21 +96,14 @@ def test_episodes_are_those_of_stepping_one_environment_at_a_time(task, actuator
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
-def test_the_policy_is_asked_once_a_step_for_the_episodes_still_running(deterministic):
-    policy = Leaner()
-    episodes = run_episodes(policy, cartpole(), episodes=3, deterministic=deterministic)
+def test_the_policy_is_asked_once_a_step_for_the_episodes_still_running_which_are_reported(deterministic):
+    policy, reports = Leaner(), []
+    episodes = run_episodes(policy, cartpole(), 3, 0, deterministic, on_step=lambda *counts: reports.append(counts))
     lengths = [len(episode.reward) for episode in episodes]
     assert len(set(lengths)) > 1  # they end at different times
-    expected = [sum(step < length for length in lengths) for step in range(max(lengths))]
-    assert policy.asked == [(running, deterministic) for running in expected]
-
-
-def test_progress_counts_running_and_finished_episodes():
-    reports = []
-    run_episodes(Leaner(), cartpole(), episodes=3, on_step=lambda *counts: reports.append(counts))
-    assert all(running + finished == 3 for running, finished in reports)
-    assert [finished for _, finished in reports] == sorted(finished for _, finished in reports)
-    assert reports[-1] == (0, 3)
+    running = [sum(step < length for length in lengths) for step in range(max(lengths) + 1)]
+    assert policy.asked == [(count, deterministic) for count in running[:-1]]
+    assert reports == [(count, 3 - count) for count in running[1:]]
 
 
 class Sampler:
@@ -172,7 +165,11 @@ def test_analytic_physics_disturbed_runs_the_same_episodes():
 def test_the_random_policy_draws_from_the_whole_action_space_and_repeats_with_its_seed(task):
     space = TASKS[task].action_space
     draw = lambda seed: RandomPolicy(task, seed).predict(np.zeros((300, 4)))[0]  # noqa: E731
+    space.seed(4)
+    expected = space.sample()
+    space.seed(4)
     actions = draw(0)
+    np.testing.assert_array_equal(space.sample(), expected)  # the task's own space is left alone
     assert actions.shape == (300, *space.shape)
     assert all(space.contains(action) for action in actions)
     np.testing.assert_array_equal(actions, draw(0))
@@ -182,15 +179,6 @@ def test_the_random_policy_draws_from_the_whole_action_space_and_repeats_with_it
     else:
         assert actions.min() < 0.9 * space.low.min()
         assert actions.max() > 0.9 * space.high.max()
-
-
-def test_the_random_policy_leaves_the_tasks_own_space_alone():
-    space = TASKS["cartpole"].action_space
-    space.seed(4)
-    expected = [space.sample() for _ in range(10)]
-    space.seed(4)
-    RandomPolicy("cartpole", 9).predict(np.zeros((10, 4)))
-    assert [space.sample() for _ in range(10)] == expected
 
 
 @pytest.mark.parametrize(
