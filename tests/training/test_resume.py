@@ -9,7 +9,6 @@ from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import read_run
 from codrl_mj.training import RunInUseError, TrainConfig, TrainingStoppedError, finished, history, watcher
-from codrl_mj.training.checkpoint import State, load_checkpoint
 from tests.matrix import but
 from tests.training.interruptions import (
     CASES,
@@ -25,7 +24,7 @@ from tests.training.interruptions import (
     resume,
 )
 
-RESUMED = ["ppo, an episode budget", "ddpg", "sarsa, traces"]
+RESUMED = ["ppo, one optimiser", "ddpg, several environments", "sarsa, traces"]
 """One case of every kind of agent."""
 
 
@@ -129,24 +128,3 @@ def test_while_one_trains_in_a_folder_another_is_refused(tmp_path, uninterrupted
 def test_the_second_ctrl_c_stops_at_once(tmp_path):
     with pytest.raises(KeyboardInterrupt), after(70, lambda: (INTERRUPT(), INTERRUPT())):
         resume(CASES["ppo, one optimiser"], tmp_path / "run")
-
-
-@pytest.mark.parametrize("entry", ["marks", "squares", "samples", "best", "watch.episodes", "watch.reports"])
-def test_what_the_watcher_remembers_matters(tmp_path, uninterrupted, monkeypatch, entry):
-    name, out = "ppo, one optimiser", tmp_path / "run"
-    expected = uninterrupted(name)
-    interrupt(CASES[name], out, 180, TERMINATE)
-
-    def load_another(*arguments):
-        arrays, facts = load_checkpoint(*arguments)
-        if entry in arrays:
-            arrays[entry] = arrays[entry][1:]
-        else:
-            value = facts["watch"][entry]
-            another = {"marks": dict.fromkeys(facts["watch"]["marks"], 0), "best": {"return": 1e9, "steps": 1}}
-            facts["watch"][entry] = another.get(entry, value * 2 + 1 if isinstance(value, int | float) else None)
-        return State(arrays, facts)
-
-    monkeypatch.setattr(watcher, "load_checkpoint", load_another)
-    resume(CASES[name], out)
-    assert differing(expected, outcome(out)) != []
