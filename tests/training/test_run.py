@@ -111,6 +111,11 @@ def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_pol
     assert result["best"] == {"return": anew, "steps": 512}  # the only evaluation
 
 
+def test_another_seed_gives_another_policy(run, tmp_path):
+    other = train(dataclasses.replace(TINY, seed=2), tmp_path / "other")
+    assert (other / "policy.safetensors").read_bytes() != (run[0] / "policy.safetensors").read_bytes()
+
+
 def test_a_report_has_the_evaluation_that_took_place_then_and_no_other(tmp_path, monkeypatch):
     monkeypatch.setattr(watcher, "REPORT_INTERVAL", 1250)
     config = dataclasses.replace(TINY, total_steps=2500, evaluation_interval=1000, evaluation_episodes=2)
