@@ -1,4 +1,17 @@
-"""Damage to files, as a failing disk or a careless transfer does it."""
+"""Damage to files: as a failing disk or a careless transfer does it, and on purpose."""
+
+from pathlib import Path
+
+
+class Bomb:
+    """Leaves a file where it is unpickled."""
+
+    def __init__(self, marker):
+        """Take the file's path."""
+        self.marker = marker
+
+    def __reduce__(self):
+        return Path.touch, (self.marker,)
 
 
 def damage(content, random):

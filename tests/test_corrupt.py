@@ -1,6 +1,6 @@
 """Whatever a user hands over is refused in a sentence, and costs nobody a file."""
 
-import importlib.util
+import importlib
 import os
 import random
 import signal
@@ -16,11 +16,9 @@ SCRIPT = Path(__file__).parents[1] / "scripts" / "corrupt.py"
 
 @pytest.fixture(scope="module")
 def corrupt():
-    spec = importlib.util.spec_from_file_location("corrupt", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(SCRIPT.parent))
+        yield importlib.import_module("corrupt")
 
 
 @pytest.mark.matrix
@@ -31,17 +29,12 @@ def test_thirty_of_each_kind_end_with_a_word(tmp_path):
     assert "0 of 90 failed" in ended.stdout
 
 
-def _succeeds():
-    return 0
+def _ends(status, word=""):
+    def program():
+        print(word, end="", file=sys.stderr)
+        return status
 
-
-def _refuses():
-    print("codrl-mj: error: there is no such thing", file=sys.stderr)
-    return 2
-
-
-def _refuses_without_a_word():
-    return 2
+    return program
 
 
 def _crashes():
@@ -52,19 +45,9 @@ def _ends_by_a_signal():
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _overwrites():
-    Path("mine").write_text("theirs")
-    return 0
-
-
-def _deletes():
-    Path("mine").unlink()
-    return 0
-
-
-def _leaves_a_half():
-    Path(".out-abcd1234.html").touch()
-    return 0
+def _does(change):
+    """A program that changes a file and succeeds."""
+    return lambda: 0 * bool(change())
 
 
 def _dies_of_ctrl_c():
@@ -83,15 +66,15 @@ def _ends_at_ctrl_c():
 @pytest.mark.parametrize(
     ("program", "failures"),
     [
-        (_succeeds, []),
-        (_refuses, []),
+        (_ends(0), []),
+        (_ends(2, "codrl-mj: error: there is no such thing\n"), []),
         (_ends_at_ctrl_c, []),
-        (_refuses_without_a_word, ["no word on it"]),
+        (_ends(2), ["no word on it"]),
         (_crashes, ["exit status 99", "traceback"]),
         (_ends_by_a_signal, ["exit status -9"]),
-        (_overwrites, ["lost: mine"]),
-        (_deletes, ["lost: mine"]),
-        (_leaves_a_half, ["lost: .out-abcd1234.html"]),
+        (_does(lambda: Path("mine").write_text("theirs")), ["lost: mine"]),
+        (_does(lambda: Path("mine").unlink()), ["lost: mine"]),
+        (_does(lambda: Path(".out-abcd1234.html").touch()), ["lost: .out-abcd1234.html"]),
         (_dies_of_ctrl_c, ["exit status -2"]),
     ],
 )

@@ -4,6 +4,7 @@ import datetime
 import hashlib
 import json
 import os
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +12,7 @@ from codrl_mj.actuators import Actuator, CurrentLoop, Motor, actuator_over, mapp
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.pages import report
+from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import SORT_KEYS, compare, find_runs, read_run, sort_runs
 from codrl_mj.tasks import named_actuator
 from codrl_mj.training.config import TrainConfig
@@ -21,48 +23,44 @@ PROGRESS = "steps,episodes,mean_return,steps_per_second,seconds\n"
 UNITS = {"returns": "reward", "tracking_rms": "N*m", "peak_voltage": "V"}
 
 
+GEARED = actuator_over(resolve("kraken-x60", None, "nobody"), {"motor": {"gear_ratio": 70.3}})
+OWN = actuator_over(GEARED, {"motor": {"resistance": 0.5}})
+
+
 def make_run(folder, actuator="weaker", *, seed=3, task="cartpole", finished=True, evaluated=True, **train):
     """A run folder as trainings leave them."""
-    folder.mkdir(parents=True)
     motor = named_actuator(actuator, task) if isinstance(actuator, str) else actuator
-    config = {
-        "agent": {"name": "ppo", "learning_rate": 1e-3, "hidden": [64, 64]},
-        "seed": seed,
-        "total_steps": 4000,
-        "env": {"task": task, "actuator": mapping_of(motor), "disturbances": {"command_delay": 0.0}},
-    } | train
-    (folder / "config.json").write_text(json.dumps({"train": config, "versions": {"torch": "2.13.0"}}))
-    (folder / "progress.csv").write_text(
-        f"{PROGRESS}1000,9,20.5,500,2.5\n{4096 if finished else 2000},12,90.25,500,4.5\n"
-    )
+    env = {"task": task, "actuator": mapping_of(motor), "disturbances": {"command_delay": 0.0}}
+    agent = {"name": "ppo", "learning_rate": 1e-3, "hidden": [64, 64]}
+    config = {"agent": agent, "seed": seed, "total_steps": 4000, "env": env} | train
+    last = 4096 if finished else 2000
+    write_json(folder / "config.json", {"train": config, "versions": {"torch": "2.13.0"}})
+    (folder / "progress.csv").write_text(f"{PROGRESS}1000,9,20.5,500,2.5\n{last},12,90.25,500,4.5\n")
     if finished:
         for place in (folder, folder / "best"):
-            place.mkdir(exist_ok=True)
+            write_json(place / "policy.json", {"weights_sha256": hashlib.sha256(b"weights").hexdigest()})
             (place / "policy.safetensors").write_bytes(b"weights")
-            digest = hashlib.sha256(b"weights").hexdigest()
-            (place / "policy.json").write_text(json.dumps({"weights_sha256": digest}))
-        (folder / "result.json").write_text(json.dumps({"steps": 4096, "mean_return": 91.0, "seconds": 8.25}))
+        write_json(folder / "result.json", {"steps": 4096, "mean_return": 91.0, "seconds": 8.25})
     if evaluated:
         returns = {"mean": 400.0 + seed, "low": 380.0, "high": 420.0}
         measures = {"returns": returns, "tracking_rms": 0.1, "peak_voltage": None, "units": UNITS}
-        (folder / "evaluation.json").write_text(json.dumps(measures))
+        write_json(folder / "evaluation.json", measures)
     return folder
 
 
 def test_a_finished_run_says_what_it_was_and_what_it_came_to(tmp_path):
-    run = read_run(make_run(tmp_path / "mine"))
+    folder = make_run(tmp_path / "mine")
+    for index, file in enumerate(sorted(folder.iterdir())):
+        os.utime(file, (0, 1_700_000_000 + index))
+    run = read_run(folder)
     assert (run.name, run.state, run.problem) == ("mine", "finished", None)
     assert (run.task, run.agent, run.actuator, run.seed) == ("cartpole", "ppo", "weaker", 3)
     assert (run.steps, run.total_steps, run.seconds) == (4096, 4000, 8.25)
-    assert run.mean_return == 90.25  # the last report's
-    assert run.evaluation_return == 403.0
+    assert (run.mean_return, run.evaluation_return) == (90.25, 403.0)  # the last report's, the evaluation's
     assert run.configuration["env.disturbances.command_delay"] == 0.0
     assert run.configuration["versions.torch"] == "2.13.0"
-    for index, file in enumerate(sorted((tmp_path / "mine").iterdir())):
-        os.utime(file, (0, 1_700_000_000 + index))
-    assert read_run(tmp_path / "mine").modified == 1_700_000_000 + index
-    mapping = json.loads(json.dumps(read_run(tmp_path / "mine").as_mapping()))
-    assert datetime.datetime.fromisoformat(mapping["modified"]).timestamp() == 1_700_000_000 + index
+    mapping = json.loads(json.dumps(run.as_mapping()))
+    assert run.modified == 1_700_000_000 + index == datetime.datetime.fromisoformat(mapping["modified"]).timestamp()
     assert mapping["evaluation_return"] == 403.0
 
 
@@ -94,35 +92,29 @@ def test_the_time_of_a_run_without_a_clock_follows_from_its_pace(tmp_path):
         (named_actuator("paper", "cartpole"), "pendulum", "custom"),  # named, but not on this task
         (Actuator(Motor(resistance=7.0)), "pendulum", "custom"),
         (Actuator(Motor(), CurrentLoop(max_voltage=float("inf"))), "pendulum", "custom"),
+        (GEARED, "cartpole", "kraken-x60"),  # known by its numbers, whatever its gear
+        (OWN, "cartpole", "drive"),
     ],
 )
 def test_the_actuator_has_its_name_on_the_task(tmp_path, actuator, task, name):
     assert read_run(make_run(tmp_path / "mine", actuator, task=task)).actuator == name
 
 
-def test_motors_keep_their_names(tmp_path):
-    """Known by their numbers where they are the catalogue's, whatever their gear; others by what the run was told."""
-    geared = actuator_over(resolve("kraken-x60", None, "nobody"), {"motor": {"gear_ratio": 70.3}})
-    own = actuator_over(geared, {"motor": {"resistance": 0.5}})
-    assert read_run(make_run(tmp_path / "one", geared)).actuator == "kraken-x60"
-    assert read_run(make_run(tmp_path / "two", own)).actuator == "drive"
-    patterns = {"a": "kraken-x60", "b": {"label": "drawer", **own.as_mapping()}, "c": None}
-    config = TrainConfig(EnvConfig("HalfCheetah-v5", patterns))
-    begin(tmp_path / "three", config)
-    assert read_run(tmp_path / "three").actuator == "kraken-x60, drawer, ideal"
-    assert load_config(tmp_path / "three").env.through == config.env.through == "kraken-x60, drawer, ideal"
-    sentence = " ".join(report._sentence(read_run(tmp_path / "three")).split())
-    assert "SAC on HalfCheetah-v5 through the actuators kraken-x60, drawer, ideal" in sentence.replace("PPO", "SAC")
-    assert "labels" not in str(config.as_mapping()) + str(read_run(tmp_path / "three").configuration)
+def test_motors_keep_the_names_that_the_run_was_told(tmp_path):
+    patterns = {"a": "kraken-x60", "b": {"label": "drawer", **OWN.as_mapping()}, "c": None}
+    config, folder = TrainConfig(EnvConfig("HalfCheetah-v5", patterns)), tmp_path / "told"
+    begin(folder, config)
+    run = read_run(folder)
+    assert run.actuator == load_config(folder).env.through == config.env.through == "kraken-x60, drawer, ideal"
+    sentence = " ".join(report._sentence(run).split())
+    assert "PPO on HalfCheetah-v5 through the actuators kraken-x60, drawer, ideal" in sentence
+    assert "labels" not in str(config.as_mapping()) + str(run.configuration)
 
 
 @pytest.mark.parametrize("actuator", [{"motor": {"colour": 3}}, 7, [["weaker"]]])
 def test_an_actuator_that_cannot_be_read_is_custom(tmp_path, actuator):
-    folder = make_run(tmp_path / "mine")
-    content = json.loads((folder / "config.json").read_text())
-    content["train"]["env"]["actuator"] = actuator
-    (folder / "config.json").write_text(json.dumps(content))
-    assert read_run(folder).actuator == "custom"
+    env = {"task": "cartpole", "actuator": actuator}
+    assert read_run(make_run(tmp_path / "mine", env=env)).actuator == "custom"
 
 
 @pytest.mark.parametrize(
@@ -139,11 +131,7 @@ def test_an_actuator_that_cannot_be_read_is_custom(tmp_path, actuator):
         ("progress.csv", b"\xff\xfe\x00", "progress.csv"),
         ("progress.csv", b"a,b\n1,2\n", "progress.csv has no column 'steps'"),
         ("policy.safetensors", None, "policy.safetensors is missing"),
-        (
-            "policy.safetensors",
-            b"exchanged",
-            "policy.safetensors is truncated or damaged, or it and policy.json do not",
-        ),
+        ("policy.safetensors", b"new", "policy.safetensors is truncated or damaged, or it and policy.json do not"),
         ("policy.json", b'{"format"', "policy.json is not a policy description: it is truncated"),
         ("best/policy.safetensors", b"weig", "best/policy.safetensors is truncated or damaged"),
         ("progress.csv", PROGRESS.encode() + b"1000,9,20.5,500,2.5\n", "progress.csv ends at step 1000 of 4096"),
@@ -249,39 +237,32 @@ def test_beside_an_ideal_actuator_no_field_of_another_is_listed(tmp_path):
 # -- codrl-mj runs ------------------------------------------------------------------------------------------
 
 
-def verb(*arguments):
-    return main(["runs", *map(str, arguments)])
-
-
-def test_the_verb_lists_runs_in_the_order_asked_for(tmp_path, capsys):
-    make_run(tmp_path / "low", seed=1)
-    make_run(tmp_path / "high", seed=50)
-    make_run(tmp_path / "hurt").joinpath("evaluation.json").write_text("{")
-    assert verb(tmp_path, "--sort", "return", "--out", tmp_path / "list.json") == 0
+def test_the_verb_lists_runs_in_the_order_asked_for(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make_run(Path("low"), seed=1)
+    make_run(Path("high"), seed=50)
+    make_run(Path("hurt")).joinpath("evaluation.json").write_text("{")
+    assert main(["runs", ".", "--sort", "return", "--out", "list.json"]) == 0
     text = capsys.readouterr().out
     assert max(map(len, text.splitlines())) <= 110
     rows = [line.split()[0] for line in text.splitlines() if "cartpole" in line]
     assert rows == ["high", "low", "hurt"]
     assert "450.0" in text
     assert "hurt: damaged" in text
-    listed = json.loads((tmp_path / "list.json").read_text())
-    assert [run["name"] for run in listed["runs"]] == rows
+    assert [run["name"] for run in json.loads(Path("list.json").read_text())["runs"]] == rows
 
 
 def test_the_verb_compares_runs(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    make_run(tmp_path / "a", "ideal", seed=1)
-    make_run(tmp_path / "b", "weaker", seed=50)
-    assert verb("--compare", "a", "b", "--out", "both.json") == 0
-    text = capsys.readouterr().out
-    lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert "seed 1 50" in lines
-    assert "env.actuator ideal weaker" in lines
-    assert "evaluation.returns reward 401 [380, 420] 450 [380, 420]" in lines
-    comparison = json.loads((tmp_path / "both.json").read_text())
-    assert comparison["names"] == ["a", "b"]
-    assert comparison["configuration"]["seed"] == [1, 50]
+    make_run(Path("a"), "ideal", seed=1)
+    make_run(Path("b"), "weaker", seed=50)
+    assert main(["runs", "--compare", "a", "b", "--out", "both.json"]) == 0
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    returns = "evaluation.returns reward 401 [380, 420] 450 [380, 420]"
+    assert {"seed 1 50", "env.actuator ideal weaker", returns} <= set(lines)
+    comparison = json.loads(Path("both.json").read_text())
+    assert (comparison["names"], comparison["configuration"]["seed"]) == (["a", "b"], [1, 50])
     assert comparison["units"]["evaluation.tracking_rms"] == "N*m"
     for names, refusal in ((("a", "nothing"), "no run at nothing"), (("a",), "two or more")):
-        assert verb("--compare", *names) == 2
+        assert main(["runs", "--compare", *names]) == 2
         assert refusal in capsys.readouterr().err

@@ -1,5 +1,7 @@
 """Agents small enough to train in a test, and how to train them."""
 
+import gymnasium
+import numpy as np
 import torch
 
 from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, TD3Config
@@ -44,3 +46,20 @@ def weights(module):
 def differing(before, after, by=0.0):
     """Names of the tensors that are not the same bits, or that differ by more than `by`."""
     return {name for name in before if (before[name] - after[name]).abs().max() > by}
+
+
+class Sampled(gymnasium.Env):
+    """Observations at random from a space; takes none but its own actions."""
+
+    def __init__(self, observation_space, action_space):
+        """Take the spaces."""
+        self.observation_space, self.action_space = observation_space, action_space
+        observation_space.seed(0)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed, options=options)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return self.observation_space.sample(), float(np.sum(action)), False, self.np_random.random() < 0.1, {}

@@ -33,35 +33,32 @@ def test_the_noise_starts_at_zero_in_every_episode_and_can_be_left_out():
 
 
 class Epsilons(BaseCallback):
-    """Epsilon at every step, by episode."""
+    """Episode and epsilon, at every step."""
 
     def _on_training_start(self):
-        self.seen = {}
+        self.seen = []
 
     def _on_step(self):
-        self.seen.setdefault(self.model._episode_num, set()).add(self.model.exploration_rate)
+        self.seen.append((self.model._episode_num, self.model.exploration_rate))
         return True
 
 
-def test_epsilon_shrinks_by_its_factor_with_every_episode_down_to_its_end():
-    config = DQNConfig(hidden=(4,), exploration_start=0.8, exploration_decay=0.5, exploration_end=0.1)
+def epsilons(steps, max_episode_steps=None, **settings):
     watched = Epsilons()
-    make_model(config, "mountain_car", max_episode_steps=5).learn(25, callback=watched)
-    assert watched.seen == {0: {0.8}, 1: {0.4}, 2: {0.2}, 3: {0.1}, 4: {0.1}}
+    make_model(DQNConfig(hidden=(4,), **settings), "mountain_car", max_episode_steps=max_episode_steps).learn(
+        steps, watched
+    )
+    return watched.seen
+
+
+def test_epsilon_shrinks_by_its_factor_with_every_episode_down_to_its_end():
+    settings = {"exploration_start": 0.8, "exploration_decay": 0.5, "exploration_end": 0.1}
+    seen = epsilons(25, 5, **settings)
+    assert set(seen) == {(0, 0.8), (1, 0.4), (2, 0.2), (3, 0.1), (4, 0.1)}
 
 
 def test_epsilon_falls_linearly_over_its_share_of_the_steps():
-    config = DQNConfig(
-        hidden=(4,), exploration_start=1.0, exploration_end=0.2, exploration_decay=None, exploration_fraction=0.5
-    )
-    model = make_model(config, "mountain_car")
-    rates = []
-
-    class Rates(BaseCallback):
-        def _on_step(self):
-            rates.append(self.model.exploration_rate)
-            return True
-
-    model.learn(100, callback=Rates())
+    settings = {"exploration_decay": None, "exploration_fraction": 0.5, "exploration_end": 0.2}
+    rates = [rate for _, rate in epsilons(100, exploration_start=1.0, **settings)]
     assert rates[26] == pytest.approx(1 - 0.8 * 0.26 / 0.5)
     assert rates[51:] == pytest.approx([0.2] * 49)

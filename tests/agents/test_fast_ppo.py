@@ -1,15 +1,13 @@
 """PPO's arithmetic written out, against Stable-Baselines3's own."""
 
 import copy
-import io
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import NatureCNN
@@ -18,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from codrl_mj import make_sb3_vec_env
 from codrl_mj.agents import PPOConfig
 from codrl_mj.agents.fast_ppo import FastPPO
+from tests.agents.small import Sampled
 
 CASES = {
     "discrete": ("CartPole", {"entropy_coefficient": 0.01, "target_kl": None}),
@@ -30,13 +29,6 @@ CASES = {
     ),
 }
 FILLED = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs", "advantages", "returns")
-
-
-class Nothing(BaseCallback):
-    """Watches nothing."""
-
-    def _on_step(self) -> bool:
-        return True
 
 
 def pair(case):
@@ -69,23 +61,28 @@ def pair(case):
 def collect(model):
     model.env.seed(1)
     model.set_logger(Logger(None, []))
-    _, callback = model._setup_learn(0, Nothing())
+    _, callback = model._setup_learn(0, ConvertCallback(lambda *_: True))
     assert model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
+
+
+def learn_alike(rollout, *models):
+    """What each has learned by an update from the same rollout, in the same minibatches."""
+    for model in models:
+        model.set_logger(Logger(None, []))
+        model.rollout_buffer = copy.deepcopy(rollout)
+        np.random.seed(3)
+        model.train()
+    return [dict(model.policy.state_dict()) for model in models]
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_learns_what_stable_baselines3_learns_from_the_same_rollout(case):
     ours, theirs, _ = pair(case)
     collect(ours)
-    theirs.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
-    theirs.set_logger(Logger(None, []))
     start = copy.deepcopy(theirs.policy.state_dict())
-    for model in (ours, theirs):
-        np.random.seed(3)
-        model.train()
+    learnt, taught = learn_alike(ours.rollout_buffer, ours, theirs)
     assert ours._n_updates == theirs._n_updates
-    learnt, taught = (model.policy.state_dict() for model in (ours, theirs))
-    torch.testing.assert_close(dict(learnt), dict(taught), rtol=0, atol=1e-5)
+    torch.testing.assert_close(learnt, taught, rtol=0, atol=1e-5)
     assert max(float((taught[name] - start[name]).abs().max()) for name in taught) > 3e-3
 
 
@@ -127,9 +124,8 @@ def test_explores_with_the_probabilities_of_its_policy(case):
         draws = ours._exploration.draws(1, count, ours._networks.outputs)
         actions = ours._exploration.actions(*acted, draws[0]).double().numpy()
         wanted = ours.policy.get_distribution(torch.as_tensor(observation)).distribution
-    discrete = case == "discrete"
-    mean = float(wanted.probs[0, 1] if discrete else wanted.mean)
-    deviation = (mean * (1 - mean)) ** 0.5 if discrete else float(wanted.stddev)
+    mean = float(wanted.probs[0, 1] if case == "discrete" else wanted.mean)
+    deviation = (mean * (1 - mean)) ** 0.5 if case == "discrete" else float(wanted.stddev)
     assert actions.mean() == pytest.approx(mean, abs=4 * deviation / count**0.5)
     assert actions.std() == pytest.approx(deviation, rel=0.03)
 
@@ -145,18 +141,12 @@ def test_a_saved_model_goes_on_in_stable_baselines3_and_theirs_here(case, tmp_pa
     """Weights and Adam's moments are in the file: the next update is the same."""
     ours, theirs, envs = pair(case)
     collect(ours)
-    theirs.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
-    for saved, reader in ((ours, PPO), (theirs, FastPPO)):
-        saved.set_logger(Logger(None, []))
-        saved.train()
+    rollout = ours.rollout_buffer
+    for saved, reader in ((ours, PPO), (ours, FastPPO), (theirs, FastPPO)):
+        learn_alike(rollout, saved)
         saved.save(tmp_path / "model")
         read = reader.load(tmp_path / "model", env=envs, device="cpu")
-        read.rollout_buffer = copy.deepcopy(ours.rollout_buffer)
-        read.set_logger(Logger(None, []))
-        for model in (saved, read):
-            np.random.seed(3)
-            model.train()
-        torch.testing.assert_close(dict(read.policy.state_dict()), dict(saved.policy.state_dict()), rtol=0, atol=1e-5)
+        torch.testing.assert_close(*learn_alike(rollout, read, saved), rtol=0, atol=1e-5)
 
 
 def test_moments_of_other_networks_are_refused():
@@ -166,36 +156,24 @@ def test_moments_of_other_networks_are_refused():
         ours.policy.optimizer.load_state_dict(other.policy.optimizer.state_dict())
 
 
-class Sampled(gymnasium.Env):
-    """Observations at random from a space; takes none but its own actions."""
-
-    def __init__(self, observation_space, action_space):
-        """Take the spaces."""
-        self.observation_space, self.action_space = observation_space, action_space
-        observation_space.seed(0)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed, options=options)
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action)
-        return self.observation_space.sample(), float(np.sum(action)), False, self.np_random.random() < 0.1, {}
-
-
 def box(*shape, dtype=np.float32):
     return spaces.Box(-1, 1, shape, dtype)
 
 
-def small(observations, actions, model=PPOConfig, **settings):
-    envs = DummyVecEnv([lambda: Sampled(observations, actions)] * 2)
-    if model is PPOConfig:
-        return PPOConfig(rollout_steps=32, batch_size=16, epochs=2, hidden=(8,)).make_model(envs, 0)
-    return model(ActorCriticPolicy, envs, n_steps=16, batch_size=16, device="cpu", **settings)
+PICTURES = spaces.Box(0, 255, (36, 36, 3), np.uint8)
+
+
+def spaced(observations, actions):
+    return DummyVecEnv([lambda: Sampled(observations, actions)] * 2)
+
+
+def small(observations, actions):
+    config = PPOConfig(rollout_steps=32, batch_size=16, epochs=2, hidden=(8,))
+    return config.make_model(spaced(observations, actions), 0)
 
 
 @pytest.mark.parametrize(
-    "spaced",
+    ("observations", "actions"),
     [
         (box(3, dtype=np.float64), box(2, dtype=np.float64)),
         (box(2, 3), box(2, 3)),
@@ -203,25 +181,11 @@ def small(observations, actions, model=PPOConfig, **settings):
     ],
     ids=["float64", "of several dimensions", "discrete"],
 )
-def test_learns_in_spaces_that_stable_baselines3_learns_in(spaced):
-    model = small(*spaced)
+def test_learns_in_spaces_that_stable_baselines3_learns_in(observations, actions):
+    model = small(observations, actions)
     before = copy.deepcopy(model.policy.state_dict())
     model.learn(64)
     assert all((tensor != before[name]).any() for name, tensor in model.policy.state_dict().items())
-
-
-def test_a_file_of_stable_baselines3_s_goes_on_where_it_was():
-    model, file = small(box(3), box(1)), io.BytesIO()
-    model.learn(64)
-    model.save(file)
-    file.seek(0)
-    loaded = FastPPO.load(file, env=model.env, device="cpu")
-    loaded.set_logger(Logger(None, []))
-    loaded.rollout_buffer = copy.deepcopy(model.rollout_buffer)
-    for one in (model, loaded):
-        np.random.seed(3)
-        one.train()
-    torch.testing.assert_close(loaded.policy.state_dict(), model.policy.state_dict(), rtol=0, atol=0)
 
 
 def test_a_copy_that_would_not_learn_says_so():
@@ -237,13 +201,9 @@ def test_a_copy_that_would_not_learn_says_so():
         ("clip_range_vf", box(3), {"clip_range_vf": 0.2}),
         ("hidden layers", box(3), {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [4]}}}),
         ("hidden layers", box(3), {"policy_kwargs": {"activation_fn": torch.nn.ELU}}),
-        (
-            "extractor must not learn",
-            spaces.Box(0, 255, (36, 36, 3), np.uint8),
-            {"policy_kwargs": {"features_extractor_class": NatureCNN}},
-        ),
+        ("extractor must not learn", PICTURES, {"policy_kwargs": {"features_extractor_class": NatureCNN}}),
     ],
 )
 def test_what_it_would_learn_wrongly_is_refused(name, observations, settings):
     with pytest.raises(ValueError, match=name):
-        small(observations, box(1), FastPPO, **settings)
+        FastPPO(ActorCriticPolicy, spaced(observations, box(1)), n_steps=16, batch_size=16, device="cpu", **settings)

@@ -1,9 +1,11 @@
 """What a training step changes, how far it goes, and that a seed repeats it."""
 
+import dataclasses
+
 import pytest
 import torch
 
-from codrl_mj.agents import DDPGConfig, PPOConfig, SACConfig, TD3Config
+from codrl_mj.agents import DDPGConfig, PPOConfig, SACConfig, SARSAConfig, TD3Config
 from tests.agents.small import SMALL, differing, make_model, weights
 
 TINY, LARGE = 1e-30, 1e-2
@@ -16,17 +18,28 @@ ACTOR_CRITIC = {
 
 
 def with_rates(config, actor, critic):
-    return type(config)(**{**vars(config), "learning_rate": actor, "critic_learning_rate": critic})
+    return dataclasses.replace(config, learning_rate=actor, critic_learning_rate=critic)
 
 
-@pytest.mark.parametrize("agent", ACTOR_CRITIC)
+def apart(**settings):
+    """PPO with separate passes, one rollout long."""
+    defaults = {"rollout_steps": 128, "batch_size": None, "hidden": (8,), "critic_learning_rate": 1e-3}
+    return PPOConfig(**defaults | settings)
+
+
+@pytest.mark.parametrize(
+    ("config", "task"),
+    [*((config, "pendulum") for config in (*ACTOR_CRITIC.values(), apart())), (apart(), "cartpole")],
+    ids=lambda value: getattr(value, "name", value),
+)
 @pytest.mark.parametrize(("actor", "critic"), [(TINY, LARGE), (LARGE, TINY)])
-def test_each_learning_rate_moves_its_own_network(agent, actor, critic):
-    model = make_model(with_rates(ACTOR_CRITIC[agent], actor, critic), "pendulum")
-    before = {name: weights(getattr(model, name)) for name in ("actor", "critic")}
+def test_each_learning_rate_moves_its_own_network(config, task, actor, critic):
+    model = make_model(with_rates(config, actor, critic), task)
+    before = {name: tensor for name, tensor in weights(model.policy).items() if "target" not in name}
     model.learn(60)
-    moved = {name for name in before if differing(before[name], weights(getattr(model, name)), by=1e-20)}
-    assert moved == ({"actor"} if actor == LARGE else {"critic"})
+    of_critic = {name for name in before if name.startswith(("critic", "mlp_extractor.value_net", "value_net"))}
+    moved = of_critic if critic == LARGE else set(before) - of_critic
+    assert differing(before, weights(model.policy), by=1e-20) == moved
 
 
 @pytest.mark.parametrize("agent", ACTOR_CRITIC)
@@ -41,44 +54,25 @@ def test_the_critics_learning_rate_is_the_agents_unless_it_has_one(agent):
     assert not differing(train(None), train(LARGE))
 
 
-def apart(**settings):
-    """PPO with separate passes, one rollout long."""
-    return PPOConfig(
-        **{"rollout_steps": 128, "batch_size": None, "hidden": (8,), "critic_learning_rate": 1e-3, **settings}
-    )
-
-
-@pytest.mark.parametrize("task", ["cartpole", "pendulum"])
-@pytest.mark.parametrize(("actor", "critic"), [(TINY, LARGE), (LARGE, TINY)])
-def test_ppo_moves_actor_and_critic_by_their_own_learning_rates(task, actor, critic):
-    model = make_model(apart(learning_rate=actor, critic_learning_rate=critic), task)
-    before = weights(model.policy)
-    model.learn(128)
-    of_critic = {name for name in before if name.startswith(("mlp_extractor.value_net", "value_net"))}
-    of_actor = set(before) - of_critic
-    assert differing(before, weights(model.policy), by=1e-20) == (of_actor if actor == LARGE else of_critic)
-
-
 def steps_taken(model):
     """Adam's own counts: of the first tensor of the actor, and of the critic."""
     optimizer = model.policy.optimizer
     return [int(optimizer.state[group["params"][0]]["step"]) for group in optimizer.param_groups]
 
 
-def test_ppo_takes_its_passes_over_the_whole_rollout_or_in_minibatches():
-    model = make_model(apart(epochs=3, critic_epochs=5, target_kl=None), "cartpole")
-    model.learn(256)  # two rollouts
-    assert steps_taken(model) == [2 * 3, 2 * 5]
-    model = make_model(apart(epochs=3, batch_size=32, target_kl=None), "cartpole")
-    model.learn(128)
-    assert steps_taken(model) == [3 * 4, 3 * 4]
-
-
-def test_too_large_a_move_stops_the_actor_alone():
-    """Before the first step the policy has not moved at all; after one it has moved more than any tiny bound."""
-    model = make_model(apart(learning_rate=LARGE, epochs=7, target_kl=1e-12), "cartpole")
-    model.learn(128)
-    assert steps_taken(model) == [1, 7]
+@pytest.mark.parametrize(
+    ("settings", "steps", "taken"),
+    [
+        ({"epochs": 3, "critic_epochs": 5, "target_kl": None}, 256, [2 * 3, 2 * 5]),  # two rollouts
+        ({"epochs": 3, "batch_size": 32, "target_kl": None}, 128, [3 * 4, 3 * 4]),  # in minibatches
+        # before its first step the policy has not moved at all; after one, by more than any tiny bound
+        ({"epochs": 7, "target_kl": 1e-12, "learning_rate": LARGE}, 128, [1, 7]),
+    ],
+)
+def test_ppo_takes_its_passes_but_after_too_large_a_move_of_the_actor_the_critics_alone(settings, steps, taken):
+    model = make_model(apart(**settings), "cartpole")
+    model.learn(steps)
+    assert steps_taken(model) == taken
 
 
 @pytest.mark.parametrize("target_kl", [0.003, 0.006, 0.012])
@@ -130,12 +124,13 @@ def test_separate_passes_are_the_clipped_loss_and_the_squared_error_stepped_by_t
         torch.testing.assert_close(model.policy.state_dict()[name], tensor, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("agent", SMALL)
-def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not(agent):
-    config, task = SMALL[agent]
+LEARNING = SMALL | {"sarsa": (SARSAConfig(), "mountain_car")}
 
+
+@pytest.mark.parametrize("agent", LEARNING)
+def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not(agent):
     def train(seed):
-        model = make_model(config, task, seed)
+        model = make_model(*LEARNING[agent], seed)
         model.learn(64)
         return weights(model.policy)
 
@@ -144,45 +139,17 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not(agent):
     assert differing(first, other)
 
 
-@pytest.mark.parametrize("agent", ["ddpg", "dqn"])
-def test_training_after_every_episode_takes_a_gradient_step_for_every_step(agent):
+@pytest.mark.parametrize(
+    ("agent", "settings", "steps_of_gradient"),
+    [
+        ("ddpg", {"train_every": None}, lambda steps: steps),  # after every episode as many as it was long
+        ("dqn", {"train_every": None}, lambda steps: steps),
+        ("dqn", {"train_every": 8, "gradient_steps": 3}, lambda steps: steps / 8 * 3),
+    ],
+)
+def test_gradient_steps_and_their_frequency_are_as_asked(agent, settings, steps_of_gradient):
     config, task = SMALL[agent]
-    episodic = type(config)(**{**vars(config), "train_every": None, "learning_starts": 0})
-    model = make_model(episodic, task, max_episode_steps=20)
-    model.learn(100)
-    assert model.num_timesteps >= 100
-    assert model._n_updates == model.num_timesteps
-
-
-def test_gradient_steps_and_their_frequency_are_as_asked():
-    config, task = SMALL["dqn"]
-    model = make_model(
-        type(config)(**{**vars(config), "train_every": 8, "gradient_steps": 3, "learning_starts": 0}), task
-    )
-    model.learn(64)
-    assert model._n_updates == 64 / 8 * 3
-
-
-def memory(tensor):
-    """Where a tensor's numbers are; PPO's parameters are views of one vector."""
-    return tensor.untyped_storage().data_ptr()
-
-
-@pytest.mark.parametrize("agent", SMALL)
-def test_every_optimiser_is_named_for_a_checkpoint(agent):
-    """What Stable-Baselines3 lists as state reaches every parameter that training moves."""
-    config, task = SMALL[agent]
-    model = make_model(config, task)
-    names, variables = model._get_torch_save_params()
-    held = set()
-    for name in names:
-        found = model
-        for part in name.split("."):
-            found = getattr(found, part)
-        if isinstance(found, torch.optim.Optimizer):
-            held |= {memory(parameter) for group in found.param_groups for parameter in group["params"]}
-    held |= {memory(getattr(model, name)) for name in variables}
-    learned = {
-        name: parameter for name, parameter in model.policy.named_parameters() if "target" not in name.split(".")[0]
-    }
-    assert {name for name, parameter in learned.items() if memory(parameter) not in held} == set()
+    model = make_model(dataclasses.replace(config, learning_starts=0, **settings), task, max_episode_steps=20)
+    model.learn(96)
+    assert model.num_timesteps >= 96
+    assert model._n_updates == steps_of_gradient(model.num_timesteps)

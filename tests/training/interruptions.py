@@ -1,9 +1,9 @@
 """Tiny trainings of every agent, ways to end them, and what must be equal in the end."""
 
 import contextlib
+import functools
 import importlib.util
 import math
-import os
 import signal
 import sys
 from pathlib import Path
@@ -15,11 +15,6 @@ from codrl_mj.runs.files import sealed, write_json
 from codrl_mj.training import TrainConfig, TrainingStoppedError, train
 from codrl_mj.training.folder import admit
 from codrl_mj.training.watcher import Watcher
-
-RANDOMIZE = {"motor.inductance": "uniform(0.05, 0.15)", "controller.kp": "choice(0.5, 1)"}
-DISTURBANCES = Disturbances(command_delay=0.03, pulse_interval=0.2, pulse_force=0.5, pulse_duration=0.05)
-NOISY = {"controller": {"current_noise": 0.1, "current_bias": 0.05}}
-"""What a sensor of the current gets wrong."""
 
 
 def _kill_test():
@@ -40,85 +35,51 @@ def begin(run, config):
     write_json(run / "config.json", sealed(admit(run, config, resume=False, accept_changes=False)))
 
 
-def tiny(task, agent, num_envs=1, steps=240, env=None, actuator="paper", **others):
+def tiny(task, agent, num_envs=1, actuator="paper", total_episodes=None, **env):
     """A training of about a second, with three or four checkpoints and evaluations."""
-    budget = {"total_steps": steps} if "total_episodes" not in others else {"total_steps": None}
     often = {"checkpoint_interval": 60, "evaluation_interval": 80, "evaluation_episodes": 2}
-    env = EnvConfig(task, actuator, **{"max_episode_steps": 25} | (env or {}))
-    return TrainConfig(env, agent, seed=3, num_envs=num_envs, **often | budget | others)
+    budget = {"total_steps": None if total_episodes else 240, "total_episodes": total_episodes}
+    env = EnvConfig(task, actuator, max_episode_steps=25, **env)
+    return TrainConfig(env, agent, seed=3, num_envs=num_envs, **often, **budget)
 
 
 _SMALL = {"learning_starts": 40, "batch_size": 16, "buffer_size": 150}  # the buffer fills, and is written over
-_PPO = {"rollout_steps": 32, "batch_size": 16, "epochs": 2, "hidden": (8, 8)}
-_NETS = {"hidden": (8,)}
-_UNITS = {"actor_units": (8,), "joint_units": (8,)}
+PPO = functools.partial(PPOConfig, rollout_steps=32, batch_size=16, epochs=2, hidden=(8, 8))
+DDPG = functools.partial(DDPGConfig, actor_units=(8,), joint_units=(8,), **_SMALL)
+DQN, TD3, SAC = (functools.partial(agent, hidden=(8,), **_SMALL) for agent in (DQNConfig, TD3Config, SACConfig))
+DRAWN = {"randomize": {"motor.inductance": "uniform(0.05, 0.15)", "controller.kp": "choice(0.5, 1)"}}
+DISTURBED = {"disturbances": Disturbances(command_delay=0.03, pulse_interval=0.2, pulse_force=0.5, pulse_duration=0.05)}
+NOISY = {"controller": {"current_noise": 0.1, "current_bias": 0.05}}
+NOISY_PAPER = {"name": "paper", **NOISY}
+"""Actuators with what a sensor of the current gets wrong."""
 
 CASES = {
-    "ppo, one optimiser": tiny(
-        "cartpole",
-        PPOConfig(**_PPO),
-        4,
-        actuator="weaker",
-        env={"options": {"center_radius": 0.1}, "observe_actuator": True},
-    ),
-    "ppo, separate learning rates": tiny(
-        "cartpole", PPOConfig(**_PPO, critic_learning_rate=3e-3), 2, env={"physics": "analytic"}
-    ),
+    "ppo, one optimiser": tiny("cartpole", PPO(), 4, "weaker", options={"center_radius": 0.1}, observe_actuator=True),
+    "ppo, separate learning rates": tiny("cartpole", PPO(critic_learning_rate=3e-3), 2, physics="analytic"),
     "ppo, an episode budget": tiny(
-        "cartpole",
-        PPOConfig(**_PPO),
-        2,
-        total_episodes=9,
-        env={"randomize": RANDOMIZE, "disturbances": DISTURBANCES},
-        actuator={"name": "paper", **NOISY},
+        "cartpole", PPO(critic_learning_rate=3e-3), 2, NOISY_PAPER, total_episodes=9, **DRAWN, **DISTURBED
     ),
-    "ppo, state-dependent noise": tiny("pendulum", PPOConfig(**_PPO, state_dependent_noise=True), 2),
-    "ppo, state-dependent noise, drawn often": tiny(
-        "pendulum", PPOConfig(**_PPO, state_dependent_noise=True, noise_steps=5)
-    ),
-    "ddpg": tiny(
-        "pendulum",
-        DDPGConfig(**_SMALL, **_UNITS, critic_learning_rate=2e-3),
-        env={"disturbances": DISTURBANCES, "observe_actuator": True},
-        actuator={"name": "paper", **NOISY},
-    ),
-    "ddpg, several environments": tiny(
-        "pendulum", DDPGConfig(**_SMALL, **_UNITS, train_every=4, gradient_steps=1), 3, env={"physics": "analytic"}
-    ),
+    "ppo, state-dependent noise": tiny("pendulum", PPO(state_dependent_noise=True), 2),
+    "ppo, state-dependent noise, drawn often": tiny("pendulum", PPO(state_dependent_noise=True, noise_steps=5)),
+    "ddpg": tiny("pendulum", DDPG(critic_learning_rate=2e-3), 1, NOISY_PAPER, observe_actuator=True, **DISTURBED),
+    "ddpg, several environments": tiny("pendulum", DDPG(train_every=4, gradient_steps=1), 3, physics="analytic"),
     "ddpg, trained after episodes": tiny(
-        "pendulum",
-        DDPGConfig(**_SMALL, **_UNITS, train_every=None, gradient_steps=5),
-        total_episodes=8,
-        env={"randomize": RANDOMIZE},
+        "pendulum", DDPG(train_every=None, gradient_steps=5), total_episodes=8, **DRAWN
     ),
-    "dqn, epsilon by episodes": tiny(
-        "cartpole", DQNConfig(**_SMALL, **_NETS, target_every=7), env={"randomize": RANDOMIZE}
-    ),
+    "dqn, epsilon by episodes": tiny("cartpole", DQN(target_every=7), **DRAWN),
     "dqn, epsilon by steps": tiny(
-        "cartpole",
-        DQNConfig(**_SMALL, **_NETS, exploration_decay=None, exploration_fraction=0.8, target_every=10),
-        3,
-        env={"physics": "analytic"},
+        "cartpole", DQN(exploration_decay=None, exploration_fraction=0.8, target_every=10), 3, physics="analytic"
     ),
-    "td3": tiny(
-        "pendulum",
-        TD3Config(**_SMALL, **_NETS),
-        2,
-        env={"disturbances": DISTURBANCES},
-        actuator={"name": "paper", **NOISY},
-    ),
-    "sac, learned entropy coefficient": tiny("pendulum", SACConfig(**_SMALL, **_NETS), env={"randomize": RANDOMIZE}),
+    "td3": tiny("pendulum", TD3(), 2, NOISY_PAPER, **DISTURBED),
+    "sac, learned entropy coefficient": tiny("pendulum", SAC(), **DRAWN),
     "sac, state-dependent noise": tiny(
-        "pendulum", SACConfig(**_SMALL, **_NETS, entropy_coefficient=0.1, state_dependent_noise=True, train_every=6), 2
+        "pendulum", SAC(entropy_coefficient=0.1, state_dependent_noise=True, train_every=6), 2
     ),
     "sarsa": tiny(
-        "mountain_car",
-        SARSAConfig(epsilon=0.2, epsilon_decay=0.9),
-        env={"disturbances": DISTURBANCES},
-        actuator={"name": "weak", **NOISY},
+        "mountain_car", SARSAConfig(epsilon=0.2, epsilon_decay=0.9), 1, {"name": "weak", **NOISY}, **DISTURBED
     ),
     "sarsa, traces": tiny(
-        "mountain_car", SARSAConfig(epsilon=0.1, trace_decay=0.8), total_episodes=9, env={"physics": "analytic"}
+        "mountain_car", SARSAConfig(epsilon=0.1, trace_decay=0.8), total_episodes=9, physics="analytic"
     ),
 }
 """Every agent, alone and with several environments, on both physics, with everything that an environment can have."""
@@ -132,12 +93,7 @@ def crash(*_):
     raise Crash
 
 
-def send(number):
-    """A function that sends a signal to this process."""
-    return lambda: os.kill(os.getpid(), number)
-
-
-TERMINATE, INTERRUPT = send(signal.SIGTERM), send(signal.SIGINT)
+TERMINATE, INTERRUPT = (functools.partial(signal.raise_signal, number) for number in (signal.SIGTERM, signal.SIGINT))
 
 
 @contextlib.contextmanager

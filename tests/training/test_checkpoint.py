@@ -1,5 +1,6 @@
 """Damaged files in a run folder: the run goes back to what is intact, says so, and comes to the same result."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -7,6 +8,7 @@ import pickle
 import random
 import resource
 import shutil
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ from codrl_mj.cli import main
 from codrl_mj.runs.files import writing
 from codrl_mj.training import TrainConfig, history, watcher
 from codrl_mj.training.checkpoint import State, load_checkpoint, save_checkpoint
-from tests.damage import damage
+from tests.damage import Bomb, damage
 from tests.training.interruptions import CASES, TERMINATE, differing, interrupt, outcome, resume
 
 CONFIG = CASES["ppo, one optimiser"]
@@ -55,141 +57,123 @@ def checkpoints(out):
     return sorted((out / "checkpoints").iterdir())
 
 
-class Bomb:
-    """Executes when it is unpickled."""
-
-    def __reduce__(self):
-        return Path.touch, (Path("exploded"),)
+# -- what is damaged ----------------------------------------------------------------------------------------
 
 
-def truncate(path):
+def flip_a_bit(content):
+    return content[:5000] + bytes([content[5000] ^ 1]) + content[5001:]
+
+
+def last(change):
+    """Damage that changes the last checkpoint's content."""
+    return lambda out: checkpoints(out)[-1].write_bytes(change(checkpoints(out)[-1].read_bytes()))
+
+
+def forged(content):
+    """Damage that replaces the last checkpoint by what has the right digest in its name, and nothing else."""
+
+    def replace(out):
+        path = checkpoints(out)[-1]
+        path.unlink()
+        digest = hashlib.sha256(content).hexdigest()[:16]
+        path.with_name(f"{path.name[:18]}{digest}.safetensors").write_bytes(content)
+
+    return replace
+
+
+def replace_by_another_runs(out):
+    """Checkpoints that are intact, of a run with another seed."""
+    interrupt(dataclasses.replace(CONFIG, seed=4), out.parent / "other", 180, TERMINATE)
+    shutil.rmtree(out / "checkpoints")
+    shutil.copytree(out.parent / "other/checkpoints", out / "checkpoints")
+
+
+def cut(path):
     path.write_bytes(path.read_bytes()[:-100])
 
 
-def flip_a_bit(path):
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
+def half_a_row(table):
+    """What was flushed of a row when the process was killed."""
+    return lambda out: (out / table).write_text((out / table).read_text() + "7,1")
 
 
-def replace_by_a_pickle(path):
-    path.write_bytes(pickle.dumps(Bomb()))
-
-
-def forge(content, path):
-    """Replace a checkpoint by what has the right digest in its name, and nothing else."""
-    path.with_name(f"{path.name[:18]}{hashlib.sha256(content).hexdigest()[:16]}.safetensors").write_bytes(content)
-    path.unlink()
-
-
-def replace_by_another_runs(path):
-    """A checkpoint that is intact, of a run with another seed, at the same step."""
-    other = path.parents[2] / "other"
-    interrupt(dataclasses.replace(CONFIG, seed=4), other, 180, TERMINATE)
-    (last,) = (other for other in checkpoints(other) if other.name[:17] == path.name[:17])
-    path.unlink()
-    shutil.copy(last, path.parent)
-
-
-DAMAGES = {
-    "truncated": truncate,
-    "a bit flipped": flip_a_bit,
-    "emptied": lambda path: path.write_bytes(b""),
-    "a pickle": replace_by_a_pickle,
-    "a pickle with the right digest": lambda path: forge(pickle.dumps(Bomb()), path),
-    "tensors with the right digest": lambda path: forge(save({"a": np.zeros(3)}), path),
-    "another run's": replace_by_another_runs,
+BOMB = pickle.dumps(Bomb(Path("exploded")))
+BACK, ANEW = "going back to the one before", "no other is left: starting anew"
+DAMAGES = {  # what is done to the run, and the remedy that is told for each checkpoint that cannot be used
+    "truncated": (lambda out: cut(checkpoints(out)[-1]), [BACK]),
+    "a bit flipped": (last(flip_a_bit), [BACK]),
+    "emptied": (last(lambda _: b""), [BACK]),
+    "a pickle": (last(lambda _: BOMB), [BACK]),
+    "a pickle with the right digest": (forged(BOMB), [BACK]),
+    "tensors with the right digest": (forged(save({"a": np.zeros(3)})), [BACK]),
+    "another program's": (forged(save({"a": np.zeros(3)}, metadata={"format": "pt"})), [BACK]),
+    "another run's": (replace_by_another_runs, [BACK, ANEW]),
+    "all truncated": (lambda out: [*map(cut, checkpoints(out))], [BACK, ANEW]),
+    "none left": (lambda out: shutil.rmtree(out / "checkpoints"), []),
+    "half a report": (half_a_row("progress.csv"), []),
+    "half an episode": (half_a_row("episodes.csv"), []),
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_checkpoint_is_named_and_the_one_before_taken(tmp_path, stopped, expected, monkeypatch, damage):
-    monkeypatch.chdir(tmp_path)
-    DAMAGES[damage](checkpoints(stopped)[-1])
-    last = checkpoints(stopped)[-1]
-    with pytest.warns(UserWarning, match="going back to the one before") as caught:
-        resume(CONFIG, stopped)
-    assert [str(warning.message).startswith(f"checkpoint {last} cannot be used") for warning in caught] == [True]
-    assert differing(expected, outcome(stopped)) == []
-    assert not Path("exploded").exists()
-
-
-def test_where_all_are_damaged_the_run_starts_anew(stopped, expected):
-    for path in checkpoints(stopped):
-        truncate(path)
-    with pytest.warns(UserWarning, match="cannot be used") as caught:
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_run_goes_back_to_what_is_intact_says_so_and_comes_to_the_same(stopped, expected, monkeypatch, name):
+    monkeypatch.chdir(stopped.parent)
+    harm, remedies = DAMAGES[name]
+    harm(stopped)
+    unusable = checkpoints(stopped)[::-1][: len(remedies)] if remedies else []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         resume(CONFIG, stopped)
     messages = [str(warning.message) for warning in caught]
-    assert ["starting anew" in message for message in messages] == [False, True]
+    assert len(messages) == len(remedies)
+    for message, path, remedy in zip(messages, unusable, remedies, strict=True):
+        assert message.startswith(f"checkpoint {path} cannot be used")
+        assert message.endswith(remedy)
     assert differing(expected, outcome(stopped)) == []
-
-
-def test_without_any_the_run_starts_anew(stopped, expected):
-    shutil.rmtree(stopped / "checkpoints")
-    resume(CONFIG, stopped)
-    assert differing(expected, outcome(stopped)) == []
+    assert not Path("exploded").exists()
 
 
 # -- which checkpoints are kept -----------------------------------------------------------------------------
 
 
-def state_at(step):
-    return State({"array": np.full(4, float(step))}, {"num_timesteps": step})
+def state_at(step, number=0):
+    return State({"array": np.full(4, float(step))}, {"num_timesteps": step, "number": number})
 
 
-def steps_kept(folder):
-    return [int(path.name[5:17]) for path in sorted(folder.iterdir())]
-
-
-def test_the_last_two_are_kept_and_the_last_is_loaded(tmp_path):
+@pytest.mark.parametrize(
+    ("steps", "damaged", "kept"),
+    [
+        ((10, 20, 30), None, [20, 30]),
+        ((10, 20, 20, 20), None, [10, 20]),  # beside the one before, the last of its step
+        ((10, 20, 15), 20, [10, 15]),  # of a run that fell back to 10
+    ],
+)
+def test_the_last_two_are_kept_and_the_last_written_is_loaded(tmp_path, steps, damaged, kept):
     assert load_checkpoint(tmp_path / "nowhere", "a run") is None
-    for step in (10, 20, 30):
-        save_checkpoint(tmp_path, state_at(step), "a run")
-    assert steps_kept(tmp_path) == [20, 30]
+    for number, step in enumerate(steps):
+        path = save_checkpoint(tmp_path, state_at(step, number), "a run")
+        if step == damaged:
+            cut(path)
+    assert [int(path.name[5:17]) for path in sorted(tmp_path.iterdir())] == kept
     loaded = load_checkpoint(tmp_path, "a run")
-    assert loaded.facts == {"num_timesteps": 30}
-    assert loaded.arrays["array"].tolist() == [30.0] * 4
-
-
-def test_a_damaged_one_of_a_later_step_is_not_kept_in_place_of_an_intact_one(tmp_path):
-    for step in (10, 20):
-        save_checkpoint(tmp_path, state_at(step), "a run")
-    truncate(sorted(tmp_path.iterdir())[-1])
-    save_checkpoint(tmp_path, state_at(15), "a run")  # of the run that fell back to 10
-    assert steps_kept(tmp_path) == [10, 15]
+    assert loaded.facts == {"num_timesteps": steps[-1], "number": len(steps) - 1}
+    assert loaded.arrays["array"].tolist() == [steps[-1]] * 4
 
 
 def test_however_a_few_bytes_are_damaged_the_one_before_is_loaded_whole(tmp_path):
     random_ = random.Random(0)
     for step in (10, 20):
-        last = save_checkpoint(tmp_path, state_at(step), "a run")
-    whole = last.read_bytes()
+        path = save_checkpoint(tmp_path, state_at(step), "a run")
+    whole = path.read_bytes()
     for _ in range(150):
-        last.write_bytes(damage(whole, random_))
-        with pytest.warns(UserWarning, match=f"{last} cannot be used"):
+        path.write_bytes(damage(whole, random_))
+        with pytest.warns(UserWarning, match=f"{path} cannot be used"):
             loaded = load_checkpoint(tmp_path, "a run")
-        assert loaded.facts == {"num_timesteps": 10}
+        assert loaded.facts == {"num_timesteps": 10, "number": 0}
         assert loaded.arrays["array"].tolist() == [10.0] * 4
 
 
-def test_of_one_step_the_last_written_is_kept_beside_the_one_before(tmp_path):
-    save_checkpoint(tmp_path, state_at(10), "a run")
-    for seconds in (1.0, 2.0, 3.0):
-        state = State({}, {"num_timesteps": 20, "seconds": seconds})
-        save_checkpoint(tmp_path, state, "a run")
-    assert steps_kept(tmp_path) == [10, 20]
-    assert load_checkpoint(tmp_path, "a run").facts["seconds"] == 3.0
-
-
-# -- other files --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("table", ["progress.csv", "episodes.csv"])
-def test_a_half_written_row_is_repaired(stopped, expected, table):
-    with (stopped / table).open("a") as file:
-        file.write("7,1")  # what was flushed of a row when the process was killed
-    resume(CONFIG, stopped)
-    assert differing(expected, outcome(stopped)) == []
+# -- what a killed process leaves --------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -233,47 +217,42 @@ def test_a_folder_in_which_nothing_was_begun_yet_is_started(tmp_path, expected, 
 # -- a full disk --------------------------------------------------------------------------------------------
 
 
+@contextlib.contextmanager
 def no_file_larger_than(size):
-    """Every write beyond that fails, as it does on a full disk, for the rest of the block."""
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
-
-
-@pytest.fixture
-def limits():
+    """Every write beyond that fails within the block, as it does on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.parametrize("size", [8000, 1200, 120], ids=["checkpoint", "policy", "table"])
-def test_where_nothing_can_be_written_the_error_is_one_line_and_the_run_goes_on_later(
-    stopped, expected, capsys, limits, size
-):
+def test_where_nothing_can_be_written_the_error_is_one_line_and_the_run_goes_on_later(stopped, expected, capsys, size):
+    line = ["train", "--resume", str(stopped), "--no-tensorboard"]
     before = {path.name: path.read_bytes() for path in checkpoints(stopped)}
-    no_file_larger_than(size)
-    status = main(["train", "--resume", str(stopped), "--no-tensorboard"])
-    no_file_larger_than(resource.RLIM_INFINITY)
+    with no_file_larger_than(size):
+        assert main(line) == 2
     error = capsys.readouterr().err
-    assert (status, error.count("\n")) == (2, 1)
+    assert error.count("\n") == 1
     assert error.startswith(f"codrl-mj: error: training in {stopped} was broken off: ")
     assert "File too large" in error
     assert error.endswith(f"continue with codrl-mj train --resume {stopped}\n")
     assert {path.name: path.read_bytes() for path in checkpoints(stopped)} == before
     assert [path for path in stopped.rglob(".*") if path.name != ".lock"] == []
-    assert main(["train", "--resume", str(stopped), "--no-tensorboard"]) == 0
+    assert main(line) == 0
     assert differing(expected, outcome(stopped)) == []
 
 
 @pytest.mark.parametrize("best", [False, True])
-def test_where_nothing_can_be_written_before_a_checkpoint_it_says_what_there_is(tmp_path, capsys, limits, best):
+def test_where_nothing_can_be_written_before_a_checkpoint_it_says_what_there_is(tmp_path, capsys, best):
     """No policy fits into so much; or the best policy does, and no checkpoint."""
-    out = tmp_path / "run"
-    rarely = dataclasses.replace(CONFIG, checkpoint_interval=10**6)
-    yaml = tmp_path / "train.yaml"
-    yaml.write_text(json.dumps((rarely if best else CONFIG).as_mapping()))
-    no_file_larger_than(8000 if best else 1200)
-    assert main(["train", "--config", str(yaml), "--out", str(out), "--no-tensorboard"]) == 2
-    no_file_larger_than(resource.RLIM_INFINITY)
+    out, yaml = tmp_path / "run", tmp_path / "train.yaml"
+    config = dataclasses.replace(CONFIG, checkpoint_interval=10**6) if best else CONFIG
+    yaml.write_text(json.dumps(config.as_mapping()))
+    with no_file_larger_than(8000 if best else 1200):
+        assert main(["train", "--config", str(yaml), "--out", str(out), "--no-tensorboard"]) == 2
     error = capsys.readouterr().err
     assert "no checkpoint" in error
     assert ("its best policy so far" in error) == best == out.exists()

@@ -8,8 +8,7 @@ import pytest
 from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import read_run
-from codrl_mj.training import TrainConfig, TrainingStoppedError, finished, history, watcher
-from codrl_mj.training.checkpoint import State, load_checkpoint, save_checkpoint
+from codrl_mj.training import RunInUseError, TrainConfig, TrainingStoppedError, finished, history, watcher
 from tests.matrix import but
 from tests.training.interruptions import (
     CASES,
@@ -69,16 +68,16 @@ FINAL = ("policy.safetensors", "policy.json", "evaluation.json", "learning_curve
 """What a training writes when it has learned, in this order."""
 
 
-@pytest.mark.parametrize("written", range(1, len(FINAL) + 1))
-def test_between_the_final_files_a_run_is_not_finished_for_anybody(tmp_path, uninterrupted, monkeypatch, written):
+@pytest.mark.parametrize("last", FINAL)
+def test_between_the_final_files_a_run_is_not_finished_for_anybody(tmp_path, uninterrupted, monkeypatch, last):
     name, out = "ppo, one optimiser", tmp_path / "run"
-    replace, final = Path.replace, []
+    replace, written = Path.replace, []
 
     def crash_behind(path, target):
         replace(path, target)
         if target.parent == out and kill_test.saved_steps(out) >= CASES[name].total_steps:
-            final.append(target.name)
-            if len(final) == written:
+            written.append(target.name)
+            if target.name == last:
                 raise Crash
 
     with monkeypatch.context() as patch:
@@ -86,23 +85,11 @@ def test_between_the_final_files_a_run_is_not_finished_for_anybody(tmp_path, uni
         patch.setattr(history, "save_learning_curve", lambda path, *_: write_json(path, "no picture"))
         with pytest.raises(Crash):
             resume(CASES[name], out)
-    done = written == len(FINAL)
-    assert tuple(final) == FINAL[:written]
+    assert tuple(written) == FINAL[: len(written)]
+    done = last == FINAL[-1]
     assert (read_run(out).state, finished(out)) == ("finished" if done else "unfinished", done)
     resume(CASES[name], out)
     assert (read_run(out).state, finished(out)) == ("finished", True)
-    assert differing(uninterrupted(name), outcome(out)) == []
-
-
-@pytest.mark.parametrize("name", but(["ppo, one optimiser"], RESUMED))
-def test_a_crash_right_after_any_checkpoint_changes_nothing(tmp_path, uninterrupted, name):
-    out = tmp_path / "run"
-    for _ in range(3):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(watcher, "save_checkpoint", lambda *arguments: crash(save_checkpoint(*arguments)))
-            with pytest.raises(Crash):
-                resume(CASES[name], out)
-    resume(CASES[name], out)
     assert differing(uninterrupted(name), outcome(out)) == []
 
 
@@ -126,28 +113,18 @@ def test_a_signal_in_the_last_but_one_step_stops_and_one_in_the_last_comes_too_l
     assert differing(uninterrupted(name), outcome(out)) == []
 
 
+def test_while_one_trains_in_a_folder_another_is_refused(tmp_path, uninterrupted):
+    name, out = "ppo, one optimiser", tmp_path / "run"
+
+    def train_too():
+        with pytest.raises(RunInUseError, match="another process is training in it"):
+            resume(CASES[name], out)
+
+    with after(70, train_too):
+        resume(CASES[name], out)
+    assert differing(uninterrupted(name), outcome(out)) == []
+
+
 def test_the_second_ctrl_c_stops_at_once(tmp_path):
     with pytest.raises(KeyboardInterrupt), after(70, lambda: (INTERRUPT(), INTERRUPT())):
         resume(CASES["ppo, one optimiser"], tmp_path / "run")
-
-
-@pytest.mark.parametrize("entry", ["marks", "squares", "samples", "best", "watch.episodes", "watch.reports"])
-def test_what_the_watcher_remembers_matters(tmp_path, uninterrupted, monkeypatch, entry):
-    """As tests/training/test_state.py shows of what the model remembers."""
-    name, out = "ppo, one optimiser", tmp_path / "run"
-    expected = uninterrupted(name)
-    interrupt(CASES[name], out, 180, TERMINATE)
-
-    def load_another(*arguments):
-        arrays, facts = load_checkpoint(*arguments)
-        if entry in arrays:
-            arrays[entry] = arrays[entry][1:]
-        else:
-            value = facts["watch"][entry]
-            another = {"marks": dict.fromkeys(facts["watch"]["marks"], 0), "best": {"return": 1e9, "steps": 1}}
-            facts["watch"][entry] = another.get(entry, value * 2 + 1 if isinstance(value, int | float) else None)
-        return State(arrays, facts)
-
-    monkeypatch.setattr(watcher, "load_checkpoint", load_another)
-    resume(CASES[name], out)
-    assert differing(expected, outcome(out)) != []
