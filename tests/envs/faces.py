@@ -1,5 +1,6 @@
 """Every face of an environment, set up and driven alike; run as a program, it goes on from what another one left."""
 
+import math
 import sys
 from pathlib import Path
 
@@ -22,12 +23,15 @@ MOTOR = changed(FULL, inductance=0.2, substeps=3)
 LIMIT = {task: {"current": TASKS[task].max_force * 0.5 / 0.8, "voltage": 4.0} for task in TASKS}
 """Largest command by task and kind, for `MOTOR`: arm 0.5, kT 0.8 N m/A, 4 V."""
 DRIVE = {
-    "controller.kp": LogUniform(0.3, 15.0),  # some draws are unstable, and rejected
+    "controller.kp": LogUniform(0.3, 15.0),  # straddles instability on every task; such draws are rejected
     "motor.inductance": Uniform(0.05, 0.2),
+    "motor.torque_constant": Uniform(0.5, 1.5),
     "motor.arm_radius": Uniform(0.2, 1.2),
+    "controller.max_voltage": Choice([3.0, 12.0, math.inf]),
     "controller.substeps": Choice([1, 2, 3]),
     "controller.bemf_compensation": Choice([True, False]),
 }
+"""Of the motor, drawn."""
 
 
 # -- set-ups ------------------------------------------------------------------------------------------------
@@ -42,10 +46,14 @@ def commanded(task, command):
     return arguments
 
 
+def scales(task):
+    """Every scale factor of a task's model, drawn."""
+    return {name: Uniform(0.6, 1.7) for name in variable(bare_model(task)) if "damping" not in name}
+
+
 def everything(task, physics):
     """Arguments with every disturbance, and every field drawn, that the physics has."""
-    model = {} if physics == "analytic" else dict.fromkeys(variable(bare_model(task)), Uniform(0.6, 1.7))
-    model = {name: drawn for name, drawn in model.items() if "damping" not in name}  # the joint has it
+    model = {} if physics == "analytic" else scales(task)
     return {
         "actuator": imperfect(named_actuator("paper", task).as_mapping()),
         "randomize": DRIVE | model,
