@@ -5,12 +5,15 @@ import pickle
 import subprocess
 import sys
 
+import gymnasium
 import numpy as np
 import pytest
 from safetensors.numpy import load, load_file, save, save_file
 
+from codrl_mj import suite
 from codrl_mj.envs import ActuatedEnv
-from tests.envs.faces import FACES, PHYSICS, SETUPS, arguments, arrays, begun, made, plain, run
+from codrl_mj.tasks import TASKS
+from tests.envs.faces import FACES, LIMITED, PHYSICS, SETUPS, arguments, arrays, begun, made, plain, run
 from tests.envs.vectors import assert_same
 from tests.tasks.faces import every_rebuilt
 
@@ -71,6 +74,24 @@ def test_both_physics_tell_the_same_story(task, setup):
     pair = [ActuatedEnv(task, physics=physics, **given) for physics in PHYSICS]
     for one, other in zip(*(arrays(plain((begun(env, 7), run(env, 15, seed=0)))) for env in pair), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-8)
+
+
+@every_rebuilt
+@every_setup
+def test_dm_control_has_the_episodes_of_a_single_environment(task, setup):
+    given = arguments(task, setup) | LIMITED
+    theirs = suite.load(task, task_kwargs={"random": 4}, **given)
+    ours = gymnasium.make(TASKS[task].env_id, disable_env_checker=True, **given)
+    for seed in (4, None):
+        step, (seen, info) = theirs.reset(), ours.reset(seed=seed)
+        np.testing.assert_array_equal(np.concatenate([*step.observation.values()]), seen)
+        assert theirs.randomization == info.get("randomization", {})
+        while not step.last():
+            action = ours.action_space.sample()
+            step, (seen, reward, terminated, truncated, info) = theirs.step(action), ours.step(action)
+            np.testing.assert_array_equal(np.concatenate([*step.observation.values()]), seen)
+            assert (step.reward, step.last(), theirs.info) == (reward, terminated or truncated, info)
+            np.testing.assert_array_equal(theirs.state, ours.unwrapped.state)
 
 
 @pytest.mark.matrix
