@@ -171,11 +171,6 @@ def test_seeds_in_every_form(seed):
         np.testing.assert_array_equal(ours.reset(seed=seed)[0], theirs.reset(seed=5)[0])
 
 
-def test_unseeded_environments_differ():
-    observations, _ = batched("cartpole", 8).reset()
-    assert len(np.unique(observations[:, 0])) == 8
-
-
 # -- the contract -------------------------------------------------------------------------------------------
 
 

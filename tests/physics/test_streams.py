@@ -1,8 +1,5 @@
 """Streams draw, seed and save as NumPy's generators do one by one."""
 
-import copy
-import pickle
-
 import numpy as np
 import pytest
 from gymnasium.utils import seeding
@@ -88,15 +85,3 @@ def test_the_state_is_numpys_and_restores_every_draw_spare_half_included():
     again = [generator.integers(1000, size=3, dtype=np.int32) for generator in other.generators]
     np.testing.assert_array_equal(again, halves)
     np.testing.assert_array_equal(other.random(np.arange(SIZE), 4), drawn)
-
-
-@pytest.mark.parametrize(
-    "duplicate", [copy.deepcopy, lambda streams: pickle.loads(pickle.dumps(streams))], ids=["copy", "pickle"]
-)
-def test_a_copy_draws_the_same_and_neither_moves_the_other(duplicate):
-    streams, generators = _seeded()
-    twin = duplicate(streams)
-    rows = np.arange(SIZE)
-    expected = _one_by_one(generators, rows, 3)
-    np.testing.assert_array_equal(twin.random(rows, 3), expected)
-    np.testing.assert_array_equal(streams.random(rows, 3), expected)
