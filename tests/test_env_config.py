@@ -189,30 +189,22 @@ def test_fields_are_set_over_another_ones(given, expected):
 
 
 def test_numpys_numbers_are_numbers():
-    given = EnvConfig(
-        "cartpole",
-        Actuator(Motor(np.float32(0.5))),
-        inner_steps=np.int64(4),
-        action="voltage",
-        levels=np.array([-1.5, 0.0, 1.5], dtype=np.float32),
-        observe_actuator=np.True_,
-        max_episode_steps=np.int32(7),
-        disturbances={"command_delay": np.float32(0.5)},
-        joint={"damping": np.float64(0.25)},
-        options={"center_radius": np.float32(0.5), "sutton_barto_reward": np.True_},
-    )
-    plain = EnvConfig(
-        "cartpole",
-        Actuator(Motor(0.5)),
-        inner_steps=4,
-        action="voltage",
-        levels=(-1.5, 0.0, 1.5),
-        observe_actuator=True,
-        max_episode_steps=7,
-        disturbances={"command_delay": 0.5},
-        joint={"damping": 0.25},
-        options={"center_radius": 0.5, "sutton_barto_reward": True},
-    )
+    def config(number, count, flag, levels):
+        return EnvConfig(
+            "cartpole",
+            Actuator(Motor(number(0.5))),
+            inner_steps=count(4),
+            action="voltage",
+            levels=levels,
+            observe_actuator=flag(1),
+            max_episode_steps=count(7),
+            disturbances={"command_delay": number(0.5)},
+            joint={"damping": number(0.25)},
+            options={"center_radius": number(0.5), "sutton_barto_reward": flag(1)},
+        )
+
+    given = config(np.float32, np.int64, np.bool_, np.array([-1.5, 0.0, 1.5], dtype=np.float32))
+    plain = config(float, int, bool, (-1.5, 0.0, 1.5))
     assert (given, hash(given)) == (plain, hash(plain))
     assert json.dumps(given.as_mapping()) == json.dumps(plain.as_mapping())
     assert json.dumps(EnvConfig("cartpole", timestep=np.float64(0.01)).as_mapping())
@@ -250,14 +242,11 @@ def test_what_is_no_configuration_is_named(mapping, message):
 def test_the_command_line_draws(tmp_path):
     def currents(*flags):
         line = ["render", "pendulum", "--width", "160", "--height", "120", "--env.max-episode-steps", "3"]
-        files = [
-            "--out",
-            str(tmp_path / f"frames{len([*tmp_path.iterdir()])}"),
-            "--trajectory",
-            str(tmp_path / "episode.npz"),
-        ]
+        folder = tmp_path / str(len([*tmp_path.iterdir()]))
+        folder.mkdir()
+        files = ["--out", str(folder / "frames"), "--trajectory", str(folder / "episode.npz")]
         assert main([*line, *files, *flags]) == 0
-        with np.load(tmp_path / "episode.npz") as episode:
+        with np.load(folder / "episode.npz") as episode:
             return episode["trace/current"]
 
     drawn = ["--env.randomize", "motor.inductance=uniform(0.3, 0.6)", "controller.kp=loguniform(0.1,10)"]

@@ -144,9 +144,10 @@ def run(env, count, seed, vandal=False):
         given = np.array(action)
         seen = begun(env) if over or index % 40 == 39 else env.step(action)
         np.testing.assert_array_equal(action, given)
-        over = isinstance(env, ActuatedEnv) and len(seen) == 5 and seen[2]
+        stepped = isinstance(env, ActuatedEnv) and len(seen) == 5
+        over = stepped and seen[2]
         states = env.get_attr("state") if several else env.state
-        found.append(plain((seen, states, env.randomization)))
+        found.append(plain((seen, states, env.randomization, env.trace if stepped else None)))
         for array in arrays((seen, states, action)) if vandal else []:
             array[...] = 1
     return tuple(found)

@@ -14,7 +14,7 @@ from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed
 from tests.reference import MotorSimulation
-from tests.tasks.faces import desired_force, every_rebuilt
+from tests.tasks.faces import REBUILT, desired_force, every_rebuilt
 
 SPEED = {"pendulum": 1, "cartpole": 1, "acrobot": 3, "mountain_car": 1, "mountain_car_continuous": 1}
 STEPS = {"pendulum": 60, "cartpole": 40, "acrobot": 15, "mountain_car": 30, "mountain_car_continuous": 30}
@@ -40,9 +40,9 @@ OFF = {  # feature -> the change that takes it away, and what else both sides of
 
 
 @functools.cache
-def _episode(task, physics, actuator):
+def _episode(task, physics, integrator, actuator):
     """States and forces of an episode under random actions, as the environment and as the oracle have them."""
-    env, driver = ActuatedEnv(task, actuator=actuator, physics=physics), TASKS[task].twin()
+    env, driver = ActuatedEnv(task, actuator, physics, integrator=integrator), TASKS[task].twin()
     env.reset(seed=0)
     env.action_space.seed(0)
     motor, state = MotorSimulation(actuator), env.state
@@ -54,21 +54,21 @@ def _episode(task, physics, actuator):
         desired = desired_force(task, action)
         for _ in range(env.task.motor_inner_steps):
             delivered = motor.step(dt, desired, state[SPEED[task]])
-            state = np.array(driver(state, delivered, dt, env.setup.plant.integrator))
+            state = np.array(driver(state, delivered, dt, integrator))
         found.append([*env.state, info["actual_force"], info["current"], info["voltage"]])
         expected.append([*state, delivered, motor.current, motor.voltage])
     return np.array(found), np.array(expected)
 
 
-@every_rebuilt
+@pytest.mark.parametrize(("task", "integrator"), [(task, name) for task in REBUILT for name in TASKS[task].integrators])
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("feature", OFF)
-def test_a_feature_matters_and_is_what_it_should_be_with_and_without(task, physics, feature):
+def test_a_feature_matters_and_is_what_it_should_be_with_and_without(task, integrator, physics, feature):
     without, both = OFF[feature]
     with_it = changed(FULL, **{"inductance": 0.2, "max_voltage": SUPPLY[task], **both})
     runs = []
     for actuator in (with_it, changed(with_it, **without)):
-        found, expected = _episode(task, physics, actuator)
+        found, expected = _episode(task, physics, integrator, actuator)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
         runs.append(found)
     size = len(TASKS[task].state_names)
@@ -81,6 +81,6 @@ def test_a_feature_matters_and_is_what_it_should_be_with_and_without(task, physi
 def test_the_pairs_saturate_at_times(task):
     """Guards the pair of the supply, and that of the compensation, which saturation alone leaves incomplete."""
     actuator = changed(FULL, inductance=0.2, max_voltage=SUPPLY[task])
-    voltages = np.abs(_episode(task, "mujoco", actuator)[0][:, -1])
+    voltages = np.abs(_episode(task, "mujoco", TASKS[task].integrators[0], actuator)[0][:, -1])
     assert (voltages == SUPPLY[task]).any()
     assert (voltages < SUPPLY[task]).any()

@@ -1,16 +1,15 @@
-"""CartPole on both physics against the installed Gymnasium, with and without a motor."""
+"""CartPole on both physics, and its asset, against the installed Gymnasium."""
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import IDEAL, NAMED
+from codrl_mj.actuators import IDEAL
 from codrl_mj.engine import motors
 from codrl_mj.own_code import asset_path
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant, trace_names
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant
 from codrl_mj.tasks import TASKS, named_actuator
-from tests.reference import MotorSimulation
 
 TASK = TASKS["cartpole"]
 every_physics = pytest.mark.parametrize("physics", [MujocoPhysics, AnalyticPhysics])
@@ -45,33 +44,6 @@ def test_steps_are_gymnasiums_of_a_fraction_of_the_time(physics, integrator, inn
             for _ in range(inner_steps):
                 state = step(state, force)
         np.testing.assert_allclose(simulation.state, state, rtol=0, atol=1e-11)
-
-
-@every_physics
-@every_integrator
-@pytest.mark.parametrize("inner_steps", [1, 4])
-@pytest.mark.parametrize("name", [name for name in NAMED if name != "ideal"])
-def test_the_motor_in_the_loop_is_the_reference_driving_gymnasium(physics, integrator, inner_steps, name):
-    """The whole chain by hand: the reference motor turns desired into delivered force, Gymnasium moves."""
-    actuator = named_actuator(name, "cartpole")
-    simulation, motor = physics(Plant(TASK, [actuator], inner_steps, integrator)), MotorSimulation(actuator)
-    step, names = _gymnasiums_step(integrator, 0.02 / inner_steps), trace_names(simulation.plant.family)
-    state = np.array([0.01, -0.02, 0.03, 0.04])
-    simulation.reset(state)
-    for count in range(100):
-        desired = 10.0 if state[2] + 0.5 * state[3] > 0 else -10.0
-        simulation.step(desired)
-        for _ in range(inner_steps):
-            delivered = motor.step(0.02 / inner_steps, desired, state[1])
-            state = step(state, delivered)
-        np.testing.assert_allclose(simulation.state, state, rtol=0, atol=1e-10, err_msg=f"step {count}")
-        signals = dict(zip(names, simulation.trace[-1, 0].tolist(), strict=True))
-        assert signals["desired_force"] == desired
-        assert signals["actual_force"] == pytest.approx(delivered, abs=1e-9)
-        assert signals["current"] == pytest.approx(motor.current, abs=1e-9)
-        assert signals["voltage"] == pytest.approx(motor.voltage, abs=1e-9)
-        assert signals["reference_current"] == pytest.approx(desired * 0.15, rel=1e-14)
-        assert signals["saturated"] == (abs(motor.voltage) >= 24.0)
 
 
 def test_the_asset_has_gymnasiums_inertias_and_the_papers_actuator():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Inputs, Motor, Supply, parameters_type
-from codrl_mj.disturbances import Disturbances
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant, trace_names
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.tasks.faces import every_rebuilt
@@ -14,10 +13,10 @@ DESIRED, ACTUAL, CURRENT, REFERENCE, VOLTAGE, SATURATED, SPEED = range(7)
 STEPS = 20
 
 
-def _physics(kind, task, actuator="paper", **more):
+def _physics(kind, task, actuator="paper"):
     definition = TASKS[task]
     inner_steps = max(3, definition.motor_inner_steps)
-    physics = kind(Plant(definition, [named_actuator(actuator, task)], inner_steps, **more))
+    physics = kind(Plant(definition, [named_actuator(actuator, task)], inner_steps))
     physics.reset(np.full(len(definition.state_names), 0.05))
     return physics
 
@@ -66,22 +65,6 @@ def test_the_last_row_is_what_the_engine_says_of_the_steps_end(task, actuator):
             np.testing.assert_array_equal(last[CURRENT : SATURATED + 1], 0.0)
         else:
             np.testing.assert_array_equal(last[CURRENT : SATURATED + 1], physics.data.act[-5:-1])
-
-
-@every_rebuilt
-def test_both_physics_leave_the_same_trace(task):
-    disturbances = Disturbances(command_delay=physics_step(task) * 1.5, command_rate=20.0)
-    pair = [_physics(kind, task, disturbances=disturbances) for kind in (MujocoPhysics, AnalyticPhysics)]
-    (forces, ours), (_, theirs) = (_traces(physics) for physics in pair)
-    np.testing.assert_allclose(ours[:8], theirs[:8], rtol=0, atol=1e-9)
-    delayed = ours[:, :, DESIRED]
-    assert not (delayed == forces[:, np.newaxis]).all(), "the command arrives as it was given"
-
-
-def physics_step(task):
-    """The integration step [s] of the physics above."""
-    definition = TASKS[task]
-    return definition.step_duration / max(3, definition.motor_inner_steps)
 
 
 @pytest.mark.parametrize("kind", [MujocoPhysics, AnalyticPhysics])
