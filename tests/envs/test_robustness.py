@@ -15,7 +15,6 @@ from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
 from codrl_mj.physics import PHYSICS, SimulationDivergedError
 from codrl_mj.tasks import TASKS
 from tests.actuators.strategies import between, zero_or
-from tests.engine.models import changed
 from tests.envs.vectors import MODES, assert_same, batched, random_actions
 from tests.matrix import but
 from tests.tasks.faces import REBUILT
@@ -102,56 +101,26 @@ def test_a_lost_state_is_reported_at_the_next_step_and_a_reset_helps(task, physi
     assert np.isfinite(env.step(action)[0]).all()
 
 
-@pytest.mark.parametrize("task", [task for task in REBUILT if task != "cartpole"])  # whose episode would end first
+@every_task
 @pytest.mark.parametrize("mode", MODES)
-def test_a_diverging_environment_is_named_and_the_others_go_on_once_it_is_reset(task, mode):
-    arguments = {"inner_steps": 10 if task == "acrobot" else 1}
-    gentle = Actuator(Motor(inductance=2.0), CurrentLoop(kp=0.5))  # stable at a step of 1 s
-    wild = changed(WILD, kp=15.0 if task == "acrobot" else 100.0)  # lost after a step or two
-    actuators = [gentle, gentle, wild, gentle]
-    env = batched(task, 4, mode, actuator=actuators, allow_unstable=True, max_episode_steps=400, **arguments)
-    others = np.array([True, True, False, True])
-    env.reset(seed=0)
-    space = env.single_action_space
-    actions = np.full(4, space.n - 1) if hasattr(space, "n") else np.repeat(space.high[None], 4, axis=0)
-
-    def run():
-        for _ in range(400):
-            *_, terminated, truncated, _ = env.step(actions)
-            if mode == "Disabled" and (terminated | truncated).any():
-                env.reset(options={"reset_mask": terminated | truncated})
-
-    with pytest.raises(SimulationDivergedError, match=rf"^{task}: 1 of 4 simulations diverged; environment 2 at t = "):
-        run()
-    state = env.unwrapped.state
-    assert np.isfinite(state[others]).all()
-    with pytest.raises(SimulationDivergedError, match="environment 2"):
-        env.step(actions)  # until it is reset
-    state = env.unwrapped.state
-    env.reset(seed=[None, None, 7, None], options={"reset_mask": ~others})
-    np.testing.assert_array_equal(env.unwrapped.state[others], state[others])
-    observations, *_ = env.step(actions)
-    assert np.isfinite(observations).all()
-    # the rest of its episode is that of an environment of its own
-    fresh = batched(task, 1, mode, actuator=[wild], allow_unstable=True, **arguments)
-    fresh.reset(seed=7)
-    np.testing.assert_array_equal(fresh.step(actions[:1])[0][0], observations[2])
-
-
-@pytest.mark.parametrize("task", but(["pendulum", "cartpole"], TASKS))
-def test_time_goes_on_for_the_others_when_one_diverges(task):
-    env = ActuatedVectorEnv(2, task, max_episode_steps=5)
-    env.reset(seed=0)
+def test_a_lost_environment_is_named_and_the_others_go_on_once_it_is_reset(task, mode):
+    env, control = (batched(task, 3, mode, max_episode_steps=6).unwrapped for _ in range(2))
     actions = random_actions(env, np.random.default_rng(0))
-    env.step(actions)
-    saved = env.snapshot()
-    saved["physics"][1, :] = np.nan
-    env.restore(saved)
-    with pytest.raises(SimulationDivergedError, match="environment 1"):
-        env.step(actions)
-    env.reset(options={"reset_mask": np.array([False, True])})
-    truncations = [env.step(actions)[3].tolist() for _ in range(3)]
-    assert truncations == [[False, False], [False, False], [True, False]]
+    for one in (env, control):
+        one.reset(seed=0)
+        one.step(actions)
+    lost = env.snapshot()
+    lost["physics"][1] = np.nan
+    env.restore(lost)
+    for _ in range(2):  # until it is reset
+        with pytest.raises(SimulationDivergedError, match=rf"^{task}: 1 of 3 simulations diverged; environment 1 at t"):
+            env.step(actions)
+        control.step(actions)
+    for one in (env, control):
+        one.reset(seed=[None, 7, None], options={"reset_mask": np.array([False, True, False])})
+    np.testing.assert_array_equal(env.state, control.state)
+    for _ in range(3):  # to the time limit of the others
+        assert_same(env.step(actions), control.step(actions))
 
 
 def test_a_foreign_callback_is_refused_at_the_start_and_at_a_reset(bare_engine):

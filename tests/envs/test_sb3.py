@@ -139,12 +139,14 @@ def test_options_reach_the_next_reset_and_its_infos_say_what_was_drawn(physics):
 def test_attributes_and_methods():
     env = batched("pendulum", 3)
     env.reset()
+    assert env.signals is None
     assert env.get_attr("max_episode_steps") == [200] * 3
     assert env.get_attr("task", indices=[1]) == [TASKS["pendulum"]]
     assert env.get_attr("task", indices=2) == [TASKS["pendulum"]]
     env.set_attr("max_episode_steps", 2)
     actions = np.zeros((3, 1), np.float32)
     assert [env.step(actions)[2].tolist() for _ in range(2)] == [[False] * 3, [True] * 3]
+    assert {name: values.shape for name, values in env.signals.items()}["current"] == (3,)
     with pytest.raises(ValueError, match="the environments share it"):
         env.set_attr("max_episode_steps", 9, indices=[0])
     with pytest.raises(AttributeError):
@@ -156,14 +158,6 @@ def test_attributes_and_methods():
     assert len(env.env_method("snapshot")) == 3
     assert env.env_is_wrapped(Monitor) == [True] * 3
     assert env.env_is_wrapped(gymnasium.wrappers.TimeLimit, indices=[0, 1]) == [False] * 2
-
-
-def test_signals_of_the_last_step_are_arrays():
-    env = batched("cartpole", 4, actuator="weaker")
-    env.reset()
-    env.step(np.array([0, 1, 0, 1]))
-    np.testing.assert_array_equal(env.signals["desired_force"], [-10.0, 10.0, -10.0, 10.0])
-    assert env.signals["current"].shape == (4,)
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])

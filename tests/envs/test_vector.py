@@ -8,8 +8,8 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from codrl_mj import LogUniform, Uniform, make_sb3_vec_env
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
-from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
+from codrl_mj.actuators import Actuator, CurrentLoop
+from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed
@@ -112,13 +112,15 @@ def test_each_environment_may_have_its_own_actuator(task, mode):
     assert len(np.unique(currents)) == 7  # the parameters arrive
 
 
-def test_actuators_of_the_environments_may_be_written_as_that_of_one(tmp_path):
+def test_an_actuator_in_any_form_is_the_same_for_all_and_for_each(tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("name: weak\ncontroller: {kp: 0.5}\n")
     written = ["paper", file, {"name": "weaker", "motor": {"resistance": 2.0}}, str(file)]
     each = [EnvConfig("pendulum", one).actuator for one in written]
     assert len(set(each)) == 3
     assert_equal_episodes(batched("pendulum", 4, actuator=written), looped("pendulum", 4, actuator=each), 20)
+    for form, one in zip(written, each, strict=True):
+        assert_equal_episodes(batched("pendulum", 2, actuator=form), looped("pendulum", 2, actuator=[one] * 2), 3)
     serial = make_sb3_vec_env("pendulum", 4, physics="analytic", actuator=written).env
     assert [one.unwrapped.actuator for one in serial.envs] == each
 
@@ -230,6 +232,9 @@ def test_rendering_shows_every_environment_and_leaves_the_episode_alone():
         assert_same(env.step(actions), control.step(actions))
         for single in singles:
             single.step(actions[0])
+    lists = batched("pendulum", 3, **arguments | {"render_mode": "rgb_array_list"})
+    lists.unwrapped.restore(env.unwrapped.snapshot())
+    np.testing.assert_array_equal(lists.render(), env.render())
     env.set_attr("l", [1.0, 0.5, 2.0])
     singles[1].set_wrapper_attr("l", 0.5)
     twin = copy.deepcopy(env)
@@ -237,39 +242,13 @@ def test_rendering_shows_every_environment_and_leaves_the_episode_alone():
     np.testing.assert_array_equal(env.image(1), singles[1].render())
     assert env.image().shape == (48, 64, 3)
     assert env.image().dtype == np.uint8
-    for one in (env, twin, *singles):
+    for one in (env, twin, lists, *singles):
         one.close()
-
-
-def test_a_list_of_images_is_one_of_each_environment():
-    view = {"width": 64, "height": 48}
-    lists, images = (batched("cartpole", 2, render_mode=mode, **view) for mode in ("rgb_array_list", "rgb_array"))
-    for env in (lists, images):
-        env.reset(seed=0)
-    np.testing.assert_array_equal(lists.render(), images.render())
 
 
 def test_without_a_render_mode_there_is_a_warning_and_no_image():
     with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
         assert batched("pendulum", 2).render() is None
-
-
-# -- one environment of a batch -----------------------------------------------------------------------------
-
-
-def test_an_actuator_in_any_form_is_the_same():
-    motor = Actuator(Motor(), CurrentLoop(kp=2.0))
-    forms = [motor, {"controller": {"kp": 2.0}}, [motor] * 3]
-    runs = []
-    for form in forms:
-        env = ActuatedVectorEnv(3, "pendulum", form)
-        env.reset(seed=0)
-        runs.append([env.step(np.full((3, 1), value, np.float32)) for value in (1.0, -2.0, 0.5)])
-    assert_same(tuple(runs[1]), tuple(runs[0]))
-    assert_same(tuple(runs[2]), tuple(runs[0]))
-    single = ActuatedEnv("pendulum", motor)
-    single.reset(seed=0)
-    assert single.step(np.array([1.0], np.float32))[4]["current"] == runs[0][0][4]["current"][0]
 
 
 def test_threads_of_a_shallow_copy_use_its_own_arrays():
