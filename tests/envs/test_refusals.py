@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from codrl_mj import Choice, LogUniform, Uniform
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import Actuator, CurrentLoop, Drive, GearMotor, Motor
 from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv, SerialVectorEnv
 from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS, named_actuator
@@ -20,6 +20,7 @@ INF, NAN = math.inf, math.nan
 STABLE = Actuator(Motor(), CurrentLoop(kp=1.0))
 UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0, max_voltage=INF))
 WILD = Actuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=INF))
+GEARED = Drive(GearMotor(rotor_inertia=0.001, gear_ratio=20.0))
 WEAK, IDEAL = named_actuator("weak", "pendulum"), {"family": "ideal"}
 CURRENT = {"action": "current", "levels": (-1.0, 1.0)}
 VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
@@ -41,9 +42,14 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
         ({"actuator": IDEAL | {"supply": {"resistance": 1}}}, "unknown actuator field supply"),
         ({"physics": "bullet"}, "unknown physics 'bullet': Known: mujoco, analytic"),
         ({"integrator": "rk45"}, "integrator = 'rk45': cartpole has euler, semi-implicit"),
-        ({"inner_steps": 0}, "inner_steps = 0: must be an integer >= 1"),
-        ({"timestep": -0.01}, "timestep = -0.01: must be a finite number > 0"),
-        ({"timestep": "1e-3"}, "timestep = '1e-3': must be a finite number > 0"),
+        *(
+            ({"inner_steps": bad}, f"inner_steps = {bad!r}: must be an integer >= 1")
+            for bad in (0, 1.5, 2.0, True, "2")
+        ),
+        *(
+            ({"timestep": bad}, f"timestep = {bad!r}: must be a finite number > 0")
+            for bad in (0.0, -0.01, NAN, INF, "1")
+        ),
         ({"timestep": 0.015}, "timestep = 0.015 s does not divide cartpole's environment step of 0.02 s"),
         ({"inner_steps": 2, "timestep": 0.01}, "inner_steps = 2 and timestep = 0.01: give one of them, not both"),
         ({"centre_radius": 0.1}, "unknown option 'centre_radius' of cartpole: it has center_radius"),
@@ -221,6 +227,9 @@ def test_what_cannot_be_drawn_is_refused(make, randomize, message):
         ({"physics": "analytic", "randomize": {"model.gravity": Uniform(1, 2)}}, "cannot draw model.gravity"),
         ({**CURRENT, "randomize": {"motor.arm_radius": Uniform(1, 2)}}, "it would change what an action means"),
         ({**VOLTAGE, "randomize": {"controller.kp": Uniform(1, 2)}}, "the command goes past the controller"),
+        ({"actuator": GEARED, "randomize": {"motor.gear_ratio": Uniform(0, 1)}}, "GearMotor.gear_ratio = 0.0: must be"),
+        ({"actuator": GEARED, "randomize": {"motor.rotor_inertia": Uniform(-1, 1)}}, "GearMotor.rotor_inertia = -1.0"),
+        ({"actuator": GEARED, "randomize": {"motor.gear_efficiency": Uniform(0, 1)}}, "GearMotor.gear_efficiency = 0"),
         # a model's draws leave the loop as it is
         ({"actuator": UNSTABLE, "randomize": {"model.gravity": Uniform(0.9, 1.1)}}, "unstable"),
     ],

@@ -21,6 +21,8 @@ STEPS = {"pendulum": 60, "cartpole": 40, "acrobot": 15, "mountain_car": 30, "mou
 SUPPLY = {"pendulum": 4.0, "cartpole": 10.0, "acrobot": 2.0, "mountain_car": 0.6, "mountain_car_continuous": 0.6}
 """A supply that saturates at times, by task [V]."""
 
+TRACE = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated", "speed")
+
 OFF = {  # feature -> the change that takes it away, and what else both sides of the pair have
     "back_emf_constant": ({"back_emf_constant": 0.0}, {"bemf_compensation": False}),
     "bemf_compensation": ({"bemf_compensation": False}, {"back_emf_constant": 2.0}),
@@ -41,22 +43,31 @@ OFF = {  # feature -> the change that takes it away, and what else both sides of
 
 @functools.cache
 def _episode(task, physics, integrator, actuator):
-    """States and forces of an episode under random actions, as the environment and as the oracle have them."""
+    """States, and traces of all integration steps, under random actions: of the environment, and of the oracle."""
     env, driver = ActuatedEnv(task, actuator, physics, integrator=integrator), TASKS[task].twin()
     env.reset(seed=0)
     env.action_space.seed(0)
     motor, state = MotorSimulation(actuator), env.state
+    constants, limit = actuator.motor, actuator.controller.max_voltage
     dt = env.task.step_duration / env.task.motor_inner_steps
     found, expected = [], []
     for _ in range(STEPS[task]):
         action = env.action_space.sample()
-        info = env.step(action)[-1]
+        env.step(action)
         desired = desired_force(task, action)
-        for _ in range(env.task.motor_inner_steps):
+        for row in env.trace[:, 0]:
             delivered = motor.step(dt, desired, state[SPEED[task]])
             state = np.array(driver(state, delivered, dt, integrator))
-        found.append([*env.state, info["actual_force"], info["current"], info["voltage"]])
-        expected.append([*state, delivered, motor.current, motor.voltage])
+            reference, saturated = (
+                desired * constants.arm_radius / constants.torque_constant,
+                abs(motor.voltage) >= limit,
+            )
+            expected.append(
+                [desired, delivered, motor.current, reference, motor.voltage, saturated, state[SPEED[task]]]
+            )
+            found.append(row)
+        np.testing.assert_allclose(env.state, state, rtol=1e-9, atol=1e-9)
+    assert env.trace_names == TRACE
     return np.array(found), np.array(expected)
 
 
@@ -71,16 +82,16 @@ def test_a_feature_matters_and_is_what_it_should_be_with_and_without(task, integ
         found, expected = _episode(task, physics, integrator, actuator)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
         runs.append(found)
-    size = len(TASKS[task].state_names)
     differences = np.abs(runs[0] - runs[1])
-    assert differences[:, size].max() > 1e-3  # the force
-    assert differences[:, :size].max() > 1e-7  # and the motion
+    assert differences[:, TRACE.index("actual_force")].max() > 1e-3
+    assert differences[:, TRACE.index("speed")].max() > 1e-7
 
 
 @every_rebuilt
 def test_the_pairs_saturate_at_times(task):
     """Guards the pair of the supply, and that of the compensation, which saturation alone leaves incomplete."""
     actuator = changed(FULL, inductance=0.2, max_voltage=SUPPLY[task])
-    voltages = np.abs(_episode(task, "mujoco", TASKS[task].integrators[0], actuator)[0][:, -1])
+    rows = _episode(task, "mujoco", TASKS[task].integrators[0], actuator)[0]
+    voltages = np.abs(rows[:, TRACE.index("voltage")])
     assert (voltages == SUPPLY[task]).any()
     assert (voltages < SUPPLY[task]).any()

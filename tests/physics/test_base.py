@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import IDEAL, Actuator, Inputs
+from codrl_mj.actuators import IDEAL, Actuator
 from codrl_mj.physics import PHYSICS, AnalyticPhysics, Plant, SimulationDivergedError
 from codrl_mj.tasks import TASKS
 
@@ -31,19 +31,6 @@ def test_a_timestep_that_does_not_divide_is_refused_with_both_numbers(task, rati
     assert f"the ratio is {ratio:.6g}, must be an integer >= 1" in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("inner_steps", "timestep", "message"),
-    [
-        *((None, bad, f"timestep = {bad}: must be a finite number > 0") for bad in (0.0, -0.01, np.nan, np.inf)),
-        *((bad, None, f"inner_steps = {bad!r}: must be an integer >= 1") for bad in (0, 1.5, 2.0, True, "2", np.nan)),
-        (2, 0.01, "inner_steps = 2 and timestep = 0.01: give one of them"),
-    ],
-)
-def test_what_is_no_step_is_refused(inner_steps, timestep, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        TASKS["cartpole"].steps_within(IDEAL, inner_steps, timestep)
-
-
 @every_task
 def test_the_default_integrator_is_the_first_and_others_are_refused_with_the_choice(task):
     assert task.integrator(None) == task.integrators[0]
@@ -67,17 +54,6 @@ def test_divergence_names_every_broken_entry_and_the_time(task, bad):
             physics.check_finite()
 
 
-@pytest.mark.parametrize("name", PHYSICS)
-def test_every_physics_checks_its_present_state_and_lets_no_fields_be_set(name):
-    physics = PHYSICS[name](Plant(TASKS["pendulum"], [IDEAL], 1, "semi-implicit"))
-    physics.reset(np.array([0.3, 0.1]))
-    physics.check_finite()
-    physics.set_model({})
-    physics.state = np.array([0.3, 1.1e10])
-    with pytest.raises(SimulationDivergedError, match=r"pendulum: the simulation diverged at t = 0 s: theta_dot"):
-        physics.check_finite()
-
-
 def test_a_physics_without_a_model_refuses_its_fields_by_its_own_name(monkeypatch):
     class Mine(AnalyticPhysics):
         """Of nobody else."""
@@ -90,9 +66,3 @@ def test_a_physics_without_a_model_refuses_its_fields_by_its_own_name(monkeypatc
     monkeypatch.setitem(PHYSICS, "mine", Mine)
     with pytest.raises(ValueError, match="which 'mine' has not"):
         Mine(plant).set_model(FIELDS)
-
-
-def test_the_ideal_actuator_delivers_what_is_desired_and_has_no_current():
-    _, torque, signals = IDEAL.advance((), 0.01, IDEAL.State(), Inputs(3.0, 1.0, 2.0, 0.5, 7.0))
-    assert torque == 3.0
-    assert signals._asdict() == {"current": 0.0, "reference_current": 0.0, "voltage": 0.0, "saturated": 0.0}
