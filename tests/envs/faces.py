@@ -134,7 +134,7 @@ def run(env, count, seed, vandal=False):
     A vandal writes into all that it was given, and into the actions that were taken.
     """
     generator = np.random.default_rng(seed)
-    several, found, over = hasattr(env, "num_envs"), [plain(env.randomization)], False
+    several, found, kept, over = hasattr(env, "num_envs"), [plain(env.randomization)], [], False
     space, shape = getattr(env, "single_action_space", env.action_space), (env.num_envs,) if several else ()
     for index in range(count):
         if hasattr(space, "n"):
@@ -148,8 +148,13 @@ def run(env, count, seed, vandal=False):
         over = stepped and seen[2]
         states = env.get_attr("state") if several else env.state
         found.append(plain((seen, states, env.randomization, env.trace if stepped else None)))
-        for array in arrays((seen, states, action)) if vandal else []:
-            array[...] = 1
+        if vandal:
+            for array in arrays((seen, states, action)):
+                array[...] = 1
+        else:
+            kept += [(array, array.copy()) for array in arrays((seen, states))]
+    for array, copied in kept:  # no later step has written into what was returned
+        np.testing.assert_array_equal(array, copied)
     return tuple(found)
 
 
