@@ -40,7 +40,7 @@ def sampled(env, steps, seed=0):
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("setup", ["ideal", "force", "everything"])
 def test_steps_are_those_of_dummy_environments(task, setup, physics):
-    given = arguments(task, setup, physics) | {"physics": physics, "max_episode_steps": 17}
+    given = arguments(task, setup, physics) | {"physics": physics, "max_episode_steps": 10}
     ours, theirs = batched(task, 5, **given), looped(task, 5, **given)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
