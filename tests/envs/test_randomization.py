@@ -232,11 +232,13 @@ def test_cartpoles_explicit_euler_takes_the_damping_explicitly():
 
 def test_a_pattern_names_the_motors_that_are_drawn():
     every, matched = ({path: Uniform(0.05, 0.2)} for path in ("motor.inductance", "slid.*:motor.inductance"))
-    all_, ours = (ActuatedEnv("cartpole", randomize=one).reset(seed=3)[1]["randomization"] for one in (every, matched))
-    assert ours == {"slid.*": {"motor.inductance": all_["motor.inductance"]}, "rejected": 0}
+    everywhere, ours = (
+        ActuatedEnv("cartpole", randomize=one).reset(seed=3)[1]["randomization"] for one in (every, matched)
+    )
+    assert ours == {"slid.*": {"motor.inductance": everywhere["motor.inductance"]}, "rejected": 0}
     many = batched("cartpole", 2, randomize=matched)
     drawn = many.reset(seed=3)[1]["randomization"]
-    assert drawn["slid.*:motor.inductance"][0] == all_["motor.inductance"]
+    assert drawn["slid.*:motor.inductance"][0] == everywhere["motor.inductance"]
 
 
 def test_what_is_drawn_has_the_drawn_length():
