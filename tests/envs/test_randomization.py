@@ -67,7 +67,7 @@ def test_a_value_is_the_formula_of_its_draw_within_the_bounds_however_many_are_d
     draws = np.random.default_rng(0).random(257)
     draws[:2] = 0.0, np.nextafter(1.0, 0.0)
     values = distribution.transform(draws)
-    np.testing.assert_allclose(values, formula(draws), rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(values, formula(draws), rtol=1e-15 if isinstance(distribution, LogUniform) else 0)
     for size in (1, 2, 3, 5, 8, 13, 64):
         parts = [distribution.transform(draws[start : start + size]) for start in range(0, len(draws), size)]
         np.testing.assert_array_equal(np.concatenate(parts), values)
