@@ -66,7 +66,7 @@ def _episode(task, physics, integrator, actuator):
                 [desired, delivered, motor.current, reference, motor.voltage, saturated, state[SPEED[task]]]
             )
             found.append(row)
-        np.testing.assert_allclose(env.state, state, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(env.state, state, rtol=0, atol=1e-10)
     assert env.trace_names == TRACE
     return np.array(found), np.array(expected)
 
