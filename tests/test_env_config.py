@@ -73,34 +73,6 @@ def test_nothing_is_drawn_by_default():
     assert "randomize" not in drawn.policy_fields  # it is no part of what an agent commands and sees
 
 
-REFUSED = {
-    "empty": ({}, "randomize = {}: must be one or more of FIELD=DISTRIBUTION"),
-    "one text": ("a=uniform(0, 1)", "randomize = 'a=uniform(0, 1)': must be one or more of FIELD=DISTRIBUTION"),
-    "no sequence": (3, "randomize = 3: must be one or more of FIELD=DISTRIBUTION"),
-    "no equals sign": (["motor.inductance"], "randomize: 'motor.inductance': must be FIELD=DISTRIBUTION, such as "),
-    "no field": (["=uniform(0, 1)"], "randomize: '=uniform(0, 1)': must be FIELD=DISTRIBUTION, such as "),
-    "no text": ([3], "randomize: 3: must be FIELD=DISTRIBUTION, such as "),
-    "twice": (["a=uniform(0, 1)", "a=choice(1)"], "randomize: a is named twice"),
-    "no distribution": ({"a": {"uniform": [0, 1]}}, "randomize: a: {'uniform': [0, 1]} is no distribution: must be "),
-    "a number": ({"a": 0.3}, "randomize: a: 0.3 is no distribution: must be uniform(LOW, HIGH), "),
-    "unknown": (["a=gauss(0, 1)"], "randomize: a: 'gauss(0, 1)' is no distribution: it must be uniform(LOW, HIGH), "),
-    "too few": (["a=uniform(1)"], "randomize: a: 'uniform(1)' has 1 values: must be uniform(LOW, HIGH)"),
-    "the model's, of a motor": (
-        {"arm": {"model.gravity": "uniform(1, 2)"}},
-        "randomize: arm:model.gravity: model.gravity is the model's, not a motor's: leave 'arm' out",
-    ),
-    "no expression": (["(:a=uniform(0, 1)"], "randomize: (:a: '(': must be a regular expression (missing ), "),
-    "bounds": (["a=uniform(2, 1)"], "randomize: a: 'uniform(2, 1)': Uniform.high = 1: must be >= low = 2"),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_is_no_randomisation_is_refused_with_a_reason(case):
-    randomize, message = REFUSED[case]
-    with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
-        EnvConfig("cartpole", randomize=randomize)
-
-
 # -- every field --------------------------------------------------------------------------------------------
 
 POSITIVE = st.floats(1e-3, 1e3)
@@ -174,68 +146,65 @@ def test_every_face_is_built_from_it():
     assert [theirs.step(0).last() for _ in range(7)] == [False] * 6 + [True]
 
 
-def test_fields_are_set_over_another_one_s():
-    base = EnvConfig("cartpole", disturbances={"command_delay": 0.1}, joint={"damping": 1.0}, inner_steps=3)
-    changed = EnvConfig.from_mapping(
-        {"actuator": "weak", "disturbances": {"command_rate": 2.0}, "center_radius": 0.3, "joint": {"friction": 0.5}},
-        base,
-    )
-    assert changed == EnvConfig(
-        "cartpole",
-        "weak",
-        inner_steps=3,
-        disturbances=Disturbances(command_delay=0.1, command_rate=2.0),
-        joint=Joint(damping=1.0, friction=0.5),
-        options={"center_radius": 0.3},
-    )
+POLE = EnvConfig(
+    "cartpole",
+    "weak",
+    action="voltage",
+    levels=(-1, 1),
+    inner_steps=3,
+    integrator="semi-implicit",
+    max_episode_steps=9,
+    disturbances={"command_delay": 0.1},
+    joint={"damping": 1.0},
+    options={"center_radius": 0.3},
+)
+OF_ANY_TASK = {"action": "voltage", "disturbances": {"command_delay": 0.1}, "joint": {"damping": 1.0}}
 
 
-def test_over_one_of_another_task_what_is_not_given_is_that_tasks():
-    pole = EnvConfig(
-        "cartpole",
-        "weak",
-        action="voltage",
-        levels=(-1, 1),
-        inner_steps=3,
-        integrator="semi-implicit",
-        max_episode_steps=9,
-        disturbances={"command_delay": 0.1},
-        joint={"damping": 1.0},
-        options={"center_radius": 0.3},
-    )
-    kept = {"action": "voltage", "disturbances": {"command_delay": 0.1}, "joint": {"damping": 1.0}}
-    assert EnvConfig.from_mapping({"task": "pendulum"}, pole) == EnvConfig("pendulum", "paper", **kept)
-    given = {"task": "pendulum", "actuator": "weaker", "inner_steps": 2, "joint": {"friction": 0.5}}
-    kept["joint"] = {"damping": 1.0, "friction": 0.5}
-    assert EnvConfig.from_mapping(given, pole) == EnvConfig("pendulum", "weaker", inner_steps=2, **kept)
-    assert EnvConfig.from_mapping({"task": "cartpole"}, pole) == pole
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"task": "cartpole"}, POLE),
+        (
+            {"actuator": "weaker", "disturbances": {"command_rate": 2.0}, "center_radius": 0.4},
+            dataclasses.replace(
+                POLE,
+                actuator="weaker",
+                disturbances=Disturbances(command_delay=0.1, command_rate=2.0),
+                options={"center_radius": 0.4},
+            ),
+        ),
+        # of another task, what is not given is that task's
+        ({"task": "pendulum"}, EnvConfig("pendulum", "paper", **OF_ANY_TASK)),
+        (
+            {"task": "pendulum", "actuator": "weaker", "inner_steps": 2, "joint": {"friction": 0.5}},
+            EnvConfig(
+                "pendulum", "weaker", inner_steps=2, **OF_ANY_TASK | {"joint": {"damping": 1.0, "friction": 0.5}}
+            ),
+        ),
+    ],
+)
+def test_fields_are_set_over_another_ones(given, expected):
+    assert EnvConfig.from_mapping(given, POLE) == expected
 
 
 def test_numpys_numbers_are_numbers():
-    given = EnvConfig(
-        "cartpole",
-        Actuator(Motor(np.float32(0.5))),
-        inner_steps=np.int64(4),
-        action="voltage",
-        levels=np.array([-1.5, 0.0, 1.5], dtype=np.float32),
-        observe_actuator=np.True_,
-        max_episode_steps=np.int32(7),
-        disturbances={"command_delay": np.float32(0.5)},
-        joint={"damping": np.float64(0.25)},
-        options={"center_radius": np.float32(0.5), "sutton_barto_reward": np.True_},
-    )
-    plain = EnvConfig(
-        "cartpole",
-        Actuator(Motor(0.5)),
-        inner_steps=4,
-        action="voltage",
-        levels=(-1.5, 0.0, 1.5),
-        observe_actuator=True,
-        max_episode_steps=7,
-        disturbances={"command_delay": 0.5},
-        joint={"damping": 0.25},
-        options={"center_radius": 0.5, "sutton_barto_reward": True},
-    )
+    def config(number, count, flag, levels):
+        return EnvConfig(
+            "cartpole",
+            Actuator(Motor(number(0.5))),
+            inner_steps=count(4),
+            action="voltage",
+            levels=levels,
+            observe_actuator=flag(1),
+            max_episode_steps=count(7),
+            disturbances={"command_delay": number(0.5)},
+            joint={"damping": number(0.25)},
+            options={"center_radius": number(0.5), "sutton_barto_reward": flag(1)},
+        )
+
+    given = config(np.float32, np.int64, np.bool_, np.array([-1.5, 0.0, 1.5], dtype=np.float32))
+    plain = config(float, int, bool, (-1.5, 0.0, 1.5))
     assert (given, hash(given)) == (plain, hash(plain))
     assert json.dumps(given.as_mapping()) == json.dumps(plain.as_mapping())
     assert json.dumps(EnvConfig("cartpole", timestep=np.float64(0.01)).as_mapping())
@@ -254,10 +223,7 @@ def test_numpys_numbers_are_numbers():
     [
         ({"task": "cartpole", "inner_step": 3}, "unknown key env.inner_step; did you mean env.inner_steps?"),
         ({"task": "cartpole", "center_radios": 3}, "unknown key env.center_radios; did you mean env.center_radius?"),
-        (
-            {"task": "pendulum", "options": {"center_radius": 3}},
-            "unknown option 'center_radius' of pendulum: it has none",
-        ),
+        ({"task": "pendulum", "options": {"center_radius": 3}}, "unknown option 'center_radius' of pendulum: it has"),
         ({"task": "cartpole", "center_radius": -1.0}, "center_radius = -1.0: must be a number > 0"),
         ({"task": "cartpole", "sutton_barto_reward": 1}, "sutton_barto_reward = 1: must be True or False"),
         ({"task": "cartpole", "center_radius": True}, "center_radius = True: must be a number > 0"),
@@ -273,36 +239,26 @@ def test_what_is_no_configuration_is_named(mapping, message):
 # -- the command line ---------------------------------------------------------------------------------------
 
 
-def _rendered(folder, *flags):
-    """The currents of an episode that the command line films."""
-    arguments = ["render", "pendulum", "--width", "160", "--height", "120", "--env.max-episode-steps", "3"]
-    trajectory = folder / "episode.npz"
-    assert main([*arguments, "--out", str(folder / "frames"), "--trajectory", str(trajectory), *flags]) == 0
-    with np.load(trajectory) as episode:
-        return episode["trace/current"]
-
-
 def test_the_command_line_draws(tmp_path):
-    fixed, drawn, exact = tmp_path / "fixed", tmp_path / "drawn", tmp_path / "exact"
-    for folder in (fixed, drawn, exact):
+    def currents(*flags):
+        line = ["render", "pendulum", "--width", "160", "--height", "120", "--env.max-episode-steps", "3"]
+        folder = tmp_path / str(len([*tmp_path.iterdir()]))
         folder.mkdir()
-    nominal = _rendered(fixed)
-    flags = ["--env.randomize", "motor.inductance=uniform(0.3, 0.6)", "controller.kp=loguniform(0.1,10)"]
-    assert not np.array_equal(_rendered(drawn, *flags), nominal)
-    one = ["--env.randomize", "motor.inductance=choice(0.25)"]
-    set_by_name = tmp_path / "set"
-    set_by_name.mkdir()
-    expected = _rendered(set_by_name, "--actuator.motor.inductance", "0.25")
-    np.testing.assert_array_equal(_rendered(exact, *one), expected)
+        files = ["--out", str(folder / "frames"), "--trajectory", str(folder / "episode.npz")]
+        assert main([*line, *files, *flags]) == 0
+        with np.load(folder / "episode.npz") as episode:
+            return episode["trace/current"]
+
+    drawn = ["--env.randomize", "motor.inductance=uniform(0.3, 0.6)", "controller.kp=loguniform(0.1,10)"]
+    assert not np.array_equal(currents(*drawn), currents())
+    found = currents("--env.randomize", "motor.inductance=choice(0.25)")
+    np.testing.assert_array_equal(found, currents("--actuator.motor.inductance", "0.25"))
 
 
 @pytest.mark.parametrize(
     ("flag", "message"),
     [
         ("motor.inductance", "'motor.inductance': must be FIELD=DISTRIBUTION"),
-        ("motor.inductance=gauss(0,1)", "motor.inductance: 'gauss(0,1)' is no distribution"),
-        ("motor.inductance=uniform(0.2,0.1)", "Uniform.high = 0.1: must be >= low = 0.2"),
-        ("motor.inductance=uniform(0,0.2)", "must be"),
         ("motor.inductanc=uniform(0.1,0.2)", "did you mean 'motor.inductance'?"),
     ],
 )
@@ -314,34 +270,21 @@ def test_the_command_line_refuses_with_one_line(flag, message, capsys, tmp_path)
     assert error.count("\n") == 1
 
 
-# -- the page -----------------------------------------------------------------------------------------------
-
-
-def test_the_examples_of_the_page_run(capsys):
+def test_python_files_and_flags_of_the_page_run(capsys):
     namespace = {}
     for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL):
         exec(compile(block, "randomization.md", "exec"), namespace)
     assert "rejected" in capsys.readouterr().out
     namespace["env"].close()
-
-
-def test_the_files_of_the_page_are_configurations():
-    blocks = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
-    assert blocks
-    for block in blocks:
-        content = yaml.safe_load(block)
-        env = EnvConfig(content["task"], **content["env"]).make()
-        assert isinstance(env, gymnasium.Env)
-        assert env.reset(seed=0)[1]["randomization"].keys() > content["env"]["randomize"].keys()
-
-
-def test_the_flags_of_the_page_survive_the_shell():
+    files = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
     commands = re.findall(r"^\$ (codrl-mj (?:.*\\\n)*.*)$", PAGE, re.MULTILINE)
+    assert files
     assert commands
+    for content in map(yaml.safe_load, files):
+        env = EnvConfig(content["task"], **content["env"]).make()
+        assert env.reset(seed=0)[1]["randomization"].keys() > content["env"]["randomize"].keys()
     for command in commands:
         words = iter(shlex.split(command.replace("\\\n", "")))
         assert "--env.randomize" in words  # leaves what follows it
-        config = EnvConfig(
-            "cartpole", randomize=list(itertools.takewhile(lambda word: not word.startswith("--"), words))
-        )
+        config = EnvConfig("cartpole", randomize=[*itertools.takewhile(lambda word: not word.startswith("--"), words)])
         assert len(config.as_arguments()["randomize"]) == 2

@@ -51,9 +51,10 @@ def test_one_is_made_of_a_name_an_id_a_configuration_or_a_function(given, same):
         (("pendulum", 2, "weak"), {"max_episode_steps": 3}, ActuatedVectorEnv),
         ((codrl_mj.EnvConfig("pendulum", "weak", physics="analytic"), 2), {}, SerialVectorEnv),
         (("Reacher-v5", 2, "lag"), {}, SerialVectorEnv),
+        (("Reacher-v5", 2, "default"), {}, SerialVectorEnv),
         ((functools.partial(gym.make, "Reacher-v5"), 2), {}, SerialVectorEnv),
     ],
-    ids=["batch", "time limit", "configuration", "environments of others", "function"],
+    ids=["batch", "time limit", "configuration", "environments of others", "their own", "function"],
 )
 def test_many_are_as_one_by_one(given, options, kind):
     env, num_envs, *actuator = given
@@ -103,13 +104,7 @@ def test_what_is_given_beside_a_configuration_is_set_over_it(view):
     envs.close()
 
 
-@pytest.mark.parametrize("made", [codrl_mj.make, lambda env, one: codrl_mj.make_vec(env, 1, one)], ids=["one", "many"])
-def test_one_and_many_take_the_same_actuators(made):
-    with pytest.raises(ValueError, match=r"actuator = \{\}: must be one for all, or what drives what"):
-        made("Reacher-v5", {})
-    made("Reacher-v5", "default").close()
-
-
+@pytest.mark.parametrize("made", [codrl_mj.make, lambda env, *actuator: codrl_mj.make_vec(env, 1, *actuator)])
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -117,8 +112,9 @@ def test_one_and_many_take_the_same_actuators(made):
         (("pendulum", "wek"), "wek"),
         (("pendulum", {"leg": "lag"}), "leg"),
         (("Reacher-v5", {"leg.*": "lag"}), "leg"),
+        (("Reacher-v5", {}), r"actuator = \{\}: must be one for all, or what drives what"),
     ],
 )
-def test_what_is_unknown_is_named(arguments, message):
+def test_what_is_unknown_is_named(made, arguments, message):
     with pytest.raises((ValueError, gym.error.Error), match=message):
-        codrl_mj.make(*arguments)
+        made(*arguments)

@@ -100,24 +100,10 @@ def test_a_rate_limited_command_moves_towards_its_target_and_never_faster(values
         last = value
 
 
-def test_the_rate_is_per_second():
-    arrived = _arrivals(Disturbances(command_rate=50.0), 0.02, [10.0] * 12)
-    np.testing.assert_allclose(arrived, np.minimum(np.arange(1, 13) * 1.0, 10.0), rtol=1e-12)
-
-
 def test_delay_comes_before_the_quantiser_and_the_quantiser_before_the_rate_limit():
     arrived = _arrivals(Disturbances(command_delay=0.01, command_quantum=1.0, command_rate=30.0), 0.02, [1.4, 1.4, 4.0])
     # interpolated: 0.7, 1.4, 2.7; quantised: 1, 1, 3; at most 0.6 a step
     np.testing.assert_allclose(arrived, [0.6, 1.0, 1.6], rtol=1e-12)
-
-
-def test_many_are_disturbed_as_one():
-    disturbances = Disturbances(command_delay=0.013, command_quantum=0.3, command_rate=100.0)
-    values = np.random.default_rng(0).uniform(-10, 10, (30, 17))
-    many = Disturber(disturbances, 0.01, np.array([10.0]), 17)
-    together = np.array([many.disturbed(row[:, np.newaxis])[0][:, 0] for row in values])
-    alone = np.stack([_arrivals(disturbances, 0.01, column) for column in values.T], axis=1)
-    np.testing.assert_array_equal(together, alone)
 
 
 def test_several_actuators_of_a_simulation_have_each_its_own_limit():

@@ -10,7 +10,6 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.disturbances import Joint
 from codrl_mj.physics import MujocoPhysics, Plant
 from codrl_mj.tasks import TASKS
-from tests.tasks.faces import every_rebuilt
 
 START = np.array([2.0, 1.0])
 
@@ -92,20 +91,6 @@ def test_the_explicit_integrator_stays_explicit():
     rubbed.reset(state)
     rubbed.step(3.0)
     np.testing.assert_array_equal(rubbed.state[[0, 2]], state[[0, 2]] + 0.02 * state[[1, 3]])
-
-
-@every_rebuilt
-def test_only_the_actuated_joint_is_rubbed(task):
-    physics = MujocoPhysics(
-        Plant(
-            TASKS[task], [IDEAL], 1, TASKS[task].integrators[0], joint=Joint(damping=0.5, friction=0.25, armature=0.125)
-        )
-    )
-    actuated = physics.model.actuator("motor").trnid[0]
-    expected = np.where(np.arange(physics.model.nv) == actuated, 1.0, 0.0)
-    np.testing.assert_array_equal(physics.model.dof_damping, 0.5 * expected)
-    np.testing.assert_array_equal(physics.model.dof_frictionloss, 0.25 * expected)
-    np.testing.assert_array_equal(physics.model.dof_armature, 0.125 * expected)
 
 
 def test_armature_is_an_inertia_of_the_joint():

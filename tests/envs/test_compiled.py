@@ -1,8 +1,6 @@
-"""The compiled step and reset: against a plain composition of their parts, in loops of one's own, in copies."""
+"""The compiled step and reset: against a plain composition of their parts, in loops of one's own, in threads."""
 
-import copy
 import itertools
-import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
@@ -16,7 +14,6 @@ from codrl_mj.actuators import IDEAL, Actuator, actuator_over
 from codrl_mj.engine.families import signals_at
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.compiled import compiled_env
-from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.matrix import but
 from tests.tasks.faces import REBUILT, actions, desired_force, every_rebuilt, random_states
@@ -140,27 +137,6 @@ def test_what_python_has_to_do_is_not_offered_as_compiled():
     assert compiled_env(ActuatedEnv("pendulum", randomize={"motor.inductance": Uniform(0.08, 0.12)})) is None
 
 
-@every_setup
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
-def test_a_copy_goes_on_by_itself(task, kind, copied):
-    env = _env(task, kind)
-    env.reset(seed=1)
-    env.action_space.seed(0)
-    chosen = [env.action_space.sample() for _ in range(12)]
-    for action in chosen[:3]:
-        env.step(action)
-    other = copied(env)
-    unmoved = env.state
-    seen = [other.step(action) for action in chosen[3:]]
-    np.testing.assert_array_equal(env.state, unmoved)
-    for action, (observation, reward, terminated, _, info) in zip(chosen[3:], seen, strict=True):
-        again = env.step(action)
-        np.testing.assert_array_equal(again[0], observation)
-        assert (again[1], again[2], again[4]) == (reward, terminated, info)
-    np.testing.assert_array_equal(env.physics.trace, other.physics.trace)
-    assert other.physics.trace is not env.physics.trace
-
-
 def test_what_a_user_writes_into_the_data_is_where_the_step_begins():
     env = _env("pendulum", "ideal")
     env.reset(seed=0)
@@ -169,37 +145,6 @@ def test_what_a_user_writes_into_the_data_is_where_the_step_begins():
     _, reward, _, _, _ = env.step(np.zeros(1))
     assert reward == pytest.approx(-((np.pi / 2) ** 2 + 0.1), rel=1e-12)
     assert env.state[1] == pytest.approx(1.0 + 0.05 * 15.0, rel=1e-12)  # 3 g / 2 l sin(theta)
-
-
-@pytest.mark.parametrize("task", but(["pendulum", "cartpole"], TASKS))
-def test_a_state_that_is_no_number_is_an_error_and_a_reset_helps(task):
-    env = _env(task)
-    env.reset(seed=0)
-    env.data.qvel[0] = 1e300
-    with pytest.raises(SimulationDivergedError, match=f"{task}: the simulation diverged"):
-        env.step(env.action_space.sample())
-    observation, _ = env.reset(seed=0)
-    assert np.isfinite(observation).all()
-    assert np.isfinite(env.step(env.action_space.sample())[0]).all()
-
-
-@every_task
-@pytest.mark.parametrize("action", [None, "1", 3, -1, 0.5, np.nan, np.zeros(2), np.array([np.nan]), np.zeros(1, int)])
-def test_an_action_that_is_none_changes_nothing(task, action):
-    env = _env(task)
-    env.reset(seed=0)
-    state = env.data.qpos.copy(), env.data.time
-    with pytest.raises(ValueError, match="action = "):
-        env.step(action)
-    assert (env.data.qpos == state[0]).all()
-    assert env.data.time == state[1]
-
-
-@pytest.mark.parametrize("one", [1, np.int64(1), np.int32(1), np.uint8(1), np.array(1), True])
-def test_an_integer_of_any_type_is_a_discrete_action(one):
-    env = _env("cartpole", "ideal")
-    env.reset(seed=0)
-    assert env.step(one)[4]["desired_force"] == 10.0
 
 
 def test_threads_do_not_disturb_each_other():

@@ -1,8 +1,5 @@
-"""What every environment keeps: over every task, physics and actuator."""
+"""What every environment keeps of Gymnasium's contract and of Gymnasium's environment: any task, physics, set-up."""
 
-import copy
-import functools
-import pickle
 import unittest.mock
 import warnings
 
@@ -12,44 +9,38 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from codrl_mj.actuators import NAMED
+from codrl_mj.envs import ActuatedEnv
 from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
+from tests.envs.faces import SETUPS, arguments
 from tests.matrix import but
-from tests.reference import MotorSimulation
-from tests.tasks.faces import REBUILT, every_rebuilt
+from tests.tasks.faces import REBUILT, actions, every_rebuilt
 
-INFO_KEYS = {"desired_force", "actual_force", "current", "reference_current", "voltage", "saturated"}
 every_physics = pytest.mark.parametrize("physics", PHYSICS)
-every_actuator = pytest.mark.parametrize("actuator", NAMED)
+every_setup = pytest.mark.parametrize("setup", SETUPS)
 
 
-def make(task, actuator="default", physics="mujoco", **options):
+def make(task, setup, physics="mujoco", **more):
     """The environment as a user makes it, in Gymnasium's wrappers."""
-    return gymnasium.make(TASKS[task].env_id, actuator=actuator, physics=physics, **options)
+    return gymnasium.make(TASKS[task].env_id, physics=physics, **arguments(task, setup, physics), **more)
 
 
-def sampled_actions(env, steps, seed=0):
-    """Random actions of the environment's space."""
-    space = copy.deepcopy(env.action_space)
-    space.seed(seed)
-    return [space.sample() for _ in range(steps)]
+class Blank(gymnasium.Env):
+    """An environment with given spaces in which nothing happens: what a checker says of it, it says of its spaces."""
 
+    def __init__(self, action_space, observation_space):  # noqa: D107
+        self.action_space, self.observation_space = action_space, observation_space
 
-def rows(env, actions):
-    """Everything that the steps return, flattened: observation, reward, ends and info."""
-    found = []
-    for action in actions:
-        observation, reward, terminated, truncated, info = env.step(action)
-        found.append(np.concatenate([observation, [reward, terminated, truncated], list(map(float, info.values()))]))
-    return np.array(found)
+    def _observation(self):
+        bounds = self.observation_space.low, self.observation_space.high
+        return np.clip(np.zeros(self.observation_space.shape, np.float32), *bounds)
 
+    def reset(self, *, seed=None, options=None):  # noqa: ARG002
+        super().reset(seed=seed)
+        return self._observation(), {}
 
-def test_every_task_is_registered_with_the_limits_of_the_environment_it_rebuilds():
-    for task in (task for task in TASKS.values() if task.gymnasium_id):
-        ours, theirs = gymnasium.spec(task.env_id), gymnasium.spec(task.gymnasium_id)
-        assert ours.max_episode_steps == theirs.max_episode_steps
-        assert ours.reward_threshold == theirs.reward_threshold
+    def step(self, action):  # noqa: ARG002
+        return self._observation(), 0.0, False, False, {}
 
 
 def _complaints(check, env, **options):
@@ -60,172 +51,71 @@ def _complaints(check, env, **options):
     return {str(warning.message) for warning in caught}
 
 
-@functools.cache
-def _inherited(check, task):
-    """What a checker says of Gymnasium's own environment: ours has the same spaces, which it may not like."""
-    return _complaints(check, gymnasium.make(TASKS[task].gymnasium_id).unwrapped, skip_render_check=True)
-
-
 @every_rebuilt
 @every_physics
-@every_actuator
+@every_setup
 @pytest.mark.parametrize("check", [check_env, check_env_sb3], ids=["gymnasium", "stable_baselines3"])
-def test_the_checkers_have_no_complaint(check, task, physics, actuator):
-    env = make(task, actuator, physics).unwrapped
-    assert _complaints(check, env, skip_render_check=True) <= _inherited(check, task)
+def test_the_checkers_complain_about_nothing_but_the_spaces(check, task, physics, setup):
+    env = make(task, setup, physics).unwrapped
+    of_spaces = _complaints(check, Blank(env.action_space, env.observation_space), skip_render_check=True)
+    assert _complaints(check, env, skip_render_check=True) <= of_spaces
 
 
 @pytest.mark.parametrize("task", but(["pendulum"], REBUILT))
 def test_gymnasiums_checker_has_no_complaint_about_rendering(task, monkeypatch):
     monkeypatch.setattr("codrl_mj.envs.single.Window", unittest.mock.Mock())  # pygame may not be there
-    env = make(task, render_mode="rgb_array", width=64, height=48)
-    assert _complaints(check_env, env.unwrapped) <= _inherited(check_env, task)
+    env = make(task, "force", render_mode="rgb_array", width=64, height=48)
+    blank = Blank(env.action_space, env.observation_space)
+    assert _complaints(check_env, env.unwrapped) <= _complaints(check_env, blank, skip_render_check=True)
     env.close()
 
 
 @every_rebuilt
 @every_physics
-@every_actuator
-def test_spaces_are_gymnasiums_and_hold_every_observation(task, physics, actuator):
-    env, original = make(task, actuator, physics), gymnasium.make(TASKS[task].gymnasium_id)
-    assert env.action_space == original.action_space
-    assert env.observation_space == original.observation_space
-    observation, info = env.reset(seed=0)
-    assert info == {}
-    for action in sampled_actions(env, 100):
-        assert env.observation_space.contains(observation), observation
-        assert observation.dtype == np.float32
-        observation, reward, terminated, truncated, info = env.step(action)
-        assert type(reward) is float
-        assert type(terminated) is bool
-        assert type(truncated) is bool
-        assert info.keys() == INFO_KEYS
-        assert isinstance(info["saturated"], bool)
-        assert abs(info["desired_force"]) <= TASKS[task].max_force
-        if terminated or truncated:
-            assert env.observation_space.contains(observation), observation
-            observation, _ = env.reset()
+@every_setup
+def test_steps_have_gymnasiums_types_and_observations_are_in_the_space(task, physics, setup):
+    env, original = make(task, setup, physics, max_episode_steps=12), gymnasium.make(TASKS[task].gymnasium_id)
+    if setup in ("ideal", "force"):
+        assert env.action_space == original.action_space
+        assert env.observation_space == original.observation_space
+    env.action_space.seed(0)
+    for seed in range(12):
+        observation, info = env.reset(seed=seed)
+        assert info.keys() == ({"randomization"} if "randomize" in arguments(task, setup, physics) else set())
+        over = False
+        while not over:
+            assert observation in env.observation_space
+            observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+            assert observation.dtype == np.float32
+            assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
+            assert {*info} == {
+                *("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
+            }
+            assert isinstance(info["saturated"], bool)
+            if setup != "voltage":
+                assert abs(info["desired_force"]) <= TASKS[task].max_force
+            over = terminated or truncated
+        assert observation in env.observation_space
 
 
 @every_rebuilt
 @every_physics
-def test_the_ideal_actuator_delivers_what_is_desired_and_a_motor_what_its_current_gives(task, physics):
-    env = make(task, "ideal", physics)
-    env.reset(seed=0)
-    for action in sampled_actions(env, 10):
-        info = env.step(action)[-1]
+def test_the_ideal_actuator_delivers_what_is_desired_and_a_motor_tracks_its_current(task, physics):
+    ideal, driven = make(task, "ideal", physics), make(task, "force", physics)
+    for env in (ideal, driven):
+        env.reset(seed=0)
+    for action in actions(task, 0, 10):
+        info = ideal.step(action)[-1]
         assert info["actual_force"] == info["desired_force"]
         assert info["current"] == info["reference_current"] == info["voltage"] == 0.0
         assert not info["saturated"]
-    env = make(task, "default", physics)
-    motor = env.unwrapped.actuator.motor
-    env.reset(seed=0)
-    for action in sampled_actions(env, 10):
-        info = env.step(action)[-1]
-        assert info["actual_force"] == pytest.approx(motor.torque_constant * info["current"] / motor.arm_radius)
-        wanted = info["desired_force"] * motor.arm_radius / motor.torque_constant
-        assert info["reference_current"] == pytest.approx(wanted)
-
-
-@every_rebuilt
-@every_physics
-def test_the_motor_starts_at_rest_in_every_episode(task, physics):
-    env = make(task, "weak", physics)
-    actions = sampled_actions(env, 20)
-    env.reset(seed=5)
-    first = rows(env, actions)
-    env.reset(seed=5)
-    np.testing.assert_array_equal(rows(env, actions), first)
-    # the first step's current is the reference's from zero
-    env.reset(seed=5)
-    setup, state = env.unwrapped, env.unwrapped.state
-    info = env.step(actions[0])[-1]
-    if setup.task.motor_inner_steps == 1:
-        motor = MotorSimulation(setup.actuator)
-        speed = dict(zip(setup.task.state_names, state, strict=True))
-        actuated = {"pendulum": "theta_dot [rad/s]", "cartpole": "x_dot [m/s]"}[task]
-        motor.step(setup.task.step_duration, info["desired_force"], speed[actuated])
-        assert info["current"] == pytest.approx(motor.current, rel=1e-12)
-
-
-@every_rebuilt
-@every_physics
-def test_a_seed_repeats_and_another_differs(task, physics):
-    actions = sampled_actions(make(task), 30)
-    runs = []
-    for seed in (3, 3, 4):
-        env = make(task, "default", physics)
-        observation, _ = env.reset(seed=seed)
-        runs.append((observation, rows(env, actions)))
-    np.testing.assert_array_equal(runs[0][0], runs[1][0])
-    np.testing.assert_array_equal(runs[0][1], runs[1][1])
-    assert np.any(runs[0][0] != runs[2][0])
-
-
-@every_rebuilt
-@every_physics
-@pytest.mark.parametrize(
-    "duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"]
-)
-def test_a_copy_made_mid_episode_continues_bit_for_bit_motor_included(task, physics, duplicate):
-    env = make(task, "weak", physics)
-    env.reset(seed=1)
-    actions = sampled_actions(env, 30)
-    rows(env, actions[:10])
-    twin = duplicate(env)
-    rest = rows(env, actions[10:])
-    np.testing.assert_array_equal(rows(twin, actions[10:]), rest)
-    # they are apart, and share the random generator's future but not the generator
-    env.reset()
-    np.testing.assert_array_equal(env.unwrapped.state, (twin.reset(), twin.unwrapped.state)[1])
-
-
-@every_rebuilt
-@every_physics
-def test_what_is_returned_never_aliases_what_goes_on(task, physics):
-    env, control = make(task, "weak", physics), make(task, "weak", physics)
-    actions = sampled_actions(env, 30)
-    expected_first, _ = control.reset(seed=2)
-    observation, _ = env.reset(seed=2)
-    kept = observation.copy()
-    expected, found = [], []
-    for action in actions:
-        expected.append(rows(control, [action])[0])
-        vandalised = env.unwrapped.state
-        vandalised[:] = 1e3
-        observation[:] = 1e3
-        before = copy.deepcopy(action)
-        step = env.step(action)
-        np.testing.assert_array_equal(action, before)
-        observation = step[0]
-        found.append(np.concatenate([observation, [step[1], step[2], step[3]], list(map(float, step[4].values()))]))
-    np.testing.assert_array_equal(kept, expected_first)
-    np.testing.assert_array_equal(found, expected)
-
-
-@pytest.mark.parametrize("task", but(REBUILT, TASKS))
-def test_observations_of_different_steps_are_different_arrays(task):
-    env = make(task)
-    first, _ = env.reset(seed=0)
-    kept = first.copy()
-    second = env.step(env.action_space.sample())[0]
-    assert not np.shares_memory(first, second)
-    np.testing.assert_array_equal(first, kept)
-
-
-@every_rebuilt
-@every_actuator
-def test_both_physics_tell_the_same_story(task, actuator):
-    """Over the first steps, before chaos: same observations, rewards, ends, forces and currents."""
-    one, two = make(task, actuator, "mujoco"), make(task, actuator, "analytic")
-    actions = sampled_actions(one, 15)
-    np.testing.assert_array_equal(one.reset(seed=7)[0], two.reset(seed=7)[0])
-    np.testing.assert_allclose(rows(one, actions), rows(two, actions), rtol=1e-6, atol=1e-6)
+        info = driven.step(action)[-1]
+        assert info["reference_current"] == pytest.approx(info["desired_force"] * 0.5 / 0.8)  # arm and kT
 
 
 @every_rebuilt
 def test_mujoco_model_and_data_are_at_hand_and_analytic_physics_says_it_has_none(task):
-    env = make(task).unwrapped
+    env = ActuatedEnv(task)
     env.reset(seed=0)
     env.step(env.action_space.sample())
     assert env.data.time == pytest.approx(env.task.step_duration)
@@ -233,4 +123,13 @@ def test_mujoco_model_and_data_are_at_hand_and_analytic_physics_says_it_has_none
     np.testing.assert_array_equal(env.state[list(env.task.qpos)], env.data.qpos)
     np.testing.assert_array_equal(env.state[list(env.task.qvel)], env.data.qvel)
     with pytest.raises(AttributeError, match="AnalyticPhysics has no MuJoCo model or data"):
-        _ = make(task, physics="analytic").unwrapped.model
+        _ = ActuatedEnv(task, physics="analytic").model
+
+
+@every_rebuilt
+def test_every_task_is_registered_with_the_limits_of_the_environment_it_rebuilds(task):
+    ours, theirs = (gymnasium.spec(name) for name in (TASKS[task].env_id, TASKS[task].gymnasium_id))
+    assert ours.max_episode_steps == theirs.max_episode_steps
+    assert ours.reward_threshold == theirs.reward_threshold
+    metadata = (gymnasium.make(spec).unwrapped.metadata for spec in (ours, theirs))
+    assert next(metadata)["render_fps"] == next(metadata)["render_fps"]

@@ -13,7 +13,6 @@ from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import every_rebuilt
 
-every_task = pytest.mark.parametrize("task", TASKS)
 NOT_OF_THE_TASK = {"last_u", "np_random", "np_random_seed", "state", "steps_beyond_terminated", "unwrapped"}
 NOT_OF_THE_TASK |= {"action_space", "high", "high_state", "low", "low_state", "metadata", "observation_space", "spec"}
 NOT_OF_THE_TASK |= {"action_arrow", "actions_num", "clock", "domain_fig", "isopen", "render_mode", "screen", "surf"}
@@ -126,15 +125,14 @@ def test_setting_the_state_leaves_the_motor_as_it_is(physics):
         assert found["current"] != 0.0
 
 
-def test_wrappers_reach_the_attributes():
+def test_wrappers_and_copies_have_the_attributes():
     env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal")
     assert env.has_wrapper_attr("gravity")
     assert env.set_wrapper_attr("gravity", 10.0)
-    assert env.get_wrapper_attr("gravity") == env.unwrapped.gravity == 10.0
+    assert env.get_wrapper_attr("gravity") == env.unwrapped.gravity == copy.deepcopy(env).unwrapped.gravity == 10.0
     assert env.unwrapped.model.opt.gravity[2] == -10.0
     assert not env.has_wrapper_attr("gravitation")
     env.unwrapped.gravitation = 1  # any other attribute is just one
-    assert copy.deepcopy(env).unwrapped.gravity == 10.0
 
 
 @pytest.mark.filterwarnings("ignore:.*already returned terminated")
@@ -142,9 +140,8 @@ def test_wrappers_reach_the_attributes():
 @pytest.mark.parametrize(
     ("task", "name", "values"), [("cartpole", "gravity", [9.81, 3.72, 1.62]), ("pendulum", "l", [1.0, 1.5, 0.7])]
 )
-def test_environments_of_a_vector_have_values_of_their_own(task, mode, name, values):
-    arguments = {"actuator": "ideal", "num_envs": 3, "vectorization_mode": mode}
-    env = gymnasium.make_vec(TASKS[task].env_id, **arguments)
+def test_environments_of_a_vector_have_values_and_states_of_their_own(task, mode, name, values):
+    env = gymnasium.make_vec(TASKS[task].env_id, 3, mode, actuator="ideal")
     env.reset(seed=[5, 5, 5])
     nominal = env.get_attr(name)
     assert nominal == env.call(name) == (getattr(_pair(task)[1], name),) * 3
@@ -152,62 +149,46 @@ def test_environments_of_a_vector_have_values_of_their_own(task, mode, name, val
     env.set_attr(name, values)
     assert env.get_attr(name) == tuple(values)
     action = np.full((3, 1), 0.5) if TASKS[task].forces is None else np.ones(3, dtype=np.int64)
-    for _ in range(8):
-        found = env.step(action)[0]
+    found = [env.step(action)[0] for _ in range(8)][-1]
     for row, value in enumerate(values):
         theirs = _pair(task)[1]
         setattr(theirs, name, value)
         theirs.reset(seed=5)
-        for _ in range(8):
-            expected = theirs.step(action[row])[0]
+        expected = [theirs.step(action[row])[0] for _ in range(8)][-1]
         np.testing.assert_allclose(found[row], expected, rtol=0, atol=1e-5)
     env.set_attr(name, 2.0)
     assert env.get_attr(name) == (2.0, 2.0, 2.0)
+    states = np.arange(1.0, 1.0 + 3 * len(TASKS[task].state_names)).reshape(3, -1) / 100
+    env.set_attr("state", list(states))
+    np.testing.assert_array_equal(env.get_attr("state"), states)
     env.close()
 
 
-def test_the_states_of_a_vector_can_be_set():
-    env = gymnasium.make_vec("codrl_mj/CartPole-v0", actuator="ideal", num_envs=2)
-    env.reset(seed=0)
-    states = np.arange(8.0).reshape(2, 4) / 100
-    env.unwrapped.state = states
-    np.testing.assert_array_equal(env.unwrapped.get_attr("state"), states)
-    assert env.unwrapped.get_attr("num_envs") == (2, 2)
-    with pytest.raises(ValueError, match=r"of shape \(2, 4\)"):
-        env.unwrapped.state = states.T
-    with pytest.raises(AttributeError, match=r"tau = 0.1: the environments share it, as 0.02"):
-        env.unwrapped.tau = 0.1
-    with pytest.raises(ValueError, match="must be one number, or 2"):
-        env.unwrapped.gravity = [1.0, 2.0, 3.0]
+# -- refusals -----------------------------------------------------------------------------------------------
+
+DRAWN_GRAVITY = {"randomize": {"model.gravity": Uniform(0.9, 1.1)}}
+CURRENT = {"actuator": "paper", "action": "current", "levels": (-1, 1)}
+CHECKED = "motor and disturbances were checked for this step"
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "why"),
+    ("arguments", "name", "value", "why"),
     [
-        ("x_threshold", 5.0, "2.4 here; it is compiled .* `gymnasium.Wrapper`"),
-        ("kinematics_integrator", "semi-implicit", "make an environment with integrator="),
-        ("total_mass", 3.0, "write masscart and masspole first"),
+        ({}, "x_threshold", 5.0, "2.4 here; it is compiled .* `gymnasium.Wrapper`"),
+        ({}, "kinematics_integrator", "semi-implicit", "make an environment with integrator="),
+        ({}, "total_mass", 3.0, "write masscart and masspole first"),
+        ({"actuator": "paper"}, "tau", 0.5, CHECKED),
+        ({"actuator": "paper", "physics": "analytic"}, "tau", 0.5, CHECKED),
+        (CURRENT, "force_mag", 0.5, "action='force'"),
+        (DRAWN_GRAVITY, "masspole", 0.5, "give `randomize` a distribution"),
     ],
 )
-def test_what_can_only_be_read_says_why_and_what_to_do(name, value, why):
-    env = _pair("cartpole")[0]
+def test_what_cannot_be_changed_says_why_and_what_to_do(arguments, name, value, why):
+    env = _pair("cartpole", **arguments)[0]
     with pytest.raises(AttributeError, match=why):
         setattr(env, name, value)
-    setattr(env, name, getattr(env, name))  # is no change
-
-
-@pytest.mark.parametrize(
-    ("arguments", "name", "why"),
-    [
-        ({"actuator": "paper"}, "tau", "motor and disturbances were checked for this step"),
-        ({"actuator": "paper", "action": "current", "levels": (-1, 1)}, "force_mag", "action='force'"),
-        ({"randomize": {"model.gravity": Uniform(0.9, 1.1)}}, "masspole", "give `randomize` a distribution"),
-        ({"physics": "analytic", "actuator": "paper"}, "tau", "motor and disturbances were checked for this step"),
-    ],
-)
-def test_what_an_environment_cannot_change_it_refuses(arguments, name, why):
-    with pytest.raises(AttributeError, match=why):
-        setattr(_pair("cartpole", **arguments)[0], name, 0.5)
+    if not arguments:
+        setattr(env, name, getattr(env, name))  # is no change
 
 
 @pytest.mark.parametrize("physics", PHYSICS)
@@ -217,6 +198,21 @@ def test_impossible_masses_are_refused_and_nothing_is_changed(value, physics):
     with pytest.raises(ValueError, match=r"masspole = .*: must be a finite number > 0"):
         env.masspole = value
     assert env.masspole == 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error", "message"),
+    [
+        ("state", np.zeros((4, 2)), ValueError, r"of shape \(2, 4\)"),
+        ("tau", 0.1, AttributeError, "tau = 0.1: the environments share it, as 0.02"),
+        ("gravity", [1.0, 2.0, 3.0], ValueError, "must be one number, or 2"),
+    ],
+)
+def test_what_cannot_be_changed_of_a_batch_is_refused(name, value, error, message):
+    env = gymnasium.make_vec("codrl_mj/CartPole-v0", 2, actuator="ideal").unwrapped
+    assert env.get_attr("num_envs") == (2, 2)
+    with pytest.raises(error, match=message):
+        setattr(env, name, value)
 
 
 def test_a_physics_of_ones_own_without_a_model_says_that_it_has_no_such_number(monkeypatch):
@@ -229,8 +225,7 @@ def test_a_physics_of_ones_own_without_a_model_says_that_it_has_no_such_number(m
 
     monkeypatch.setitem(PHYSICS, "still", Still)
     env = _pair("cartpole", physics="still")[0]
-    assert env.x_threshold == 2.4
-    assert env.force_mag == 10.0
+    assert (env.x_threshold, env.force_mag) == (2.4, 10.0)
     for name in ("gravity", "masspole"):
         with pytest.raises(AttributeError, match=r"Still has no MuJoCo model or data.* use physics='mujoco'"):
             getattr(env, name)

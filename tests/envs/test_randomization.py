@@ -1,61 +1,28 @@
 """Actuators and models drawn at resets: from the right distributions, the same alone and in a batch, and in effect."""
 
-import copy
 import dataclasses
 import math
-import pickle
-import re
 
 import gymnasium
 import numpy as np
 import pytest
 import scipy.stats
 
-import codrl_mj
 from codrl_mj import Choice, LogUniform, Uniform
-from codrl_mj.actuators import Actuator, CurrentLoop, Drive, GearMotor, Supply, actuator_over, spectral_radius
+from codrl_mj.actuators import Actuator, CurrentLoop, Drive, GearMotor, Supply, spectral_radius
 from codrl_mj.actuators.stability import spectral_radii, stability_radii
 from codrl_mj.engine.families import HEAD
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.tasks import named_actuator
-from tests.envs.vectors import MODES, assert_equal_episodes, assert_same, batched, looped, random_actions
+from tests.envs.faces import DRIVE, plain, scales
+from tests.envs.vectors import assert_same, batched
 from tests.tasks.faces import actions, every_rebuilt, gymnasiums, random_states
 
-DRIVE = {
-    "controller.kp": LogUniform(0.3, 15.0),  # straddles instability on every task
-    "motor.inductance": Uniform(0.05, 0.2),
-    "motor.torque_constant": Uniform(0.5, 1.5),
-    "motor.arm_radius": Uniform(0.2, 1.2),
-    "controller.max_voltage": Choice([3.0, 12.0, math.inf]),
-    "controller.substeps": Choice([1, 2, 3]),
-    "controller.bemf_compensation": Choice([True, False]),
-}
-MODEL = {
-    "pendulum": ("model.mass.rod", "model.length.rod"),
-    "cartpole": ("model.mass.cart", "model.mass.pole", "model.length.pole"),
-    "acrobot": ("model.mass.upper", "model.mass.lower", "model.length.upper", "model.length.lower"),
-    "mountain_car": ("model.mass.car",),
-    "mountain_car_continuous": ("model.mass.car",),
-}
 JOINT = {"pendulum": "hinge", "cartpole": "slider", "acrobot": "elbow"}
 
 
-def scales(task):
-    """Every scale factor of a task's model, drawn."""
-    return dict.fromkeys((*MODEL[task], "model.gravity"), Uniform(0.6, 1.7))
-
-
-DISTURBED = {
-    "command_delay": 0.03,
-    "pulse_force": 1.0,
-    "pulse_duration": 0.05,
-    "pulse_interval": 0.1,
-}
-IMPERFECT = {"controller": {"current_noise": 0.1}, "supply": {"resistance": 2.0}}
-
-
-def everything(task):
-    """All that the tests draw of a task."""
+def everything_drawn(task):
+    """All that is drawn of a task, its damping too."""
     return DRIVE | scales(task) | {f"model.damping.{JOINT.get(task, 'slider')}": Uniform(0.0, 0.3)}
 
 
@@ -63,38 +30,44 @@ def everything(task):
 
 
 def test_values_have_the_distributions_that_were_asked_for():
-    env = batched("cartpole", 4000, randomize=everything("cartpole"), allow_unstable=True)
-    _, infos = env.reset(seed=3)
-    drawn = infos["randomization"]
+    asked = everything_drawn("cartpole")
+    env = batched("cartpole", 4000, randomize=asked, allow_unstable=True)
+    drawn = env.reset(seed=3)[1]["randomization"]
 
     def probability(name, transform=lambda x: x):
-        low, high = (transform(bound) for bound in (env_bounds[name].low, env_bounds[name].high))
-        assert env_bounds[name].low <= drawn[name].min() < drawn[name].max() <= env_bounds[name].high
+        low, high = transform(asked[name].low), transform(asked[name].high)
+        assert asked[name].low <= drawn[name].min() < drawn[name].max() <= asked[name].high
         return scipy.stats.kstest(transform(drawn[name]), "uniform", (low, high - low)).pvalue
 
-    env_bounds = everything("cartpole")
-    for name, distribution in env_bounds.items():
+    for name, distribution in asked.items():
         if isinstance(distribution, Uniform):
             assert probability(name) > 1e-3, name
     assert probability("controller.kp", np.log) > 1e-3
     assert probability("controller.kp") < 1e-12  # the oracle tells a uniform from a log-uniform
     for name in ("controller.max_voltage", "controller.substeps", "controller.bemf_compensation"):
         values, counts = np.unique(drawn[name], return_counts=True)
-        assert list(values) == sorted(env_bounds[name].values)
+        assert list(values) == sorted(asked[name].values)
         assert scipy.stats.chisquare(counts).pvalue > 1e-3
     assert drawn["controller.substeps"].dtype.kind == "i"
     assert drawn["controller.bemf_compensation"].dtype == bool
-    names = list(env_bounds)
-    table = np.array([drawn[name] for name in names if name != "controller.max_voltage"], dtype=float)
+    table = np.array([drawn[name] for name in asked if name != "controller.max_voltage"], dtype=float)
     correlations = np.corrcoef(table) - np.eye(len(table))
     assert np.abs(correlations).max() < 0.07  # 4.4 standard deviations: no two share a draw
 
 
-@pytest.mark.parametrize("distribution", [Uniform(0.1, 0.7), LogUniform(1e-3, 5.0), Choice([3.0, 1.0, 2.0])])
-def test_a_value_is_a_pure_function_of_its_draw_within_the_bounds(distribution):
+@pytest.mark.parametrize(
+    ("distribution", "formula"),
+    [
+        (Uniform(-1.0, 3.0), lambda draw: -1.0 + 4.0 * draw),
+        (LogUniform(1.0, 16.0), lambda draw: 16.0**draw),
+        (Choice([3.0, 1.0, 2.0]), lambda draw: np.array([3.0, 1.0, 2.0])[(3 * draw).astype(int)]),
+    ],
+)
+def test_a_value_is_the_formula_of_its_draw_within_the_bounds_however_many_are_drawn(distribution, formula):
     draws = np.random.default_rng(0).random(257)
     draws[:2] = 0.0, np.nextafter(1.0, 0.0)
     values = distribution.transform(draws)
+    np.testing.assert_allclose(values, formula(draws), rtol=1e-15 if isinstance(distribution, LogUniform) else 0)
     for size in (1, 2, 3, 5, 8, 13, 64):
         parts = [distribution.transform(draws[start : start + size]) for start in range(0, len(draws), size)]
         np.testing.assert_array_equal(np.concatenate(parts), values)
@@ -102,68 +75,19 @@ def test_a_value_is_a_pure_function_of_its_draw_within_the_bounds(distribution):
     assert values.max() <= max(distribution.extremes)
 
 
-def test_a_value_is_the_formula_of_its_draw():
-    draws = np.array([0.0, 0.25, 0.9])
-    np.testing.assert_array_equal(Uniform(-1.0, 3.0).transform(draws), [-1.0, 0.0, 2.6])
-    np.testing.assert_allclose(LogUniform(1.0, 16.0).transform(draws), [1.0, 2.0, 16.0**0.9], rtol=1e-15)
-    np.testing.assert_array_equal(Choice([5, 6, 7, 8]).transform(draws), [5.0, 6.0, 8.0])
-
-
-# -- one environment and many -------------------------------------------------------------------------------
-
-
-@every_rebuilt
-@pytest.mark.parametrize("mode", MODES)
-def test_drawn_episodes_are_those_of_single_environments(task, mode):
-    arguments = {"randomize": everything(task), "max_episode_steps": 9}
-    ours = batched(task, 4, mode, num_threads=1 if mode == "SameStep" else 2, **arguments)
-    ends = assert_equal_episodes(ours, looped(task, 4, mode, **arguments), 34)
-    assert (ends.sum(axis=1) > 1).all()
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"actuator": "ideal", "randomize": scales("cartpole")},
-        {"randomize": {"controller.kp": LogUniform(0.5, 30.0)}},
-        {"action": "current", "levels": (-1.5, 1.5), "randomize": {"motor.resistance": Uniform(0.5, 2.0)}},
-        {"action": "voltage", "levels": (-9.0, 9.0), "randomize": {"motor.inductance": Uniform(0.05, 0.2)}},
-        {"integrator": "semi-implicit", "randomize": everything("cartpole"), "observe_actuator": True},
-        {"inner_steps": 4, "randomize": everything("cartpole")},
-        {
-            "actuator": actuator_over(named_actuator("paper", "cartpole"), IMPERFECT),
-            "disturbances": DISTURBED,
-            "joint": {"friction": 0.2},
-            "randomize": DRIVE | scales("cartpole"),
-        },
-    ],
-    ids=str,
-)
-def test_so_are_those_of_other_set_ups(arguments):
-    for mode in ("NextStep", "SameStep"):
-        arguments = {"max_episode_steps": 12, **arguments}
-        assert_equal_episodes(batched("cartpole", 3, mode, **arguments), looped("cartpole", 3, mode, **arguments), 40)
-
-
-def test_each_of_different_actuators_is_varied():
-    nominal = [Actuator(controller=CurrentLoop(kp=kp, substeps=2)) for kp in (0.5, 1.0, 2.0)]
-    arguments = {"actuator": nominal, "randomize": {"motor.inductance": Uniform(0.05, 0.2)}}
-    assert_equal_episodes(batched("pendulum", 3, **arguments), looped("pendulum", 3, **arguments), 20)
-
-
 @every_rebuilt
 def test_seeds_draw_gymnasiums_initial_states_all_the_same(task):
     ours = ActuatedEnv(task, randomize={"controller.kp": LogUniform(0.5, 2.0), **scales(task)})
     gym = gymnasiums(task).unwrapped
-    plain = ActuatedEnv(task)
+    undrawn = ActuatedEnv(task)
     for seed in range(5):
         seen, info = ours.reset(seed=seed)
         expected, _ = gym.reset(seed=seed)
         np.testing.assert_array_equal(seen, expected)
         assert info["randomization"]["rejected"] == 0
-        assert plain.reset(seed=seed)[1] == {}
+        assert undrawn.reset(seed=seed)[1] == {}
     # without randomisation nothing more is drawn: a second episode is the second of Gymnasium's, too
-    np.testing.assert_array_equal(plain.reset()[0], gym.reset()[0])
+    np.testing.assert_array_equal(undrawn.reset()[0], gym.reset()[0])
 
 
 # -- in effect ----------------------------------------------------------------------------------------------
@@ -172,25 +96,20 @@ def test_seeds_draw_gymnasiums_initial_states_all_the_same(task):
 @every_rebuilt
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
 def test_the_drawn_actuator_is_what_acts(task, physics):
-    ours = ActuatedEnv(task, physics=physics, randomize=DRIVE)
-    trajectories = []
+    ours, ends = ActuatedEnv(task, physics=physics, randomize=DRIVE), set()
     for seed in range(4):
-        _, info = ours.reset(seed=seed)
-        drawn, actuator = info["randomization"], ours.actuator
+        drawn, actuator = ours.reset(seed=seed)[1]["randomization"], ours.actuator
         for name in DRIVE:
             part, field = name.split(".")
             assert getattr(getattr(actuator, part), field) == drawn[name]
         same = ActuatedEnv(task, physics=physics, actuator=actuator)
         same.reset(seed=seed)
         for action in actions(task, seed, 25):
-            one, other = ours.step(action), same.step(action)
-            assert_same(tuple(map(np.asarray, one[:4])), tuple(map(np.asarray, other[:4])))
-            assert one[4] == other[4]
-            np.testing.assert_array_equal(ours.state, same.state)
-        trajectories.append(ours.state)
+            assert_same(plain((ours.step(action), ours.state)), plain((same.step(action), same.state)))
+        ends.add(tuple(ours.state))
         if physics == "mujoco":
             assert tuple(ours.model.actuator_user[0, HEAD:]) == actuator.numbers
-    assert len(set(map(tuple, trajectories))) == 4
+    assert len(ends) == 4
 
 
 class _DampedAcrobot:
@@ -250,43 +169,31 @@ def changed_gymnasium(task, drawn):
     return step
 
 
-def _equal_moments(task, factors):
-    """The factors, with the lower link's length such that both links of an acrobot have the same moment of inertia."""
+def _factors(task, generator):
+    """Random ones; of an acrobot, both of whose links have the same moment of inertia, with a damped elbow."""
+    factors = {name: generator.uniform(0.6, 1.7) for name in scales(task)}
     if task == "acrobot":
         moment = factors["model.mass.upper"] * factors["model.length.upper"] ** 2
         factors["model.length.lower"] = math.sqrt(moment / factors["model.mass.lower"])
+        factors["model.damping.elbow"] = generator.uniform(0.1, 0.5)
     return factors
 
 
 @every_rebuilt
-def test_masses_lengths_and_gravity_are_those_of_gymnasium_with_changed_attributes(task):
-    generator, worst = np.random.default_rng(5), 0.0
+def test_masses_lengths_gravity_and_damping_are_those_of_gymnasium_with_changed_attributes(task):
+    generator = np.random.default_rng(5)
     for _ in range(6):
-        factors = _equal_moments(task, {name: generator.uniform(0.6, 1.7) for name in scales(task)})
+        factors = _factors(task, generator)
         ours = ActuatedEnv(task, "ideal", randomize={name: Uniform(value, value) for name, value in factors.items()})
-        _, info = ours.reset(seed=0)
-        assert info["randomization"] == factors | {"rejected": 0}
-        step, plain = changed_gymnasium(task, factors), changed_gymnasium(task, dict.fromkeys(factors, 1.0))
+        assert ours.reset(seed=0)[1]["randomization"] == factors | {"rejected": 0}
+        step, unchanged = (changed_gymnasium(task, one) for one in (factors, dict.fromkeys(scales(task), 1.0)))
         for state, action in zip(random_states(task, 1, 5), actions(task, 2, 5), strict=True):
             ours.physics.reset(state)
             ours.step(action)
             after = step(state, action)
-            worst = max(worst, np.abs(ours.state - after).max())
-            matters = np.abs(after - plain(state, action)).max() > 1e-6
+            np.testing.assert_allclose(ours.state, after, rtol=0, atol=1e-12)
+            matters = np.abs(after - unchanged(state, action)).max() > 1e-6
         assert matters or task.startswith("mountain_car")  # the factors matter
-    assert worst <= 1e-12
-
-
-def test_acrobats_damped_elbow_is_gymnasiums_with_a_torque_against_its_speed():
-    ours = ActuatedEnv("acrobot", "ideal", randomize={"model.damping.elbow": Uniform(0.4, 0.4)})
-    ours.reset(seed=0)
-    factors = dict.fromkeys(scales("acrobot"), 1.0)
-    damped, free = (changed_gymnasium("acrobot", factors | {"model.damping.elbow": d}) for d in (0.4, 0.0))
-    for state, action in zip(0.3 * random_states("acrobot", 3, 10), actions("acrobot", 4, 10), strict=True):
-        ours.physics.reset(state)
-        ours.step(action)
-        np.testing.assert_allclose(ours.state, damped(state, action), rtol=0, atol=1e-12)
-        assert np.abs(damped(state, action) - free(state, action)).max() > 1e-4
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3, 5.0])
@@ -325,18 +232,13 @@ def test_cartpoles_explicit_euler_takes_the_damping_explicitly():
 
 def test_a_pattern_names_the_motors_that_are_drawn():
     every, matched = ({path: Uniform(0.05, 0.2)} for path in ("motor.inductance", "slid.*:motor.inductance"))
-    plain, ours = (ActuatedEnv("cartpole", randomize=one).reset(seed=3)[1]["randomization"] for one in (every, matched))
-    assert ours == {"slid.*": {"motor.inductance": plain["motor.inductance"]}, "rejected": 0}
+    everywhere, ours = (
+        ActuatedEnv("cartpole", randomize=one).reset(seed=3)[1]["randomization"] for one in (every, matched)
+    )
+    assert ours == {"slid.*": {"motor.inductance": everywhere["motor.inductance"]}, "rejected": 0}
     many = batched("cartpole", 2, randomize=matched)
     drawn = many.reset(seed=3)[1]["randomization"]
-    assert drawn["slid.*:motor.inductance"][0] == plain["motor.inductance"]
-    with pytest.raises(ValueError, match=r"'hing\.\*': no actuator has such a name"):
-        ActuatedEnv("cartpole", randomize={"hing.*:motor.inductance": Uniform(0.05, 0.2)})
-
-
-def test_joint_friction_is_not_offered_because_the_models_switch_constraints_off():
-    with pytest.raises(ValueError, match=re.escape("unknown field 'model.friction.slider'")):
-        ActuatedEnv("cartpole", randomize={"model.friction.slider": Uniform(0.0, 1.0)})
+    assert drawn["slid.*:motor.inductance"][0] == everywhere["motor.inductance"]
 
 
 def test_what_is_drawn_has_the_drawn_length():
@@ -384,23 +286,14 @@ def _recount(seed, episodes):
 
 def test_unstable_draws_are_rejected_whole_and_counted():
     nominal, randomize = _proportional()
-    env = ActuatedEnv("cartpole", nominal, randomize=randomize)
-    drawn = [env.reset(seed=7)[1]["randomization"]]
-    radii = [spectral_radius(env.actuator, 0.02)]
-    for _ in range(299):
-        drawn.append(env.reset()[1]["randomization"])
+    env, drawn, radii = ActuatedEnv("cartpole", nominal, randomize=randomize), [], []
+    for episode in range(300):
+        drawn.append([*env.reset(seed=7 if episode == 0 else None)[1]["randomization"].values()])
         radii.append(spectral_radius(env.actuator, 0.02))
-    found = np.array([list(one.values()) for one in drawn])
     expected = _recount(7, 300)
-    np.testing.assert_allclose(found, expected, rtol=1e-14)
+    np.testing.assert_allclose(drawn, expected, rtol=1e-14)
     assert max(radii) < 1.0
     assert 50 < expected[:, 2].sum() < 3000  # many were
-
-    vector = batched("cartpole", 300, actuator=nominal, randomize=randomize)
-    infos = vector.reset(seed=0)[1]["randomization"]
-    for row in range(0, 300, 50):
-        first = _recount(row, 1)[0]
-        np.testing.assert_allclose([infos[name][row] for name in (*randomize, "rejected")], first, rtol=1e-14)
 
 
 def test_what_a_motors_fields_refuse_together_is_rejected_too():
@@ -435,19 +328,16 @@ def test_a_winding_too_fast_for_its_supply_is_rejected():
 def test_a_supply_is_drawn_over_that_of_the_controller(supply):
     """No supply is one without resistance at `max_voltage`: a supply's voltage limits the terminal's as that does."""
     nominal = dataclasses.replace(named_actuator("paper", "cartpole"), supply=supply)
-    drawn = ActuatedEnv(
-        "cartpole", nominal, randomize={"supply.voltage": Choice([0.5]), "supply.resistance": Choice([0.0])}
-    )
     limited = dataclasses.replace(nominal, controller=dataclasses.replace(nominal.controller, max_voltage=0.5))
-    fixed = ActuatedEnv("cartpole", limited)
+    choices = {"supply.voltage": Choice([0.5]), "supply.resistance": Choice([0.0])}
+    drawn, fixed = ActuatedEnv("cartpole", nominal, randomize=choices), ActuatedEnv("cartpole", limited)
     for env in (drawn, fixed):
         env.reset(seed=1)
     drawn.state = fixed.state
     assert drawn.actuator.supply == Supply(0.5, 0.0)
     for action in (1, 1, 0, 1, 0, 0):
-        found, expected = drawn.step(action), fixed.step(action)
-        np.testing.assert_array_equal(found[0], expected[0])
-        assert found[4] == expected[4]
+        found = drawn.step(action)
+        assert_same(plain(found), plain(fixed.step(action)))
         assert abs(found[4]["voltage"]) <= 0.5
     sagging = ActuatedEnv("cartpole", nominal, randomize={"supply.resistance": Uniform(1.0, 2.0)})
     sagging.reset(seed=1)
@@ -474,8 +364,6 @@ def test_a_nominal_actuator_may_be_unstable_if_its_draws_are_not():
     unstable = Actuator(controller=CurrentLoop(kp=100.0))
     env = ActuatedEnv("cartpole", unstable, randomize={"controller.kp": Uniform(1.0, 2.0)})
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="unstable"):  # a model's draws leave the loop as it is
-        ActuatedEnv("cartpole", unstable, randomize={"model.gravity": Uniform(0.9, 1.1)})
 
 
 def test_the_radius_of_one_is_that_among_many():
@@ -510,157 +398,3 @@ def test_the_quick_proof_of_stability_and_the_radius_agree():
     np.testing.assert_array_equal(
         spectral_radii(Actuator, edge, 0.02) < 1.0, stability_radii(Actuator, edge, 0.02) < 1.0
     )
-
-
-# -- saved and restored -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("task", ["cartpole", "acrobot", "mountain_car"])
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_a_copy_made_in_mid_episode_goes_on_the_same(task, duplicate):
-    env = ActuatedEnv(task, randomize=everything(task))
-    env.reset(seed=1)
-    for action in actions(task, 0, 5):
-        env.step(action)
-    twin = duplicate(env)
-    for _ in range(3):
-        for action in actions(task, 1, 8):
-            one, other = env.step(action), twin.step(action)
-            assert one[4] == other[4]
-            np.testing.assert_array_equal(env.state, twin.state)
-        assert env.actuator == twin.actuator
-        assert env.reset()[1] == twin.reset()[1]
-
-
-@every_rebuilt
-def test_a_vector_environment_continues_from_plain_arrays_and_as_a_copy(task):
-    arguments = {"randomize": everything(task), "max_episode_steps": 10}
-    env = batched(task, 5, **arguments)
-    generator = np.random.default_rng(0)
-    env.reset(seed=0)
-    for _ in range(14):
-        env.step(random_actions(env, generator))
-    kept, twin = env.snapshot(), pickle.loads(pickle.dumps(env))
-    assert all(isinstance(value, np.ndarray) and value.dtype != object for value in kept.values())
-    batch = [random_actions(env, generator) for _ in range(25)]
-    expected = [env.step(one) for one in batch]
-    fresh = batched(task, 5, **arguments)
-    fresh.reset(seed=99)
-    fresh.restore(kept)
-    for other in (fresh, twin):
-        assert_same(other.randomization["rejected"], kept["rejected"])
-        for one, wanted in zip(batch, expected, strict=True):
-            assert_same(other.step(one), wanted)
-
-
-# -- other faces --------------------------------------------------------------------------------------------
-
-
-def test_dm_control_draws_what_the_environment_draws():
-    suite = pytest.importorskip("codrl_mj.suite")
-    randomize = everything("cartpole")
-    theirs = suite.load("cartpole", randomize=randomize, task_kwargs={"random": 4})
-    ours = ActuatedEnv("cartpole", randomize=randomize)
-    for episode in range(3):
-        _, info = ours.reset(seed=4 if episode == 0 else None)
-        theirs.reset()
-        assert theirs.randomization == info["randomization"]
-        for action in actions("cartpole", episode, 5):
-            ours.step(action)
-            theirs.step(action)
-        np.testing.assert_array_equal(theirs.state, ours.state)
-
-
-def test_stable_baselines_environments_show_what_they_drew():
-    randomize = {"controller.kp": LogUniform(0.5, 5.0)}
-    env = codrl_mj.make_sb3_vec_env("codrl_mj/CartPole-v0", 3, randomize=randomize)
-    env.seed(0)
-    env.reset()
-    same = batched("cartpole", 3, randomize=randomize)
-    _, infos = same.reset(seed=0)
-    np.testing.assert_array_equal(env.randomization["controller.kp"], infos["randomization"]["controller.kp"])
-
-
-# -- bad input ----------------------------------------------------------------------------------------------
-
-BAD = {
-    "unknown": (
-        {"motor.inductanze": Uniform(1, 2)},
-        "unknown field 'motor.inductanze': did you mean 'motor.inductance'",
-    ),
-    "unknown body": ({"model.mass.bole": Uniform(1, 2)}, "did you mean 'model.mass.pole'"),
-    "no length": ({"model.length.cart": Uniform(1, 2)}, "unknown field 'model.length.cart'"),
-    "field's bound": ({"motor.inductance": Uniform(0.0, 0.2)}, "Motor.inductance = 0.0: must be a finite number > 0"),
-    "field's bound below": (
-        {"controller.kp": Uniform(-1.0, 0.2)},
-        "CurrentLoop.kp = -1.0: must be a finite number >= 0",
-    ),
-    "choice's bound": ({"controller.kp": Choice([1.0, -2.0])}, "CurrentLoop.kp = -2.0: must be a finite number >= 0"),
-    "infinite": ({"controller.kp": Choice([1.0, math.inf])}, "CurrentLoop.kp = inf: must be a finite number >= 0"),
-    "substeps": ({"controller.substeps": Uniform(1, 4)}, "controller.substeps must be drawn from a Choice of int"),
-    "substeps float": (
-        {"controller.substeps": Choice([1.5])},
-        "controller.substeps must be drawn from a Choice of int",
-    ),
-    "substeps 0": ({"controller.substeps": Choice([0, 1])}, "CurrentLoop.substeps = 0: must be an integer >= 1"),
-    "flag": ({"controller.bemf_compensation": Choice([0, 1])}, "must be drawn from a Choice of bool"),
-    "bool": ({"controller.kp": Choice([True])}, "controller.kp must be a number"),
-    "mass": ({"model.mass.pole": Uniform(0.0, 1.0)}, "mass.pole = 0: must be a finite number > 0"),
-    "damping": ({"model.damping.hinge": Uniform(-1.0, 1.0)}, "damping.hinge = -1: must be a finite number >= 0"),
-    "no distribution": (
-        {"controller.kp": (1.0, 2.0)},
-        "controller.kp: (1.0, 2.0) is no distribution: must be uniform(",
-    ),
-    "empty": ({}, "must be one or more of FIELD=DISTRIBUTION, or a mapping of fields to these"),
-    "no mapping": ("motor.inductance", "must be one or more of FIELD=DISTRIBUTION, or a mapping of fields to these"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-@pytest.mark.parametrize("make", [lambda **a: ActuatedEnv("cartpole", **a), lambda **a: batched("cartpole", 2, **a)])
-def test_what_cannot_be_drawn_is_refused_with_a_reason(case, make):
-    randomize, message = BAD[case]
-    with pytest.raises(ValueError, match="randomize") as refused:
-        make(randomize=randomize)
-    assert message in str(refused.value)
-    for name in randomize if isinstance(randomize, dict) else ():
-        assert name in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    ("distribution", "arguments", "message"),
-    [
-        (Uniform, (2.0, 1.0), "Uniform.high = 1: must be >= low = 2"),
-        (Uniform, (0.0, math.inf), "Uniform.high = inf: must be a finite number"),
-        (Uniform, ("0", 1.0), "Uniform.low = '0': must be a finite number"),
-        (LogUniform, (0.0, 1.0), "LogUniform.low = 0.0: must be a finite number > 0"),
-        (LogUniform, (math.nan, 1.0), "LogUniform.low = nan: must be a finite number > 0"),
-        (Choice, ([],), "Choice.values = []: must be a sequence of one or more numbers"),
-        (Choice, (["a"],), "'a' must be a number"),
-        (Choice, ([math.nan],), "nan must be a number"),
-    ],
-)
-def test_impossible_bounds_are_refused(distribution, arguments, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        distribution(*arguments)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"actuator": "ideal", "randomize": {"motor.resistance": Uniform(1, 2)}}, "the ideal actuator has no motor"),
-        ({"actuator": "ideal", "randomize": {"controller.kp": Uniform(1, 2)}}, "the ideal actuator has no motor"),
-        ({"physics": "analytic", "randomize": {"model.gravity": Uniform(1, 2)}}, "cannot draw model.gravity"),
-        (
-            {"action": "current", "levels": (-1.0, 1.0), "randomize": {"motor.arm_radius": Uniform(1, 2)}},
-            "it would change what an action means",
-        ),
-        (
-            {"action": "voltage", "levels": (-1.0, 1.0), "randomize": {"controller.kp": Uniform(1, 2)}},
-            "the command goes past the controller",
-        ),
-    ],
-)
-def test_what_does_not_go_together_is_refused(arguments, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        ActuatedEnv("cartpole", **arguments)

@@ -1,145 +1,358 @@
-"""Bad input is refused with a `ValueError` that names field, value and bound."""
+"""Bad input is refused with a sentence that names field, value and bound, and changes nothing."""
 
+import functools
+import math
 import re
 
 import gymnasium
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
-from codrl_mj.envs import ActuatedEnv
-from codrl_mj.physics import PHYSICS, SimulationDivergedError
-from codrl_mj.tasks import TASKS
+from codrl_mj import Choice, LogUniform, Uniform
+from codrl_mj.actuators import Actuator, CurrentLoop, Drive, GearMotor, Motor
+from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv, SerialVectorEnv
+from codrl_mj.physics import PHYSICS
+from codrl_mj.tasks import TASKS, named_actuator
+from tests.envs.faces import commanded
+from tests.envs.vectors import MODES, assert_same, batched, random_actions
 
-UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0, max_voltage=float("inf")))
-
-BAD = {
-    "task": ({"task": "cartpol"}, "unknown task 'cartpol': did you mean 'cartpole'"),
-    "task like none": ({"task": "xyz"}, "unknown task 'xyz': Known: "),
-    "actuator": ({"actuator": "papr"}, "unknown actuator 'papr': did you mean 'paper'"),
-    "actuator type": ({"actuator": 3.0}, r"actuator = 3.0: must be a name"),
-    "actuator field": ({"actuator": {"motor": {"resistanze": 1}}}, "motor.resistanze; did you mean motor.resistance?"),
-    "actuator value": (
-        {"actuator": {"motor": {"resistance": -1.0}}},
-        "Motor.resistance = -1.0: must be a finite number > 0",
-    ),
-    "physics": ({"physics": "bullet"}, "unknown physics 'bullet': Known: mujoco, analytic"),
-    "integrator": ({"integrator": "rk45"}, "integrator = 'rk45': cartpole has euler, semi-implicit"),
-    "inner_steps": ({"inner_steps": 0}, "inner_steps = 0: must be an integer >= 1"),
-    "timestep": ({"timestep": -0.01}, "timestep = -0.01: must be a finite number > 0"),
-    "timestep text": ({"timestep": "1e-3"}, "timestep = '1e-3': must be a finite number > 0"),
-    "timestep ratio": ({"timestep": 0.015}, "timestep = 0.015 s does not divide cartpole's environment step of 0.02 s"),
-    "both": ({"inner_steps": 2, "timestep": 0.01}, "inner_steps = 2 and timestep = 0.01: give one of them, not both"),
-    "option": ({"centre_radius": 0.1}, "unknown option 'centre_radius' of cartpole: it has center_radius"),
-    "option value": ({"center_radius": -0.1}, "center_radius = -0.1: must be a number > 0"),
-    "option NaN": ({"center_radius": float("nan")}, "center_radius = nan: must be a number > 0"),
-    "option type": ({"center_radius": "0.1"}, "center_radius = '0.1': must be a number > 0"),
-    "option bool": ({"center_radius": True}, "center_radius = True: must be a number > 0"),
-}
+INF, NAN = math.inf, math.nan
+STABLE = Actuator(Motor(), CurrentLoop(kp=1.0))
+UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0, max_voltage=INF))
+WILD = Actuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=INF))
+GEARED = Drive(GearMotor(rotor_inertia=0.001, gear_ratio=20.0))
+WEAK, IDEAL = named_actuator("weak", "pendulum"), {"family": "ideal"}
+CURRENT = {"action": "current", "levels": (-1.0, 1.0)}
+VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_a_bad_argument_is_refused(case):
-    arguments, message = BAD[case]
+# -- arguments ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"task": "cartpol"}, "unknown task 'cartpol': did you mean 'cartpole'"),
+        ({"task": "xyz"}, "unknown task 'xyz': Known: "),
+        ({"actuator": "papr"}, "unknown actuator 'papr': did you mean 'paper'"),
+        ({"actuator": 3.0}, "actuator = 3.0: must be a name"),
+        ({"actuator": {"motor": {"resistanze": 1}}}, "motor.resistanze; did you mean motor.resistance?"),
+        ({"actuator": {"motor": {"resistance": -1.0}}}, "Motor.resistance = -1.0: must be a finite number > 0"),
+        ({"actuator": IDEAL | {"controller": {"current_noise": 0.1}}}, "unknown actuator field controller"),
+        ({"actuator": IDEAL | {"supply": {"resistance": 1}}}, "unknown actuator field supply"),
+        ({"physics": "bullet"}, "unknown physics 'bullet': Known: mujoco, analytic"),
+        ({"integrator": "rk45"}, "integrator = 'rk45': cartpole has euler, semi-implicit"),
+        *(
+            ({"inner_steps": bad}, f"inner_steps = {bad!r}: must be an integer >= 1")
+            for bad in (0, 1.5, 2.0, True, "2")
+        ),
+        *(
+            ({"timestep": bad}, f"timestep = {bad!r}: must be a finite number > 0")
+            for bad in (0.0, -0.01, NAN, INF, "1")
+        ),
+        ({"timestep": 0.015}, "timestep = 0.015 s does not divide cartpole's environment step of 0.02 s"),
+        ({"inner_steps": 2, "timestep": 0.01}, "inner_steps = 2 and timestep = 0.01: give one of them, not both"),
+        ({"centre_radius": 0.1}, "unknown option 'centre_radius' of cartpole: it has center_radius"),
+        ({"center_radius": -0.1}, "center_radius = -0.1: must be a number > 0"),
+        ({"center_radius": NAN}, "center_radius = nan: must be a number > 0"),
+        ({"center_radius": "0.1"}, "center_radius = '0.1': must be a number > 0"),
+        ({"center_radius": True}, "center_radius = True: must be a number > 0"),
+        ({"action": "torque"}, "action = 'torque': must be one of force, current, voltage"),
+        ({"levels": (0.0, 1.0)}, "only for action='current' and action='voltage'"),
+        ({**VOLTAGE, "task": "pendulum"}, "only for tasks with discrete actions; pendulum's are continuous"),
+        ({"action": "current", "actuator": "ideal"}, "the ideal actuator has no current to command"),
+        ({"action": "voltage", "actuator": None}, "the ideal actuator has no voltage to command"),
+        ({"observe_actuator": True, "actuator": "ideal"}, "observe_actuator=True: the ideal actuator has no current"),
+        (
+            {"action": "voltage", "actuator": {"controller": {"max_voltage": INF}}},
+            "action = 'voltage': needs a finite controller.max_voltage, it is inf",
+        ),
+        # |1 - (1 + 100) * 0.02 / 0.1| = 19.2; in inner steps of less than 2 L / (R + kp) = 0.00198 s it is stable
+        ({"actuator": UNSTABLE}, "unstable at a step of 0.02 s: spectral radius 19.2, must be < 1"),
+        ({"actuator": UNSTABLE, "inner_steps": 10}, "unstable at a step of 0.002 s"),
+        # |1 - R dt / L| = 2
+        ({**VOLTAGE, "actuator": Actuator(Motor(resistance=15.0))}, "unstable at a step of 0.02 s"),
+        ({"actuator": {"supply": {"resistance": 9.0}}}, "supply.resistance = 9: must be < "),
+        ({"physics": "analytic", "joint": {"damping": 0.1}}, "use physics='mujoco'"),
+        ({"physics": "analytic", "joint": {"friction": 0.1}}, "no place for it"),
+        ({"physics": "analytic", "joint": {"armature": 0.1}}, "joint.armature = 0.1"),
+        (
+            {"render_mode": "rgb_array", "camera": "fixd"},
+            "camera = 'fixd': did you mean 'fixed'? The model's cameras are fixed, close",
+        ),
+        ({"render_mode": "rgb_array", "width": 0}, "width = 0: must be an integer from 1 to 3840 [px]"),
+        ({"render_mode": "rgb_array", "width": 3841}, "width = 3841: must be an integer from 1 to 3840 [px]"),
+        ({"render_mode": "rgb_array", "height": 2161}, "height = 2161: must be an integer from 1 to 2160 [px]"),
+        ({"render_mode": "rgb_array", "height": 100.5}, "height = 100.5: must be an integer from 1 to 2160 [px]"),
+        ({"render_mode": "rgb_array", "height": True}, "height = True: must be an integer from 1 to 2160 [px]"),
+        (
+            {"render_mode": "rgb_array", "physics": "analytic", "camera": "fixd"},
+            "camera = 'fixd': did you mean 'fixed'?",
+        ),
+    ],
+)
+def test_a_bad_argument_of_one_environment_is_refused(arguments, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         ActuatedEnv(**{"task": "cartpole", **arguments})
 
 
-def test_an_unknown_render_mode_is_refused_when_it_is_rendered():
+@pytest.mark.parametrize("make", [ActuatedVectorEnv, SerialVectorEnv])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 0}, "num_envs = 0: must be an integer >= 1"),
+        ({"num_envs": 1.5}, "num_envs = 1.5: must be an integer >= 1"),
+        ({"num_envs": True}, "num_envs = True: must be an integer >= 1"),
+        ({"max_episode_steps": 0}, "max_episode_steps = 0: must be an integer >= 1"),
+        ({"max_episode_steps": 1.5}, "max_episode_steps = 1.5: must be an integer >= 1"),
+        ({"max_episode_steps": True}, "max_episode_steps = True: must be an integer >= 1"),
+        ({"task": "pendulm"}, "unknown task 'pendulm': did you mean 'pendulum'"),
+        ({"centre_radius": 0.1}, "unknown option 'centre_radius' of pendulum: it has none"),
+        ({"actuator": [WEAK] * 2}, "2 actuators for 3 environments: there must be one for each"),
+        ({"actuator": [WEAK] * 4}, "4 actuators for 3 environments: there must be one for each"),
+        ({"actuator": []}, "0 actuators for 3 environments: there must be one for each"),
+    ],
+)
+def test_a_bad_argument_of_many_environments_is_refused(make, arguments, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make(**{"task": "pendulum", "num_envs": 3, **arguments})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"physics": "analytic"}, "one Gymnasium environment at a time: use vectorization_mode='sync' for it"),
+        ({"num_threads": -1}, "num_threads = -1: must be an integer >= 0"),
+        ({"num_threads": "2"}, "num_threads = '2': must be an integer >= 0"),
+        ({"autoreset_mode": "Sometimes"}, "'Sometimes' is not a valid AutoresetMode"),
+        ({"render_mode": "human"}, "render_mode = 'human': must be one of None, rgb_array"),
+        ({"render_mode": "rgb_array", "camera": "far"}, "camera = 'far'"),
+        ({"actuator": [STABLE, "ideal", STABLE]}, "actuator[1] = 'ideal': must be an Actuator"),
+        ({"actuator": ["weak", None, "weak"]}, "actuator[1] = None: must be an Actuator"),
+        ({"actuator": ["weak", "weka", "weak"]}, "actuator[1]: unknown actuator 'weka': did you mean 'weak'?"),
+        ({"actuator": ["weak", "weak", 3]}, "actuator[2]: actuator = 3: must be a name"),
+        ({"actuator": ["weak", "lag", "weak"]}, "actuators of several families (Actuator, Lag)"),
+        ({"actuator": WILD}, "unstable at a step of 0.05 s: spectral radius"),
+        ({"actuator": [STABLE, STABLE, WILD]}, "actuator[2]: actuator: the current loop is unstable at a step of 0.05"),
+        ({"actuator": [STABLE] * 3, "action": "voltage"}, "with an actuator for each environment only 'force'"),
+    ],
+)
+def test_a_bad_argument_of_a_batch_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        ActuatedVectorEnv(**{"task": "pendulum", "num_envs": 3, **arguments})
+
+
+@pytest.mark.parametrize("physics", PHYSICS)
+def test_an_unknown_render_mode_is_refused_when_it_is_rendered(physics):
     """Gymnasium warns of it when the environment is made, and its test suite wants no more."""
-    env = ActuatedEnv("cartpole", render_mode="rgb_aray")
-    env.reset(seed=0)
+    env = ActuatedEnv("cartpole", physics=physics, render_mode="rgb_aray")
     with pytest.raises(ValueError, match=re.escape("render_mode = 'rgb_aray': must be None, 'human' or 'rgb_array'")):
         env.render()
 
 
-@pytest.mark.parametrize(
-    ("view", "message"),
-    [
-        ({"camera": "fixd"}, "camera = 'fixd': did you mean 'fixed'? The model's cameras are fixed, close"),
-        ({"width": 0}, "width = 0: must be an integer from 1 to 3840 [px]"),
-        ({"width": 3841}, "width = 3841: must be an integer from 1 to 3840 [px]"),
-        ({"height": 2161}, "height = 2161: must be an integer from 1 to 2160 [px]"),
-        ({"height": 100.5}, "height = 100.5: must be an integer from 1 to 2160 [px]"),
-        ({"height": True}, "height = True: must be an integer from 1 to 2160 [px]"),
-    ],
-)
-@pytest.mark.parametrize("physics", PHYSICS)
-def test_a_bad_view_is_refused(view, message, physics):
-    def look():
-        env = ActuatedEnv("cartpole", physics=physics, render_mode="rgb_array", **view)
-        env.reset(seed=0)
-        env.render()
-
-    with pytest.raises(ValueError, match=re.escape(message)):
-        look()
-
-
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize(
-    "action", [np.nan, None, "left", 7, -1, 1.5, [0, 1], np.array([np.nan], np.float32), {}], ids=repr
-)
-def test_a_bad_action_is_refused_and_changes_nothing(task, action):
-    env = gymnasium.make(TASKS[task].env_id, disable_env_checker=True).unwrapped
-    env.reset(seed=0)
-    before = env.state
-    with pytest.raises(ValueError, match="action") as refused:
-        env.step(action)
-    assert repr(action) in str(refused.value)
-    np.testing.assert_array_equal(env.state, before)
-    assert env.data.time == 0.0
-
-
-def test_an_unstable_loop_is_refused_with_its_radius_and_allowed_on_request(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # the engine writes a log
-    # |1 - (1 + 100)*0.02/0.1| = 19.2
-    with pytest.raises(ValueError, match=r"unstable at a step of 0\.02 s: spectral radius 19\.2, must be < 1"):
-        ActuatedEnv("cartpole", actuator=UNSTABLE)
-    for physics in PHYSICS:
-        env = ActuatedEnv("cartpole", actuator=UNSTABLE, physics=physics, allow_unstable=True)
-        env.reset(seed=0)
-
-        def run(env=env):
-            for _ in range(500):
-                env.step(1)
-
-        with (
-            np.errstate(all="ignore"),
-            pytest.raises(SimulationDivergedError, match="cartpole: the simulation diverged"),
-        ):
-            run()
-        env.reset(seed=0)
-        assert np.isfinite(env.step(1)[0]).all()
-
-
-def test_an_unstable_loop_is_stable_with_the_substeps_that_the_refusal_proposes():
+def test_an_unstable_loop_is_stable_with_the_substeps_that_the_refusal_proposes_and_in_a_shorter_step():
     with pytest.raises(ValueError, match=r"controller\.substeps = \d+") as refused:
         ActuatedEnv("cartpole", actuator=UNSTABLE)
-    substeps = int(re.search(r"controller\.substeps = (\d+)", str(refused.value)).group(1))
     mapping = UNSTABLE.as_mapping()
-    mapping["controller"]["substeps"] = substeps
+    mapping["controller"]["substeps"] = int(re.search(r"controller\.substeps = (\d+)", str(refused.value)).group(1))
     env = ActuatedEnv("cartpole", actuator=mapping)
     env.reset(seed=0)
     for _ in range(20):
-        _, _, _, _, info = env.step(1)
+        info = env.step(1)[-1]
     # no integral: the current is kp/(R + kp) of its reference
     assert info["current"] == pytest.approx(info["reference_current"] * 100 / 101, rel=1e-3)
+    ActuatedEnv("cartpole", actuator=UNSTABLE, inner_steps=11)
 
 
-def test_a_shorter_step_makes_a_loop_stable_too():
-    # a proportional loop is stable up to dt = 2L/(R + kp) = 0.00198 s
-    for inner_steps, fine in ((10, False), (11, True)):
-        if fine:
-            ActuatedEnv("cartpole", actuator=UNSTABLE, inner_steps=inner_steps)
-        else:
-            with pytest.raises(ValueError, match="unstable"):
-                ActuatedEnv("cartpole", actuator=UNSTABLE, inner_steps=inner_steps)
+# -- what is drawn ------------------------------------------------------------------------------------------
+
+DISTRIBUTION = "is no distribution: must be uniform(LOW, HIGH), "
 
 
-def test_a_mapping_is_as_good_as_an_actuator():
-    mapping = {"motor": {"arm_radius": 0.15}, "controller": {"kp": 2.0}}
-    one, two = (
-        ActuatedEnv("cartpole", actuator=mapping),
-        ActuatedEnv("cartpole", actuator=Actuator.from_mapping(mapping)),
-    )
-    assert one.actuator == two.actuator
+@pytest.mark.parametrize(
+    "make", [functools.partial(ActuatedEnv, "cartpole"), functools.partial(batched, "cartpole", 2)]
+)
+@pytest.mark.parametrize(
+    ("randomize", "message"),
+    [
+        ({}, "randomize = {}: must be one or more of FIELD=DISTRIBUTION, or a mapping of fields to these"),
+        ("a=uniform(0, 1)", "randomize = 'a=uniform(0, 1)': must be one or more of FIELD=DISTRIBUTION"),
+        (3, "randomize = 3: must be one or more of FIELD=DISTRIBUTION"),
+        (["motor.inductance"], "randomize: 'motor.inductance': must be FIELD=DISTRIBUTION, such as "),
+        (["=uniform(0, 1)"], "randomize: '=uniform(0, 1)': must be FIELD=DISTRIBUTION, such as "),
+        ([3], "randomize: 3: must be FIELD=DISTRIBUTION, such as "),
+        (["a=uniform(0, 1)", "a=choice(1)"], "randomize: a is named twice"),
+        ({"a": {"uniform": [0, 1]}}, f"randomize: a: {{'uniform': [0, 1]}} {DISTRIBUTION}"),
+        ({"a": 0.3}, f"randomize: a: 0.3 {DISTRIBUTION}"),
+        ({"controller.kp": (1.0, 2.0)}, f"randomize: controller.kp: (1.0, 2.0) {DISTRIBUTION}"),
+        (["a=gauss(0, 1)"], "randomize: a: 'gauss(0, 1)' is no distribution: it must be uniform(LOW, HIGH), "),
+        (["a=uniform(1)"], "randomize: a: 'uniform(1)' has 1 values: must be uniform(LOW, HIGH)"),
+        (["a=uniform(2, 1)"], "randomize: a: 'uniform(2, 1)': Uniform.high = 1: must be >= low = 2"),
+        (["(:a=uniform(0, 1)"], "randomize: (:a: '(': must be a regular expression (missing ), "),
+        (
+            {"arm": {"model.gravity": "uniform(1, 2)"}},
+            "randomize: arm:model.gravity: model.gravity is the model's, not a motor's: leave 'arm' out",
+        ),
+        ({"hing.*:motor.inductance": Uniform(0.05, 0.2)}, "'hing.*': no actuator has such a name"),
+        ({"motor.inductanze": Uniform(1, 2)}, "unknown field 'motor.inductanze': did you mean 'motor.inductance'"),
+        ({"model.mass.bole": Uniform(1, 2)}, "unknown field 'model.mass.bole': did you mean 'model.mass.pole'"),
+        ({"model.length.cart": Uniform(1, 2)}, "unknown field 'model.length.cart'"),
+        ({"model.friction.slider": Uniform(0, 1)}, "unknown field 'model.friction.slider'"),
+        ({"motor.inductance": Uniform(0.0, 0.2)}, "Motor.inductance = 0.0: must be a finite number > 0"),
+        ({"controller.kp": Uniform(-1.0, 0.2)}, "CurrentLoop.kp = -1.0: must be a finite number >= 0"),
+        ({"controller.kp": Choice([1.0, -2.0])}, "CurrentLoop.kp = -2.0: must be a finite number >= 0"),
+        ({"controller.kp": Choice([1.0, INF])}, "CurrentLoop.kp = inf: must be a finite number >= 0"),
+        ({"controller.kp": Choice([True])}, "controller.kp must be a number"),
+        ({"controller.substeps": Uniform(1, 4)}, "controller.substeps must be drawn from a Choice of int"),
+        ({"controller.substeps": Choice([1.5])}, "controller.substeps must be drawn from a Choice of int"),
+        ({"controller.substeps": Choice([0, 1])}, "CurrentLoop.substeps = 0: must be an integer >= 1"),
+        (
+            {"controller.bemf_compensation": Choice([0, 1])},
+            "controller.bemf_compensation must be drawn from a Choice of bool",
+        ),
+        ({"model.mass.pole": Uniform(0.0, 1.0)}, "mass.pole = 0: must be a finite number > 0"),
+        ({"model.damping.hinge": Uniform(-1.0, 1.0)}, "damping.hinge = -1: must be a finite number >= 0"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(make, randomize, message):
+    with pytest.raises(ValueError, match=f"^randomize.*{re.escape(message.removeprefix('randomize'))}"):
+        make(randomize=randomize)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"actuator": "ideal", "randomize": {"motor.resistance": Uniform(1, 2)}}, "the ideal actuator has no motor"),
+        ({"actuator": "ideal", "randomize": {"controller.kp": Uniform(1, 2)}}, "the ideal actuator has no motor"),
+        ({"physics": "analytic", "randomize": {"model.gravity": Uniform(1, 2)}}, "cannot draw model.gravity"),
+        ({**CURRENT, "randomize": {"motor.arm_radius": Uniform(1, 2)}}, "it would change what an action means"),
+        ({**VOLTAGE, "randomize": {"controller.kp": Uniform(1, 2)}}, "the command goes past the controller"),
+        ({"actuator": GEARED, "randomize": {"motor.gear_ratio": Uniform(0, 1)}}, "GearMotor.gear_ratio = 0.0: must be"),
+        ({"actuator": GEARED, "randomize": {"motor.rotor_inertia": Uniform(-1, 1)}}, "GearMotor.rotor_inertia = -1.0"),
+        ({"actuator": GEARED, "randomize": {"motor.gear_efficiency": Uniform(0, 1)}}, "GearMotor.gear_efficiency = 0"),
+        # a model's draws leave the loop as it is
+        ({"actuator": UNSTABLE, "randomize": {"model.gravity": Uniform(0.9, 1.1)}}, "unstable"),
+    ],
+)
+def test_draws_that_do_not_go_with_the_rest_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        ActuatedEnv("cartpole", **arguments)
+
+
+@pytest.mark.parametrize(
+    ("distribution", "arguments", "message"),
+    [
+        (Uniform, (2.0, 1.0), "Uniform.high = 1: must be >= low = 2"),
+        (Uniform, (0.0, INF), "Uniform.high = inf: must be a finite number"),
+        (Uniform, ("0", 1.0), "Uniform.low = '0': must be a finite number"),
+        (LogUniform, (0.0, 1.0), "LogUniform.low = 0.0: must be a finite number > 0"),
+        (LogUniform, (NAN, 1.0), "LogUniform.low = nan: must be a finite number > 0"),
+        (Choice, ([],), "Choice.values = []: must be a sequence of one or more numbers"),
+        (Choice, (["a"],), "'a' must be a number"),
+        (Choice, ([NAN],), "nan must be a number"),
+    ],
+)
+def test_impossible_bounds_are_refused(distribution, arguments, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        distribution(*arguments)
+
+
+# -- actions ------------------------------------------------------------------------------------------------
+
+NEITHER = [None, "1", "left", {}, np.nan, 0.5, 1.5, -1, 7, [0, 1], np.zeros(2), np.zeros(1, int), np.array([np.nan])]
+NO_BOX = [1, np.float32([np.nan]), np.array(0.5), np.zeros((1, 1)), np.array([True]), np.array(["1"])]
+NO_CHOICE = [4, 1.0, np.array([0.0])]
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("command", ["force", "current", "voltage"])
+def test_what_is_no_action_is_refused_and_changes_nothing(task, command):
+    env = ActuatedEnv(task, **commanded(task, command))
+    env.reset(seed=0)
+    before = env.snapshot()
+    for action in NEITHER + (NO_CHOICE if hasattr(env.action_space, "n") else NO_BOX):
+        with pytest.raises(ValueError, match=rf"^action = {re.escape(repr(action))}: not in (Box|Discrete)"):
+            env.step(action)
+        assert_same(env.snapshot(), before)
+
+
+def _wrong_batches(env):
+    """Batches of actions for four that are refused, with the index of the environment to be named, or None."""
+    good = random_actions(env, np.random.default_rng(0))
+    wrong = [(good[:3], None), (np.concatenate([good, good]), None), (good[0], None), (None, None), ("left", None)]
+    if isinstance(env.single_action_space, gymnasium.spaces.Discrete):
+        wrong += [(good.astype(float), None), (good[:, None], None), (good > 0, None)]
+        values = [-1, env.single_action_space.n, np.iinfo(np.int64).max]
+    else:
+        wrong += [(np.ones((4, 1), int), None), (good[:, 0], None), (np.ones((4, 2), np.float32), None)]
+        values = [np.nan]
+    for row, value in zip((2, 0, 3), values * 3, strict=False):
+        bad = good.copy()
+        bad[row] = value
+        wrong.append((bad, row))
+    return wrong
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("mode", MODES)
+def test_bad_batches_of_actions_are_refused_before_anything_is_stepped(task, mode):
+    env, control = batched(task, 4, mode), batched(task, 4, mode)
+    generator = np.random.default_rng(1)
+    for one in (env, control):
+        one.reset(seed=0)
+    before = env.unwrapped.snapshot()
+    for actions, row in _wrong_batches(env):
+        with pytest.raises(ValueError, match="actions" if row is None else rf"actions\[{row}\] .*environment {row}\)"):
+            env.step(actions)
+        assert_same(env.unwrapped.snapshot(), before)
+    actions = random_actions(env, generator)
+    assert_same(env.step(actions), control.step(actions))
+
+
+# -- resets -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"seed": [1, 2]}, "seed: 2 seeds for 3 environments"),
+        ({"seed": [1, 2, 3, 4]}, "seed: 4 seeds for 3 environments"),
+        ({"options": {"reset_mask": np.ones(2, bool)}}, "must be a bool array of shape (3,) with a True in it"),
+        ({"options": {"reset_mask": np.ones(3)}}, "must be a bool array of shape (3,)"),
+        ({"options": {"reset_mask": [True] * 3}}, "must be a bool array of shape (3,)"),
+        ({"options": {"reset_mask": np.zeros(3, bool)}}, "with a True in it"),
+        ({"options": {"low": 0.5, "high": -0.5}}, "low"),
+        ({"options": {"low": "left"}}, "left"),
+        ({"seed": -1}, "-1"),
+    ],
+)
+def test_a_bad_reset_of_many_is_refused_and_changes_nothing(arguments, message):
+    env = ActuatedVectorEnv(3, "cartpole")
+    env.reset(seed=0)
+    env.step(np.ones(3, int))
+    before = env.snapshot()
+    with pytest.raises((ValueError, gymnasium.error.Error), match=re.escape(message)):
+        env.reset(**arguments)
+    assert_same(env.snapshot(), before)
+
+
+@pytest.mark.parametrize("value", [-1.0, NAN])
+@pytest.mark.parametrize("make", [ActuatedEnv, functools.partial(ActuatedVectorEnv, 2)])
+def test_reset_options_out_of_order_are_refused(make, value):
+    with pytest.raises(ValueError, match=re.escape(f"reset options = {{'x_init': {value}}}: ask for [")):
+        make("pendulum").reset(seed=0, options={"x_init": value})
+
+
+def test_an_environment_that_ended_is_not_stepped_again_unless_reset():
+    env = batched("cartpole", 3, "Disabled", max_episode_steps=2)
+    env.reset(seed=0)
+    env.step(np.zeros(3, int))
+    env.reset(options={"reset_mask": np.array([True, False, True])})
+    *_, truncated, _ = env.step(np.zeros(3, int))
+    np.testing.assert_array_equal(truncated, [False, True, False])
+    before = env.unwrapped.snapshot()
+    with pytest.raises(RuntimeError, match="environment 1 has ended and was not reset"):
+        env.step(np.zeros(3, int))
+    assert_same(env.unwrapped.snapshot(), before)
+    env.reset(options={"reset_mask": truncated})
+    env.step(np.zeros(3, int))

@@ -1,5 +1,6 @@
 """Divergence is reported, never hidden; and no actuator parts MuJoCo from Gymnasium's dynamics."""
 
+import ctypes
 import dataclasses
 
 import mujoco
@@ -9,16 +10,24 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor, spectral_radius
-from codrl_mj.envs import ActuatedEnv
+from codrl_mj.engine import CallbackInUseError
+from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
 from codrl_mj.physics import PHYSICS, SimulationDivergedError
 from codrl_mj.tasks import TASKS
 from tests.actuators.strategies import between, zero_or
+from tests.envs.vectors import MODES, assert_same, batched, random_actions
 from tests.matrix import but
 from tests.tasks.faces import REBUILT
 
 every_task = pytest.mark.parametrize("task", TASKS)
 WILD = Actuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=float("inf")))
 pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered", "ignore:invalid value encountered")
+
+
+@pytest.fixture(autouse=True)
+def _logs_of_the_engine(tmp_path, monkeypatch):
+    """The engine writes a log where it works."""
+    monkeypatch.chdir(tmp_path)
 
 
 def _constant_action(env):
@@ -32,10 +41,7 @@ def _constant_action(env):
 @every_task
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("command", ["force", "voltage"])
-def test_a_diverging_simulation_raises_with_task_and_entry_and_is_not_reset(
-    task, physics, command, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)  # the engine writes a log
+def test_a_diverging_simulation_raises_with_task_and_entry_and_is_not_reset(task, physics, command):
     actuator, options = WILD, {"inner_steps": 1}
     if command == "voltage":  # a winding too fast for the step: |1 - R dt/L| = 1e4 dt - 1
         actuator = Actuator(Motor(inductance=1e-4), CurrentLoop(max_voltage=10.0))
@@ -69,36 +75,67 @@ def test_a_diverging_simulation_raises_with_task_and_entry_and_is_not_reset(
     np.testing.assert_array_equal(env.state, fresh.state)
 
 
-@pytest.mark.parametrize("physics", PHYSICS)
+BEYOND = (np.inf, -np.inf, 1e11, 1e300)
+
+
 @pytest.mark.parametrize(
-    ("task", "entry", "value"),
-    [(task, entry, np.nan) for task in REBUILT for entry in (0, -1)]
-    + [("cartpole", entry, value) for entry in range(4) for value in (np.inf, -np.inf, 1e11)],
+    ("task", "physics", "value"),
+    [
+        *((task, "mujoco", value) for task in TASKS for value in (np.nan, *BEYOND)),
+        *((task, "analytic", np.nan) for task in REBUILT),
+        *(("cartpole", "analytic", value) for value in BEYOND),  # others' equations, Gymnasium's, clip it
+    ],
 )
-def test_a_state_that_is_no_number_is_reported_at_the_next_step(task, entry, value, physics, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # the engine writes a log
-    env = ActuatedEnv(task, actuator="default", physics=physics)
-    env.reset(seed=0)
-    state = env.state
-    state[entry] = value
-    env.physics.reset(state)
-    with pytest.raises(SimulationDivergedError, match=f"^{task}: "):
-        env.step(_constant_action(env))
+def test_a_lost_state_is_reported_at_the_next_step_and_a_reset_helps(task, physics, value):
+    """A wall, a speed limit or a wrapped angle would make it look like any other."""
+    env = ActuatedEnv(task, "default", physics)
+    action = _constant_action(env)
+    for entry in range(len(TASKS[task].state_names)):
+        env.reset(seed=0)
+        state = env.state
+        state[entry] = value
+        env.physics.reset(state)
+        with pytest.raises(SimulationDivergedError, match=f"^{task}: the simulation diverged"):
+            env.step(action)
+    assert np.isfinite(env.reset(seed=0)[0]).all()
+    assert np.isfinite(env.step(action)[0]).all()
 
 
 @every_task
-@pytest.mark.parametrize("value", [np.inf, -np.inf, 1e11])
-@pytest.mark.parametrize("entry", [0, -1])
-def test_a_lost_state_is_not_brought_back_within_the_tasks_bounds(task, entry, value, tmp_path, monkeypatch):
-    """A wall, a speed limit or a wrapped angle would make it look like any other."""
-    monkeypatch.chdir(tmp_path)  # the engine writes a log
-    env = ActuatedEnv(task, actuator="default")
+@pytest.mark.parametrize("mode", MODES)
+def test_a_lost_environment_is_named_and_the_others_go_on_once_it_is_reset(task, mode):
+    limit = 3 if mode == "NextStep" else 6  # the others' episodes end in the step that is lost, or at last
+    env, control = (batched(task, 3, mode, max_episode_steps=limit).unwrapped for _ in range(2))
+    actions = random_actions(env, np.random.default_rng(0))
+    for one in (env, control):
+        one.reset(seed=0)
+        one.step(actions)
+    lost = env.snapshot()
+    lost["physics"][1] = np.nan
+    env.restore(lost)
+    for _ in range(2):  # until it is reset
+        with pytest.raises(SimulationDivergedError, match=rf"^{task}: 1 of 3 simulations diverged; environment 1 at t"):
+            env.step(actions)
+        control.step(actions)
+    for one in (env, control):
+        one.reset(seed=[None, 7, None], options={"reset_mask": np.array([False, True, False])})
+    np.testing.assert_array_equal(env.state, control.state)
+    for _ in range(3):
+        assert_same(env.step(actions), control.step(actions))
+
+
+def test_a_foreign_callback_is_refused_at_the_start_and_at_a_reset(bare_engine):
+    foreign = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(lambda *_: None)
+    env = ActuatedVectorEnv(2, "pendulum")
     env.reset(seed=0)
-    state = env.state
-    state[entry] = value
-    env.physics.reset(state)
-    with pytest.raises(SimulationDivergedError, match=f"^{task}: "):
-        env.step(_constant_action(env))
+    mujoco.set_mjcb_control(None)
+    mujoco.set_mjcb_control(foreign)
+    with pytest.raises(CallbackInUseError, match="mjcb_control is already set"):
+        ActuatedVectorEnv(2, "pendulum")
+    with pytest.raises(CallbackInUseError, match="mjcb_control is already set"):
+        env.reset(seed=0)
+    mujoco.set_mjcb_control(None)
+    assert_same(env.reset(seed=0), ActuatedVectorEnv(2, "pendulum").reset(seed=0))
 
 
 # -- any actuator -------------------------------------------------------------------------------------------

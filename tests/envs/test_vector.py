@@ -1,30 +1,25 @@
 """The vector environment is Gymnasium's loop over single environments, bit for bit."""
 
 import copy
-import itertools
-import math
-import pickle
-import re
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
-from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
+from codrl_mj import LogUniform, Uniform, make_sb3_vec_env
+from codrl_mj.actuators import Actuator, CurrentLoop
+from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.sb3 import make_sb3_vec_env
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed
+from tests.envs.faces import DRIVE, SETUPS, arguments, scales
 from tests.envs.vectors import MODES, assert_equal_episodes, assert_same, batched, looped, random_actions
 from tests.matrix import but
 from tests.tasks.faces import REBUILT, every_rebuilt
 
 every_task = pytest.mark.parametrize("task", TASKS)
 every_mode = pytest.mark.parametrize("mode", MODES)
-DISCRETE = ("cartpole", "acrobot", "mountain_car")
-COMMANDED = [("pendulum", "force"), ("pendulum", "current"), ("cartpole", "voltage")]
 DIFFERENT = [
     changed(
         FULL, inductance=inductance, resistance=resistance, arm_radius=arm, torque_constant=constant, max_voltage=top
@@ -39,12 +34,41 @@ DIFFERENT = [
 
 @every_rebuilt
 @every_mode
-@pytest.mark.parametrize("actuator", ["ideal", "paper", "weaker"])
-def test_episodes_are_those_of_single_environments(task, mode, actuator):
-    arguments = {"actuator": actuator, "max_episode_steps": 13}
-    ours = batched(task, 5, mode, num_threads=1 if actuator == "weaker" else 2, **arguments)
-    ends = assert_equal_episodes(ours, looped(task, 5, mode, **arguments), 45)
-    assert (ends.sum(axis=1) > 0).all()
+@pytest.mark.parametrize("setup", SETUPS)
+def test_episodes_are_those_of_single_environments(task, mode, setup):
+    given = arguments(task, setup) | {"max_episode_steps": 11}
+    ours = batched(task, 5, mode, num_threads=1 if mode == "SameStep" else 2, **given)
+    theirs = looped(task, 5, mode, **given)
+    assert ours.single_action_space == theirs.single_action_space
+    assert ours.single_observation_space == theirs.single_observation_space
+    assert (assert_equal_episodes(ours, theirs, 40).sum(axis=1) > 0).all()
+
+
+CURRENT = {"action": "current", "levels": (-1.5, 1.5)}
+DAMPED = {**DRIVE, **scales("cartpole"), "model.damping.slider": Uniform(0.0, 0.3)}
+SPREAD = [Actuator(controller=CurrentLoop(kp=kp, substeps=2)) for kp in (0.5, 1.0, 2.0, 3.0)]
+
+
+@pytest.mark.parametrize(
+    ("task", "given"),
+    [
+        ("cartpole", {"integrator": "semi-implicit"}),
+        ("cartpole", {"center_radius": 0.05, "inner_steps": 4}),
+        ("cartpole", {"integrator": "euler", "timestep": 0.005, "actuator": "ideal"}),
+        ("pendulum", {"inner_steps": 7}),
+        ("acrobot", {"timestep": 0.1, "actuator": "ideal"}),
+        ("mountain_car", {"inner_steps": 40}),
+        ("cartpole", {"actuator": "ideal", "randomize": scales("cartpole")}),
+        ("cartpole", {"randomize": {"controller.kp": LogUniform(0.5, 30.0)}}),
+        ("cartpole", {**CURRENT, "randomize": {"motor.resistance": Uniform(0.5, 2.0)}}),
+        ("cartpole", {"integrator": "semi-implicit", "randomize": DAMPED, "observe_actuator": True}),
+        ("cartpole", {"inner_steps": 4, "randomize": DAMPED}),
+        ("pendulum", {"actuator": SPREAD, "randomize": {"motor.inductance": Uniform(0.05, 0.2)}}),
+    ],
+)
+def test_so_are_those_of_every_option(task, given):
+    given = {"max_episode_steps": 12, **given}
+    assert_equal_episodes(batched(task, 4, **given), looped(task, 4, **given), 40)
 
 
 @every_rebuilt
@@ -88,59 +112,35 @@ def test_each_environment_may_have_its_own_actuator(task, mode):
     assert len(np.unique(currents)) == 7  # the parameters arrive
 
 
-def test_actuators_of_the_environments_may_be_written_as_that_of_one(tmp_path):
+def test_an_actuator_in_any_form_is_the_same_for_all_and_for_each(tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("name: weak\ncontroller: {kp: 0.5}\n")
     written = ["paper", file, {"name": "weaker", "motor": {"resistance": 2.0}}, str(file)]
     each = [EnvConfig("pendulum", one).actuator for one in written]
     assert len(set(each)) == 3
     assert_equal_episodes(batched("pendulum", 4, actuator=written), looped("pendulum", 4, actuator=each), 20)
-    serial = make_sb3_vec_env(TASKS["pendulum"].env_id, 4, physics="analytic", actuator=written).env
+    for form, one in zip(written, each, strict=True):
+        assert_equal_episodes(batched("pendulum", 2, actuator=form), looped("pendulum", 2, actuator=[one] * 2), 3)
+    serial = make_sb3_vec_env("pendulum", 4, physics="analytic", actuator=written).env
     assert [one.unwrapped.actuator for one in serial.envs] == each
 
 
 @every_rebuilt
-def test_many_environments_are_as_equal_as_few(task):
+@pytest.mark.parametrize("num_envs", [1, 67])
+def test_one_environment_is_a_batch_and_many_are_as_equal_as_few(task, num_envs):
     """Compiled array functions take other paths for long arrays than for single numbers."""
-    arguments = {"actuator": "weaker", "max_episode_steps": 9}
-    assert_equal_episodes(batched(task, 67, num_threads=2, **arguments), looped(task, 67, **arguments), 12)
+    given = {"actuator": "weaker", "max_episode_steps": 9}
+    assert_equal_episodes(batched(task, num_envs, num_threads=2, **given), looped(task, num_envs, **given), 12)
 
 
-@pytest.mark.parametrize(("task", "command"), but(COMMANDED, itertools.product(TASKS, ["force", "current", "voltage"])))
-def test_other_commands_and_observed_currents(task, command):
-    actuator = FULL if command == "force" else changed(FULL, inductance=0.2, substeps=3)
-    arguments = {"actuator": actuator, "action": command, "observe_actuator": True, "max_episode_steps": 10}
-    if command != "force" and task in DISCRETE:
-        limit = 4.0 if command == "voltage" else TASKS[task].max_force * 0.5 / 0.8
-        arguments["levels"] = (-limit, -limit / 3, limit / 7, limit)
-    ours, theirs = batched(task, 5, "SameStep", **arguments), looped(task, 5, "SameStep", **arguments)
-    assert ours.single_action_space == theirs.single_action_space
-    assert ours.single_observation_space == theirs.single_observation_space
-    assert_equal_episodes(ours, theirs, 25)
-    assert np.any(ours.step(random_actions(ours, np.random.default_rng(0)))[0][:, -2:] != 0.0)
-
-
-@pytest.mark.parametrize(
-    ("task", "arguments"),
-    [
-        ("cartpole", {"integrator": "semi-implicit"}),
-        ("cartpole", {"center_radius": 0.05, "inner_steps": 4}),
-        ("cartpole", {"integrator": "euler", "timestep": 0.005, "actuator": "ideal"}),
-        ("pendulum", {"inner_steps": 7}),
-        ("acrobot", {"timestep": 0.1, "actuator": "ideal"}),
-        ("mountain_car", {"inner_steps": 40}),
-    ],
-)
-def test_every_option_of_the_single_environment(task, arguments):
-    arguments = {"max_episode_steps": 15, **arguments}
-    assert_equal_episodes(batched(task, 4, **arguments), looped(task, 4, **arguments), 40)
-
-
-@pytest.mark.parametrize("value", [-1.0, math.nan])
-def test_reset_options_out_of_order_are_refused(value):
-    for env in (ActuatedEnv("pendulum"), batched("pendulum", 2)):
-        with pytest.raises(ValueError, match=re.escape(f"reset options = {{'x_init': {value}}}: ask for [")):
-            env.reset(seed=0, options={"x_init": value})
+@pytest.mark.parametrize("task", ["pendulum", "mountain_car_continuous"])
+def test_infinite_and_float64_actions_saturate_as_in_a_single_environment(task):
+    ours, theirs = batched(task, 4), looped(task, 4, disable_env_checker=True)
+    for env in (ours, theirs):
+        env.reset(seed=0)
+    for values in ([np.inf, -np.inf, 1e300, -3.0], [0.1, 0.2, 0.3, -0.4]):
+        actions = np.array(values).reshape(4, 1)
+        assert_same(ours.step(actions), theirs.step(actions))
 
 
 @pytest.mark.parametrize("task", but(["pendulum", "cartpole", "mountain_car"], TASKS))
@@ -156,7 +156,7 @@ def test_resets_take_gymnasiums_options_and_a_mask_leaves_the_others(task):
         mask = np.arange(6) % 4 == index % 4
         kept = ours.unwrapped.state[~mask]
         given = {"reset_mask": mask, **options}
-        assert_same(*(env.reset(options=dict(given)) for env in (ours, theirs)))
+        assert_same(ours.reset(options=given), theirs.reset(options=dict(given)))
         np.testing.assert_array_equal(ours.unwrapped.state[~mask], kept)
         assert given.keys() == {"reset_mask", *options}  # ours changes nobody's dictionary
 
@@ -171,15 +171,6 @@ def test_seeds_in_every_form(seed):
         assert mine.bit_generator.state == his.bit_generator.state
     if isinstance(seed, np.integer):
         np.testing.assert_array_equal(ours.reset(seed=seed)[0], theirs.reset(seed=5)[0])
-
-
-def test_unseeded_environments_differ():
-    observations, _ = batched("cartpole", 8).reset()
-    assert len(np.unique(observations[:, 0])) == 8
-
-
-def test_one_environment_is_a_batch_too():
-    assert_equal_episodes(batched("pendulum", 1, max_episode_steps=5), looped("pendulum", 1, max_episode_steps=5), 20)
 
 
 # -- the contract -------------------------------------------------------------------------------------------
@@ -210,51 +201,8 @@ def test_the_autoreset_mode_is_in_the_metadata_and_may_be_a_name_or_gymnasiums_o
 def test_without_a_limit_no_episode_is_truncated():
     env = ActuatedVectorEnv(2, "pendulum", max_episode_steps=None)
     env.reset(seed=0)
-    for _ in range(1100):
-        _, _, terminated, truncated, _ = env.step(np.zeros((2, 1), np.float32))
-        assert not terminated.any()
-        assert not truncated.any()
-
-
-@every_rebuilt
-@every_mode
-def test_nothing_returned_or_given_aliases_what_goes_on(task, mode):
-    arguments = {"actuator": "weaker", "max_episode_steps": 7}
-    env, control = batched(task, 4, mode, **arguments), batched(task, 4, mode, **arguments)
-    generator = np.random.default_rng(0)
-    first, _ = env.reset(seed=0)
-    kept = [first]
-    copies = [first.copy()]
-    control.reset(seed=0)
-    for _ in range(20):
-        actions = random_actions(env, generator)
-        given = actions.copy()
-        found, expected = env.step(actions), control.step(given.copy())
-        assert_same(found, expected)
-        np.testing.assert_array_equal(actions, given)
-        ended = found[2] | found[3]
-        for array in _arrays(found):
-            array[...] = 1  # vandalism
-        actions[...] = 0
-        env.unwrapped.state[:] = 5.0
-        kept.append(control.unwrapped.state)
-        copies.append(kept[-1].copy())
-        if mode == "Disabled" and ended.any():
-            for one in (env, control):
-                one.reset(options={"reset_mask": ended})
-    for array, expected in zip(kept, copies, strict=True):
-        np.testing.assert_array_equal(array, expected)
-
-
-def _arrays(value):
-    """Every numeric array in nested results."""
-    if isinstance(value, dict):
-        return [array for item in value.values() for array in _arrays(item)]
-    if isinstance(value, tuple):
-        return [array for item in value for array in _arrays(item)]
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        return [array for item in value for array in _arrays(item)]
-    return [value] if isinstance(value, np.ndarray) else []
+    actions = np.zeros((2, 1), np.float32)
+    assert not any(end.any() for _ in range(1100) for end in env.step(actions)[2:4])
 
 
 def test_gymnasiums_vector_wrappers_work_on_it():
@@ -265,79 +213,6 @@ def test_gymnasiums_vector_wrappers_work_on_it():
         *_, infos = env.step(env.action_space.sample())
         episodes += int(infos["_episode"].sum()) if "_episode" in infos else 0
     assert episodes > 4
-
-
-# -- copies and snapshots -----------------------------------------------------------------------------------
-
-
-def _copy_by_snapshot(env):
-    twin = batched(env.spec.kwargs["task"], env.num_envs, env.metadata["autoreset_mode"], **env.test_arguments)
-    twin.reset(seed=99)
-    for _ in range(5):
-        twin.step(random_actions(twin, np.random.default_rng(8)))
-    saved = env.unwrapped.snapshot()
-    twin.unwrapped.restore({name: value.copy() for name, value in saved.items()})
-    return twin
-
-
-@every_task
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-@pytest.mark.parametrize(
-    "duplicate",
-    [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env)), _copy_by_snapshot],
-    ids=["copy", "pickle", "snapshot"],
-)
-def test_a_copy_made_mid_episode_continues_bit_for_bit(task, mode, duplicate):
-    arguments = {"actuator": DIFFERENT, "max_episode_steps": 8}
-    env = batched(task, 7, mode, **arguments)
-    env.test_arguments = arguments
-    env.reset(seed=4)
-    generator = np.random.default_rng(0)
-    mask = np.arange(7) < 3
-    for index in range(8):  # the last step ends some episodes, which in NextStep mode are to be reset
-        if index == 4:
-            env.reset(options={"reset_mask": mask})
-        env.step(random_actions(env, generator))
-    twin = duplicate(env)
-    actions = [random_actions(env, generator) for _ in range(20)]
-    expected = [env.step(action) for action in actions]
-    for index, (action, one) in enumerate(zip(actions, expected, strict=True)):
-        assert_same(twin.step(action), one, f"step {index}")
-    state = env.unwrapped.state
-    twin.step(actions[0])
-    np.testing.assert_array_equal(env.unwrapped.state, state)  # they are apart
-    for mine, his in zip(env.np_random, twin.np_random, strict=True):
-        assert mine is not his
-
-
-def test_a_snapshot_is_plain_arrays_and_does_not_move_with_the_environment(tmp_path):
-    env = batched("acrobot", 3, "SameStep", max_episode_steps=5)
-    env.reset(seed=0)
-    env.step(np.array([0, 1, 2]))
-    saved = env.unwrapped.snapshot()
-    np.savez(tmp_path / "snapshot.npz", **saved)
-    actions = np.random.default_rng(0).integers(3, size=(12, 3))
-    first = [env.step(action) for action in actions]
-    with np.load(tmp_path / "snapshot.npz", allow_pickle=False) as loaded:
-        for again in (saved, dict(loaded)):
-            env.unwrapped.restore(again)
-            for action, one in zip(actions, first, strict=True):
-                assert_same(env.step(action), one)
-
-
-def test_a_snapshot_of_others_is_refused_and_nothing_changes():
-    env = ActuatedVectorEnv(3, "pendulum")
-    env.reset(seed=0)
-    before = env.snapshot()
-    for wrong, name in (
-        (ActuatedVectorEnv(4, "pendulum").snapshot(), "physics"),
-        (ActuatedVectorEnv(3, "cartpole").snapshot(), "physics"),
-        ({**before, "elapsed": before["elapsed"][:2]}, "elapsed"),
-        ({key: value for key, value in before.items() if key != "streams"}, "streams"),
-    ):
-        with pytest.raises(ValueError, match=rf"^snapshot\['{name}'\] is "):
-            env.restore(wrong)
-    assert_same(env.snapshot(), before)
 
 
 # -- rendering ----------------------------------------------------------------------------------------------
@@ -357,6 +232,9 @@ def test_rendering_shows_every_environment_and_leaves_the_episode_alone():
         assert_same(env.step(actions), control.step(actions))
         for single in singles:
             single.step(actions[0])
+    lists = batched("pendulum", 3, **arguments | {"render_mode": "rgb_array_list"})
+    lists.unwrapped.restore(env.unwrapped.snapshot())
+    np.testing.assert_array_equal(lists.render(), env.render())
     env.set_attr("l", [1.0, 0.5, 2.0])
     singles[1].set_wrapper_attr("l", 0.5)
     twin = copy.deepcopy(env)
@@ -364,39 +242,13 @@ def test_rendering_shows_every_environment_and_leaves_the_episode_alone():
     np.testing.assert_array_equal(env.image(1), singles[1].render())
     assert env.image().shape == (48, 64, 3)
     assert env.image().dtype == np.uint8
-    for one in (env, twin, *singles):
+    for one in (env, twin, lists, *singles):
         one.close()
-
-
-def test_a_list_of_images_is_one_of_each_environment():
-    view = {"width": 64, "height": 48}
-    lists, images = (batched("cartpole", 2, render_mode=mode, **view) for mode in ("rgb_array_list", "rgb_array"))
-    for env in (lists, images):
-        env.reset(seed=0)
-    np.testing.assert_array_equal(lists.render(), images.render())
 
 
 def test_without_a_render_mode_there_is_a_warning_and_no_image():
     with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
         assert batched("pendulum", 2).render() is None
-
-
-# -- one environment of a batch -----------------------------------------------------------------------------
-
-
-def test_an_actuator_in_any_form_is_the_same():
-    motor = Actuator(Motor(), CurrentLoop(kp=2.0))
-    forms = [motor, {"controller": {"kp": 2.0}}, [motor] * 3]
-    runs = []
-    for form in forms:
-        env = ActuatedVectorEnv(3, "pendulum", form)
-        env.reset(seed=0)
-        runs.append([env.step(np.full((3, 1), value, np.float32)) for value in (1.0, -2.0, 0.5)])
-    assert_same(tuple(runs[1]), tuple(runs[0]))
-    assert_same(tuple(runs[2]), tuple(runs[0]))
-    single = ActuatedEnv("pendulum", motor)
-    single.reset(seed=0)
-    assert single.step(np.array([1.0], np.float32))[4]["current"] == runs[0][0][4]["current"][0]
 
 
 def test_threads_of_a_shallow_copy_use_its_own_arrays():

@@ -14,12 +14,14 @@ from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed
 from tests.reference import MotorSimulation
-from tests.tasks.faces import desired_force, every_rebuilt
+from tests.tasks.faces import REBUILT, desired_force, every_rebuilt
 
 SPEED = {"pendulum": 1, "cartpole": 1, "acrobot": 3, "mountain_car": 1, "mountain_car_continuous": 1}
 STEPS = {"pendulum": 60, "cartpole": 40, "acrobot": 15, "mountain_car": 30, "mountain_car_continuous": 30}
 SUPPLY = {"pendulum": 4.0, "cartpole": 10.0, "acrobot": 2.0, "mountain_car": 0.6, "mountain_car_continuous": 0.6}
 """A supply that saturates at times, by task [V]."""
+
+TRACE = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated", "speed")
 
 OFF = {  # feature -> the change that takes it away, and what else both sides of the pair have
     "back_emf_constant": ({"back_emf_constant": 0.0}, {"bemf_compensation": False}),
@@ -40,47 +42,56 @@ OFF = {  # feature -> the change that takes it away, and what else both sides of
 
 
 @functools.cache
-def _episode(task, physics, actuator):
-    """States and forces of an episode under random actions, as the environment and as the oracle have them."""
-    env, driver = ActuatedEnv(task, actuator=actuator, physics=physics), TASKS[task].twin()
+def _episode(task, physics, integrator, actuator):
+    """States, and traces of all integration steps, under random actions: of the environment, and of the oracle."""
+    env, driver = ActuatedEnv(task, actuator, physics, integrator=integrator), TASKS[task].twin()
     env.reset(seed=0)
     env.action_space.seed(0)
     motor, state = MotorSimulation(actuator), env.state
+    constants, limit = actuator.motor, actuator.controller.max_voltage
     dt = env.task.step_duration / env.task.motor_inner_steps
     found, expected = [], []
     for _ in range(STEPS[task]):
         action = env.action_space.sample()
-        info = env.step(action)[-1]
+        env.step(action)
         desired = desired_force(task, action)
-        for _ in range(env.task.motor_inner_steps):
+        for row in env.trace[:, 0]:
             delivered = motor.step(dt, desired, state[SPEED[task]])
-            state = np.array(driver(state, delivered, dt, env.setup.plant.integrator))
-        found.append([*env.state, info["actual_force"], info["current"], info["voltage"]])
-        expected.append([*state, delivered, motor.current, motor.voltage])
+            state = np.array(driver(state, delivered, dt, integrator))
+            reference, saturated = (
+                desired * constants.arm_radius / constants.torque_constant,
+                abs(motor.voltage) >= limit,
+            )
+            expected.append(
+                [desired, delivered, motor.current, reference, motor.voltage, saturated, state[SPEED[task]]]
+            )
+            found.append(row)
+        np.testing.assert_allclose(env.state, state, rtol=0, atol=1e-10)
+    assert env.trace_names == TRACE
     return np.array(found), np.array(expected)
 
 
-@every_rebuilt
+@pytest.mark.parametrize(("task", "integrator"), [(task, name) for task in REBUILT for name in TASKS[task].integrators])
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("feature", OFF)
-def test_a_feature_matters_and_is_what_it_should_be_with_and_without(task, physics, feature):
+def test_a_feature_matters_and_is_what_it_should_be_with_and_without(task, integrator, physics, feature):
     without, both = OFF[feature]
     with_it = changed(FULL, **{"inductance": 0.2, "max_voltage": SUPPLY[task], **both})
     runs = []
     for actuator in (with_it, changed(with_it, **without)):
-        found, expected = _episode(task, physics, actuator)
+        found, expected = _episode(task, physics, integrator, actuator)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
         runs.append(found)
-    size = len(TASKS[task].state_names)
     differences = np.abs(runs[0] - runs[1])
-    assert differences[:, size].max() > 1e-3  # the force
-    assert differences[:, :size].max() > 1e-7  # and the motion
+    assert differences[:, TRACE.index("actual_force")].max() > 1e-3
+    assert differences[:, TRACE.index("speed")].max() > 1e-7
 
 
 @every_rebuilt
 def test_the_pairs_saturate_at_times(task):
     """Guards the pair of the supply, and that of the compensation, which saturation alone leaves incomplete."""
     actuator = changed(FULL, inductance=0.2, max_voltage=SUPPLY[task])
-    voltages = np.abs(_episode(task, "mujoco", actuator)[0][:, -1])
+    rows = _episode(task, "mujoco", TASKS[task].integrators[0], actuator)[0]
+    voltages = np.abs(rows[:, TRACE.index("voltage")])
     assert (voltages == SUPPLY[task]).any()
     assert (voltages < SUPPLY[task]).any()

@@ -10,7 +10,8 @@ from codrl_mj import EnvConfig
 from codrl_mj.__main__ import main
 from codrl_mj.envs.worlds import World, find_world, world_of
 from codrl_mj.training import TrainConfig
-from tests.envs.rig import RIG
+from codrl_mj.view.session import Session
+from tests.envs.rig import RIG, RigEnv
 
 NAME, MOTOR = "tests.envs.rig:RIG", "maxon-re65"
 QUICK = "--agent sac --total-steps 60 --agent.learning-starts 20 --num-envs 1 --evaluation-episodes 1"
@@ -42,56 +43,48 @@ def test_a_configuration_of_it_survives_json_and_makes_environments():
     assert TrainConfig.preset(NAME, "sac", actuator="lag").env.through == "lag"
 
 
-def test_what_it_does_not_have_is_refused_by_the_configuration():
-    with pytest.raises(ValueError, match="integrator = 'rk4': rig has none: leave it out"):
-        EnvConfig(NAME, integrator="rk4")
-    with pytest.raises(ValueError, match="rk4_of_nobody"):
-        EnvConfig("tests.envs.rig:rk4_of_nobody")
-    with pytest.raises(ValueError, match=r"must be a codrl_mj.Task or a codrl_mj.World"):
-        EnvConfig("tests.envs.rig:XML")
-    with pytest.raises(ValueError, match=r"^Rig: must be an instance of it: Rig\(...\)"):
-        EnvConfig("tests.envs.rig:Rig")
+class Nameless(World):
+    def make(self, *_, **__):
+        return 3
 
 
-def test_a_world_without_what_every_world_has_is_refused_in_a_sentence():
-    class Nameless(World):
-        def make(self, *_, **__):
-            return 3
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: EnvConfig(NAME, integrator="rk4"), "integrator = 'rk4': rig has none: leave it out"),
+        (lambda: EnvConfig("tests.envs.rig:rk4_of_nobody"), "rk4_of_nobody"),
+        (lambda: EnvConfig("tests.envs.rig:XML"), "must be a codrl_mj.Task or a codrl_mj.World"),
+        (lambda: EnvConfig("tests.envs.rig:Rig"), r"^Rig: must be an instance of it: Rig\(...\)"),
+        (lambda: world_of(Nameless()), "Nameless: must have a `name`, a text, which messages call it by"),
+        (lambda: codrl_mj.make(RigEnv(), {".*": "lag"}), "must be an id, or a function or class that makes an env"),
+    ],
+)
+def test_what_is_no_world_or_what_it_does_not_have_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
 
-    with pytest.raises(ValueError, match="Nameless: must have a `name`, a text, which messages call it by"):
-        world_of(Nameless())
+
+def test_a_world_that_makes_no_environment_is_refused(monkeypatch):
     named = Nameless()
     named.name = "named"
     assert world_of(named) is named
-    config = EnvConfig(NAME)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(type(RIG), "make", lambda *_, **__: 3)
-        with pytest.raises(ValueError, match=r"tests.envs.rig:RIG: its `make` returned 3: must be a gymnasium.Env"):
-            config.make()
+    monkeypatch.setattr(type(RIG), "make", lambda *_, **__: 3)
+    with pytest.raises(ValueError, match=r"tests.envs.rig:RIG: its `make` returned 3: must be a gymnasium.Env"):
+        EnvConfig(NAME).make()
 
 
-def test_an_evaluation_keeps_the_time_limit_of_a_world_without_one():
+def test_an_evaluation_keeps_the_time_limit_of_a_world_without_one(monkeypatch):
     config = TrainConfig.preset(NAME, "sac", env={"max_episode_steps": 9, "options": {"target": 0.5}})
-    assert RIG.time_limit is None or config.evaluation_env.time_limit == RIG.time_limit
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(type(RIG), "time_limit", None)
-        assert config.evaluation_env.time_limit == 9
+    assert config.evaluation_env.time_limit == RIG.time_limit
+    monkeypatch.setattr(type(RIG), "time_limit", None)
+    assert config.evaluation_env.time_limit == 9
 
 
 def test_a_long_text_among_the_options_is_no_file():
     assert EnvConfig(NAME, options={"target": "x" * 9000}).code == EnvConfig(NAME).code
 
 
-def test_what_makes_no_environment_is_refused():
-    from tests.envs.rig import RigEnv
-
-    with pytest.raises(ValueError, match="must be an id, or a function or class that makes an environment"):
-        codrl_mj.make(RigEnv(), {".*": "lag"})
-
-
 def test_ideal_motors_change_nothing():
-    from tests.envs.rig import RigEnv
-
     plain, made = RigEnv(), EnvConfig(NAME).make()
     np.testing.assert_array_equal(plain.reset(seed=3)[0], made.reset(seed=3)[0])
     for action in np.random.default_rng(0).uniform(-1, 1, (20, 1)):
@@ -117,8 +110,6 @@ def test_every_verb_takes_it(run, line):
 
 
 def test_a_live_session_runs_it():
-    from codrl_mj.view.session import Session
-
     session = Session(EnvConfig(NAME, {"drive": MOTOR}), {})
     session.set_actuator("drive", ("motor", "resistance"), 0.3)
     assert session.problem is None
@@ -136,9 +127,7 @@ def test_make_takes_of_a_world_or_task_by_its_place_what_it_says_it_takes():
         assert env.spec.max_episode_steps == 9
 
 
-def test_make_takes_an_actuators_fields_for_an_environment_of_others():
-    fields = {"family": "lag", "time_constant": 0.03}
-    with codrl_mj.make("InvertedPendulum-v5", fields) as env:
-        assert [one.time_constant for one in env.get_wrapper_attr("motors").values()] == [0.03]
-    with codrl_mj.make("InvertedPendulum-v5", {"slider": fields}) as env:
+@pytest.mark.parametrize("of", [lambda fields: fields, lambda fields: {"slider": fields}], ids=["all", "by name"])
+def test_make_takes_an_actuators_fields_for_an_environment_of_others(of):
+    with codrl_mj.make("InvertedPendulum-v5", of({"family": "lag", "time_constant": 0.03})) as env:
         assert [one.time_constant for one in env.get_wrapper_attr("motors").values()] == [0.03]

@@ -5,7 +5,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import codrl_mj  # noqa: F401 - registers the environments
-from codrl_mj.envs import ActuatedVectorEnv
+from codrl_mj.envs import ActuatedVectorEnv, SerialVectorEnv
 from codrl_mj.tasks import TASKS
 
 MODES = tuple(mode.value for mode in AutoresetMode)
@@ -64,7 +64,7 @@ def assert_equal_episodes(ours, theirs, steps, seed=0, masks=True):
     Returns:
         How often each environment's episode ended, terminated and truncated: shape (N, 2).
     """
-    assert isinstance(ours.unwrapped, ActuatedVectorEnv)
+    assert isinstance(ours.unwrapped, ActuatedVectorEnv | SerialVectorEnv)
     generator = np.random.default_rng(seed)
     mode = ours.metadata["autoreset_mode"]
     ends = np.zeros((ours.num_envs, 2), dtype=int)
