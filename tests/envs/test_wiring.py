@@ -58,17 +58,16 @@ def _episode(task, physics, integrator, actuator):
         for row in env.trace[:, 0]:
             delivered = motor.step(dt, desired, state[SPEED[task]])
             state = np.array(driver(state, delivered, dt, integrator))
-            reference, saturated = (
-                desired * constants.arm_radius / constants.torque_constant,
-                abs(motor.voltage) >= limit,
-            )
-            expected.append(
-                [desired, delivered, motor.current, reference, motor.voltage, saturated, state[SPEED[task]]]
-            )
+            reference = desired * constants.arm_radius / constants.torque_constant
+            ends = abs(motor.voltage) >= limit, state[SPEED[task]]
+            expected.append([desired, delivered, motor.current, reference, motor.voltage, *ends])
             found.append(row)
         np.testing.assert_allclose(env.state, state, rtol=0, atol=1e-10)
     assert env.trace_names == TRACE
-    return np.array(found), np.array(expected)
+    rows, oracle = np.array(found), np.array(expected)
+    np.testing.assert_array_equal(rows[:, 0], oracle[:, 0])
+    np.testing.assert_allclose(rows[:, 1] * constants.arm_radius, constants.torque_constant * rows[:, 2], rtol=1e-12)
+    return rows, oracle
 
 
 @pytest.mark.parametrize(("task", "integrator"), [(task, name) for task in REBUILT for name in TASKS[task].integrators])
