@@ -1,0 +1,65 @@
+"""What a step keeps: walls in the middle of a step, and no bound that makes a lost state look like any other."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from codrl_mj.actuators import IDEAL
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant
+from codrl_mj.physics.compiled_task import compiled_constrain
+from codrl_mj.tasks import TASKS
+from tests.tasks.faces import NEW, WITH_HILL, random_states
+
+
+@pytest.mark.parametrize("task", NEW)
+def test_a_step_from_states_beyond_every_bound_is_gymnasiums(task):
+    definition = TASKS[task]
+    arguments = definition, [IDEAL], 1, definition.integrators[0]
+    pair = MujocoPhysics(Plant(*arguments)), AnalyticPhysics(Plant(*arguments))
+    forces = np.random.default_rng(1).uniform(-1, 1, 1000) * definition.max_force
+    for state, force in zip(random_states(task, 0, 1000), forces, strict=True):
+        for physics in pair:
+            physics.reset(state)
+            physics.step(force)
+        np.testing.assert_allclose(*(physics.state for physics in pair), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("task", WITH_HILL)
+@pytest.mark.parametrize("inner_steps", [1, 20])
+@pytest.mark.parametrize(
+    ("state", "wall", "stops"),
+    [
+        ([-1.19, -0.07], -1.2, True),  # inelastic
+        ([0.59, 0.07], 0.6, False),  # the right end stops the car, not its speedometer
+    ],
+)
+def test_walls(task, inner_steps, state, wall, stops):
+    definition = TASKS[task]
+    one = dataclasses.replace(definition, step_duration=definition.step_duration / inner_steps)
+    physics = MujocoPhysics(Plant(one, [IDEAL], 1, "semi-implicit"))
+    physics.reset(np.array(state))
+    for _ in range(inner_steps):
+        physics.step(np.sign(state[1]) * definition.max_force)
+        if physics.state[0] == wall:
+            break
+    assert physics.state[0] == wall
+    assert physics.state[1] == 0.0 if stops else physics.state[1] > 0.0
+
+
+@pytest.mark.parametrize("value", [0.9e10, np.nan, np.inf, -np.inf, 1.01e10])
+@pytest.mark.parametrize("task", NEW)
+def test_bounds_let_a_diverged_state_through(task, value):
+    """Compiled, nothing of it passes for a state; but 0.9e10 is large and a number that the engine takes."""
+    definition = TASKS[task]
+    order = tuple(definition.qpos), tuple(definition.qvel)
+    keep = compiled_constrain(definition.constrain, definition.state_names, *order)
+    for state in np.where(np.eye(len(definition.state_names)), value, 0.0):
+        kept = state[list(definition.qpos)], state[list(definition.qvel)]
+        keep(*kept, np.empty_like(state), 0.1)
+        with np.errstate(invalid="ignore"):  # inf - inf
+            plain = np.array(definition.constrain(state, 0.1))
+        for found, entries in zip(kept, order, strict=True):
+            expected = plain[list(entries)] if value == 0.9e10 else np.full(len(entries), np.nan)
+            np.testing.assert_array_equal(found, expected)
+        assert np.isnan(plain[np.isnan(state)]).all()
