@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.tasks import TASKS
-from tests.tasks.faces import actions, gymnasiums, ours
+from tests.tasks.faces import actions, every_rebuilt, gymnasiums, ours, random_states
 
 
 def compare(task, seed, choose, states_to, steps=None):
@@ -57,21 +57,19 @@ def test_an_episode_that_reaches_the_goal(task, states_to, seed):
     assert compare(task, seed, pump, states_to) == [True, False]
 
 
-def test_acrobot_reaches_the_goal_with_gymnasium():
-    """From a start near the goal, where chaos has no time to act."""
-    pair = ours("acrobot", actuator="ideal"), gymnasiums("acrobot")
+@every_rebuilt
+def test_reward_and_end_of_a_step_are_gymnasiums_all_over_the_state_space(task):
+    pair, seen = (ours(task, actuator="ideal").unwrapped, gymnasiums(task).unwrapped), []
     for env in pair:
         env.reset(seed=0)
-    pair[0].unwrapped.physics.reset(np.array([0.4, 0.2, 5.5, 0.0]))
-    pair[1].unwrapped.state = np.array([0.4, 0.2, 5.5, 0.0])
-    told = []
-    for _ in range(10):
-        told.append([env.step(2)[1:3] for env in pair])
-        if told[-1][0][1]:
-            break
-    assert len(told) > 1
-    assert all(mine == theirs for mine, theirs in told)
-    assert [mine for mine, _ in told] == [(-1.0, False)] * (len(told) - 1) + [(0.0, True)]
+    for state, action in zip(random_states(task, 0, 1000), actions(task, 0, 1000), strict=True):
+        pair[0].physics.reset(state)
+        pair[1].state, pair[1].steps_beyond_terminated = state, None
+        (_, reward, terminated, *_), (_, expected, end, *_) = (env.step(action) for env in pair)
+        assert terminated == end
+        assert reward == pytest.approx(expected, rel=0, abs=1e-5 if task == "mountain_car_continuous" else 1e-9)
+        seen.append(terminated)
+    assert task == "pendulum" or 0 < sum(seen) < len(seen)
 
 
 @pytest.mark.parametrize(
