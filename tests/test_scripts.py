@@ -10,9 +10,11 @@ from pathlib import Path
 import imageio
 import pytest
 
+import benchmark
 from codrl_mj.actuators import IDEAL
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import read_run
+from codrl_mj.study import read_csv
 from codrl_mj.training import load_config
 
 pytestmark = pytest.mark.matrix
@@ -177,3 +179,23 @@ def test_a_short_soak_finds_nothing_wrong_on_one_and_two_threads():
 @pytest.mark.parametrize(("script", "flag"), [("benchmark.py", "--turns"), ("soak.py", "--steps")])
 def test_bad_arguments_are_refused(script, flag):
     assert f"{flag} 0: must be >= 1" in run(script, flag, 0, status=2)
+
+
+def test_what_is_measured_anew_takes_the_place_of_what_was(tmp_path):
+    def group(ours):
+        return {"Gymnasium's": {"steps_per_second": [5e4] * 3, "ratio": [1.0] * 3}, "ours": ours}
+
+    rows, page = tmp_path / "speed.csv", tmp_path / "speed.md"
+    page.write_text(f"# Mine\n\n{benchmark.WRITTEN}old")
+    first = group({"steps_per_second": [1e5, 9e4, 2e5], "ratio": [2.0, 1.8, 4.0]})
+    benchmark.publish({"single: pendulum": first, "chains": first}, rows, page)
+    second = group({"steps_per_second": [1.5e5] * 3, "ratio": [3.0, 2.5, 3.5]})
+    benchmark.publish({"single: pendulum": second}, rows, page)
+    told = [tuple(row.values()) for row in read_csv(rows)]
+    assert ("single: pendulum", "ours", "150000", "3.000", "2.500", "3.500") in told
+    assert ("chains", "ours", "100000", "2.000", "1.800", "4.000") in told
+    assert len(told) == 4
+    before, _, tables = page.read_text().partition(benchmark.WRITTEN)
+    assert before == "# Mine\n\n"
+    assert "| ours | 150,000 | 3.00 |" in tables
+    assert "old" not in tables
