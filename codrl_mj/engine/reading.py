@@ -1,9 +1,7 @@
 """What compiled models and their data say of our actuators, at either door."""
 
-import math
 import numbers
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,9 +18,7 @@ from codrl_mj.actuators import (
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.engine.doors import shaft_inertia
 from codrl_mj.engine.families import HEAD, SIGNATURE, loaded_families, signals_at, slot_size
-from codrl_mj.engine.layout import DATA
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEAD, REASONS
-from codrl_mj.kept import njit
 from codrl_mj.plugin import FAMILY, NAME, registered
 
 
@@ -174,22 +170,6 @@ def check_shafts(
                 raise ValueError(f"{model.actuator(index).name or f'actuator {index}'}: {error}") from None
 
 
-@njit(error_model="numpy")
-def _gather(data: int, places: Any, activations: int, states: int, forces: int, table: Any) -> None:
-    """What mjData has at places in its activations, states of plugins and forces, which end there; NaN beyond them."""
-    for row in range(places.shape[0]):
-        for column in range(places.shape[1]):
-            place = places[row, column]
-            if place < activations:
-                table[row, column] = DATA.act(data)[place]
-            elif place < states:
-                table[row, column] = DATA.plugin_state(data)[place - activations]
-            elif place < forces:
-                table[row, column] = DATA.actuator_force(data)[place - states]
-            else:
-                table[row, column] = math.nan
-
-
 class Readout:
     """Reads the signals of all motors of a model, quickly: one array a signal.
 
@@ -207,20 +187,24 @@ class Readout:
         families: list[Family] = [type(actuator) for actuator in self.motors.values()]
         out, instances = model.actuator_outadr[indices], model.actuator_plugin[indices]
         behind_plugin, tracks = instances >= 0, np.array([family.tracks for family in families], dtype=bool)
-        # places in activations, then plugins' states, then forces, then nowhere
+        self._behind = behind_plugin.all(), behind_plugin.any()
+        # places in plugins' states, after activations where there are motors at both doors
         in_plugin = model.plugin_stateadr[instances] if model.nplugin else 0
-        starts = np.where(behind_plugin, model.na + in_plugin, model.actuator_actadr[indices])
-        states = model.na + model.npluginstate
-        self._ends = model.na, states, states + model.nout
-        actual, nothing = states + out, states + model.nout
+        first = 0 if behind_plugin.all() else model.na
+        starts = np.where(behind_plugin, first + in_plugin, model.actuator_actadr[indices])
         last = np.array([slot_size(family) for family in families], dtype=int)
-        places = {"desired_force": np.where(behind_plugin & tracks, starts + last, actual), "actual_force": actual}
+        desired = np.where(behind_plugin & tracks, starts + last, -1)
+        places = {"desired_force": desired, "actual_force": np.full(len(families), -1)}
         for motor, (start, family) in enumerate(zip(starts, families, strict=True)):
             for place, name in enumerate(family.Signals._fields, start + signals_at(family)):
-                places.setdefault(name, np.full(len(families), nothing))[motor] = place
+                places.setdefault(name, np.full(len(families), -1))[motor] = place
         self.names = tuple(places)
         """Of the signals, in order."""
-        self._places = np.stack(list(places.values())).astype(np.int64)
+        self._places = np.stack(list(places.values()))
+        self._out = out.astype(np.intp)  # which numpy would cast each time
+        nothing = self._places == -1
+        self._as_delivered, nothing[:2] = np.flatnonzero(nothing[0]), False
+        self._nothing = nothing if nothing.any() else None
         # a motor at the callback's door has its arm in the gear, and forces at the shaft
         self._called = np.flatnonzero(~behind_plugin)
         self._gear = np.where(behind_plugin, 1.0, model.actuator_gear[out, 0])
@@ -236,8 +220,14 @@ class Readout:
         Args:
             data: a simulation of the model.
         """
-        table = np.empty(self._places.shape)
-        _gather(data._address, self._places, *self._ends, table)
+        every, some = self._behind
+        states = data.plugin_state if every else np.append(data.act, data.plugin_state) if some else data.act
+        table: np.ndarray = states[self._places]
+        table[1] = data.actuator_force[self._out]
+        if self._as_delivered.size:
+            table[0, self._as_delivered] = table[1, self._as_delivered]
+        if self._nothing is not None:
+            table[self._nothing] = np.nan
         if self._called.size:
             table[:2] *= self._gear
             controls = data.ctrl[self._control]

@@ -1,7 +1,5 @@
 """Looks at each integration step of anybody's environment: its `recorder`, as our own environments are theirs."""
 
-import contextlib
-from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -52,9 +50,8 @@ class StepWatch:
         )
         return self._moments[self._outputs] @ data.qvel
 
-    @contextlib.contextmanager
-    def watching(self) -> Iterator[None]:
-        """Record what the environment does in the block, one step of it; not in two threads at once."""
+    def step(self, env: Any, action: Any) -> Any:
+        """Take a step of the environment, and record what it does in it; not in two threads at once."""
         self._rows, plain, began = [], mujoco.mj_step, self._data.time
 
         def each(model: mujoco.MjModel, data: mujoco.MjData, nstep: int = 1) -> None:
@@ -67,7 +64,7 @@ class StepWatch:
 
         mujoco.mj_step = each  # type: ignore[assignment]
         try:
-            yield
+            outcome = env.step(action)
         finally:
             mujoco.mj_step = plain
         if self._rows:
@@ -75,6 +72,7 @@ class StepWatch:
         else:
             self.step_duration = float(self._data.time - began)
             self._row()
+        return outcome
 
     def _row(self) -> None:
         self._rows.append(np.column_stack([*self._motors.readout.table(self._data), self.speeds]))

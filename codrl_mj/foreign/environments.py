@@ -229,11 +229,8 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         motors = self._motors
         time = motors.data.time
         controls = motors.controls(action)
-        if self._watch is None:
-            observation, reward, terminated, truncated, info = self.env.step(controls)
-        else:
-            with self._watch.watching():
-                observation, reward, terminated, truncated, info = self.env.step(controls)
+        outcome = self.env.step(controls) if self._watch is None else self._watch.step(self.env, controls)
+        observation, reward, terminated, truncated, info = outcome
         motors.check_finite(self._id, time)
         return self._observed(observation), reward, terminated, truncated, info | motors.signals()
 
