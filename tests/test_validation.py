@@ -18,6 +18,7 @@ from codrl_mj.actuators import IDEAL, Actuator, Lag, TorqueSpeed
 from codrl_mj.cli import main
 from codrl_mj.pages import certificate as page
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant, SimulationDivergedError, needed_callbacks
+from codrl_mj.physics.variation import bare_model
 from codrl_mj.tasks import TASKS
 from codrl_mj.validation import (
     GROUPS,
@@ -34,7 +35,7 @@ from codrl_mj.validation import (
     validate_model,
 )
 from codrl_mj.validation.compare import differences
-from codrl_mj.validation.mutations import edited, unfailed, wrong_loop
+from codrl_mj.validation.mutations import edited, unfailed, wrong_loop, wrong_model
 from codrl_mj.validation.table import TABLE, Case, outcome
 from codrl_mj.validation.trajectories import Growth
 from tests.conftest import REPRESENTATIVES
@@ -559,14 +560,25 @@ def test_the_users_model_is_left_as_it_was():
 # -- bad input ----------------------------------------------------------------------------------------------
 
 
-def test_an_unknown_task_is_refused_with_the_nearest():
-    with pytest.raises(ValueError, match="did you mean 'acrobot'"):
-        validate("acrobat")
+@pytest.mark.parametrize(
+    ("tasks", "groups", "message"),
+    [
+        ("acrobat", None, "did you mean 'acrobot'"),
+        ("acrobot", ["dynamic"], r"'dynamic'.*dynamics, trajectories"),
+        ([], None, r"tasks = \[\].*must name one at least"),
+        (None, [], r"groups = \[\].*must name one at least"),
+    ],
+)
+def test_what_is_no_task_or_group_or_none_of_them_is_refused(tasks, groups, message):
+    with pytest.raises(ValueError, match=message):
+        validate(tasks, groups=groups)
 
 
-def test_an_unknown_group_is_refused():
-    with pytest.raises(ValueError, match=r"'dynamic'.*dynamics, trajectories"):
-        validate("acrobot", groups=["dynamic"])
+def test_no_model_is_kept_from_a_mutation_nor_into_it():
+    masses = [bare_model("pendulum").body_mass.sum()]
+    with wrong_model(("body_mass", None, 2.0)):
+        masses.append(bare_model("pendulum").body_mass.sum())
+    assert [*masses, bare_model("pendulum").body_mass.sum()] == [masses[0], 2.0 * masses[0], masses[0]]
 
 
 def test_a_model_without_a_motor_is_refused():

@@ -13,7 +13,7 @@ __all__ = ["ActuatedEnv", "ActuatedVectorEnv", "SerialVectorEnv"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on first use: `codrl_mj.envs.registration` and `.config` need nothing heavy."""
+    """Import a public name on first use: `codrl_mj.envs.config` needs nothing heavy."""
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module 'codrl_mj.envs' has no attribute {name!r}")

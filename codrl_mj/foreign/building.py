@@ -21,7 +21,7 @@ class Building:
         """Take patterns and their actuators; a pattern may match nothing in some of the models."""
         self.actuators = actuators
         self._allow_unstable = allow_unstable
-        self._met: list[list[list[str]]] = []
+        self._met: dict[str, list[list[str]]] = {}
 
     @contextlib.contextmanager
     def motorising(self) -> Iterator[None]:
@@ -52,7 +52,7 @@ class Building:
             ValueError: see `codrl_mj.motorise`.
         """
         names = names_of(plain)
-        self._met.append(names)
+        self._met[repr(names)] = names  # once each, though some build their model anew at every reset
         wanted = {
             pattern: actuator
             for pattern, actuator in self.actuators.items()
@@ -78,7 +78,7 @@ class Building:
                 "codrl_mj.motorise"
             )
         for pattern in self.actuators:
-            matched_by(pattern, [own for names in self._met for own in names])
+            matched_by(pattern, [own for names in self._met.values() for own in names])
 
 
 @contextlib.contextmanager

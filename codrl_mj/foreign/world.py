@@ -86,10 +86,10 @@ class GymnasiumWorld(World):
         """Say whose it is that does not go together in the block."""
         try:
             yield
-        except TypeError as error:
-            raise ValueError(f"options = {config.options!r}: {self.name} does not take them: {error}") from None
-        except ValueError as error:
-            raise ValueError(f"{self.name}: {error}") from None
+        except (TypeError, ValueError) as error:
+            asked = isinstance(error, TypeError) and config.options
+            whose = f"options = {config.options!r}: {self.name} does not take them" if asked else self.name
+            raise ValueError(f"{whose}: {error}") from error
 
     def view(self, config: Any, width: int, height: int, camera: str | None) -> dict[str, Any]:
         """In that size [px] and by that camera where Gymnasium's `MujocoEnv` draws them."""

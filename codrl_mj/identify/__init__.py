@@ -1,5 +1,6 @@
 """Motors from their bench logs."""
 
+from codrl_mj.identify.checks import check
 from codrl_mj.identify.identify import identify
 from codrl_mj.identify.log import Finding, Log
 from codrl_mj.identify.parameters import PARAMETERS
@@ -14,6 +15,7 @@ __all__ = [
     "Log",
     "Prediction",
     "Proposal",
+    "check",
     "identify",
     "propose_columns",
     "read_log",

@@ -37,8 +37,8 @@ def identify(
     """Identify a motor.
 
     Args:
-        logs: to fit, at least one. Voltage and current tell the winding; torque or current, or else voltage, and
-            position or velocity tell the shaft.
+        logs: to fit, at least one, as they are: `check` says what is wrong with one. Voltage and current tell the
+            winding; torque or current, or else voltage, and position or velocity tell the shaft.
         rig: what the output moves: `pendulum`, `free` or `load`; None: a pendulum where `mgl` is known.
         known: parameters that are not to be fitted, by names of `PARAMETERS`.
         friction: `coulomb` (viscous and Coulomb), `stribeck`, `load`, `both`, or `auto`: whichever foretells logs that

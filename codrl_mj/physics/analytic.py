@@ -19,11 +19,12 @@ class AnalyticPhysics(Physics):
             ValueError: something is added to the joint, which Gymnasium's equations have no place for; or the task has
                 no Gymnasium environment.
         """
-        for added in (*(actuator.additions for actuator in plant.actuators), plant.joint):
+        adding = {"joint.": plant.joint} | {f"the {type(one).__name__}'s ": one.additions for one in plant.actuators}
+        for whose, added in adding.items():
             for name in ("armature", "damping", "friction"):
                 if value := getattr(added, name):
                     raise ValueError(
-                        f"joint.{name} = {value:g}: the equations have no place for it; use physics='mujoco'"
+                        f"{whose}{name} = {value:g}: the equations have no place for it; use physics='mujoco'"
                     )
         task = plant.task
         if task.twin is None:

@@ -15,7 +15,8 @@ from codrl_mj.tasks.base import INTEGRATORS
 def drive(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float | None) -> None:
     """Make an actuator of an `MjSpec` one of ours, at the control callback's door; an ideal one is a plain `<motor>`.
 
-    All but its transmission is overwritten. `max_force` limits the desired force [N] or torque [N*m] at the joint.
+    Its gear, control, dynamics, gain and bias are overwritten. `max_force` limits the desired force [N] or torque [N*m]
+    at the joint.
     """
     ideal, family, arm = isinstance(actuator, Ideal), type(actuator), actuator.arm_radius
     target.gear = [1.0 / arm, 0, 0, 0, 0, 0]

@@ -104,8 +104,8 @@ class MujocoBatchPhysics:
         for at, (one, limit) in enumerate(zip(self._wiring, self.plant.max_forces, strict=True)):
             index, arm = int(one.actuator), arms[:, at]
             user[rows, index, HEAD : HEAD + numbers.shape[2]] = numbers[:, at]
-            gear[rows, index, 0] = 1.0 / arm
-            limits[rows, index] = np.stack([-limit * arm, limit * arm], axis=-1)
+            gear[rows, self.model.actuator_outadr[index], 0] = 1.0 / arm
+            limits[rows, int(one.ctrl)] = np.stack([-limit * arm, limit * arm], axis=-1)
         self._arms[rows] = arms
 
     def set_model(self, rows: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:

@@ -100,10 +100,10 @@ class MujocoPhysics(Physics):
         if not self.plant.motorised:
             return
         for row, (one, limit) in enumerate(zip(actuators, self.plant.max_forces, strict=True)):
-            index, arm, numbers = int(self.settings[row, 0]), one.arm_radius, one.numbers
+            index, arm, numbers = int(self.wiring[row].actuator), one.arm_radius, one.numbers
             self.model.actuator_user[index, HEAD : HEAD + len(numbers)] = numbers
-            self.model.actuator_gear[index, 0] = 1.0 / arm
-            self.model.actuator_ctrlrange[index] = -limit * arm, limit * arm
+            self.model.actuator_gear[self.model.actuator_outadr[index], 0] = 1.0 / arm
+            self.model.actuator_ctrlrange[int(self.wiring[row].ctrl)] = -limit * arm, limit * arm
             self.settings[row, ARM] = arm
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:

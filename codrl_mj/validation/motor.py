@@ -32,7 +32,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from codrl_mj.actuators import Actuator, Motor
+from codrl_mj.actuators import Actuator, Motor, Supply
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.validation.drives import drive_checks
 from codrl_mj.validation.motor_loops import analogue, sampled_checks
@@ -269,22 +269,25 @@ def no_load(motors: Mapping[str, Motor]) -> Iterator[Case]:
 
 @check("motor", Check("stall torque at the voltage limit", "kT u_max/R", TOLERANCE))
 def voltage_limit(loops: Mapping[str, Loop]) -> Iterator[Case]:
-    """Stall torque at the loop's own voltage limit, in both directions, under a command far beyond it.
+    """Stall torque at the voltage that controller and supply leave, in both directions, under a command far beyond it.
 
     A loop asked for 1000 times its stall current saturates whatever its gains, so that the torque must be kT*u_max/R.
     Loops without a limit, or without a gain, never do and are left out. The tolerance is that of the other constants.
     """
     for name, loop in loops.items():
-        motor, gains = loop.actuator.motor, loop.actuator.controller
-        if not math.isfinite(gains.max_voltage) or not gains.kp + gains.ki + gains.kff > 0:
+        motor, gains, supply = loop.actuator.motor, loop.actuator.controller, loop.actuator.supply or Supply()
+        sag = motor.resistance / (motor.resistance + supply.resistance)
+        open_circuit = gains.max_voltage if math.isinf(supply.voltage) else supply.voltage
+        limit = min(gains.max_voltage, open_circuit * sag)
+        if not math.isfinite(limit) or not gains.kp + gains.ki + gains.kff > 0:
             continue
         steps = math.ceil(40 * motor.electrical_time_constant / loop.timestep) + 40
-        stall = motor.torque_constant * gains.max_voltage / motor.resistance
+        stall = motor.torque_constant * limit / motor.resistance
         for sign in (1.0, -1.0):
             controls = np.full(steps, 1000.0 * sign * stall)
             torque = drive(motors_on(HELD, [loop.actuator], loop.timestep), controls, np.zeros(steps)).torque[-1, 0]
             error = abs(float(torque) * motor.arm_radius / (sign * stall) - 1.0)
-            yield Case(error, f"{name}, {torque:.6g} N m at {sign * gains.max_voltage:g} V")
+            yield Case(error, f"{name}, {torque:.6g} N m at {sign * limit:g} V")
 
 
 # -- the group -----------------------------------------------------------------------------------------------------

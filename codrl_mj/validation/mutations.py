@@ -25,6 +25,7 @@ from codrl_mj.engine import control
 from codrl_mj.engine.families import SLOT, replaced
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import MujocoPhysics, compiled_task, mjcf
+from codrl_mj.physics.variation import bare_model
 from codrl_mj.tasks import OURS, find_task
 from codrl_mj.validation.certificate import WITHOUT_TASK, Certificate, Progress, unheard, validate
 from codrl_mj.validation.table import Check
@@ -65,8 +66,12 @@ def wrong_model(*parts: Part) -> Iterator[None]:
                 getattr(owner, field)[at] *= factor
         return model
 
-    with _everywhere("task_model", build, build_wrong):
-        yield
+    bare_model.cache_clear()  # what is kept of right models, and of wrong ones after it
+    try:
+        with _everywhere("task_model", build, build_wrong):
+            yield
+    finally:
+        bare_model.cache_clear()
 
 
 # -- in the source text -------------------------------------------------------------------------------------

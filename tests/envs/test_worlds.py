@@ -2,6 +2,7 @@
 
 import json
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -78,6 +79,16 @@ def test_an_evaluation_keeps_the_time_limit_of_a_world_without_one(monkeypatch):
     assert config.evaluation_env.time_limit == RIG.time_limit
     monkeypatch.setattr(type(RIG), "time_limit", None)
     assert config.evaluation_env.time_limit == 9
+
+
+def test_a_fault_of_an_environment_s_own_is_not_said_to_be_of_options_that_nobody_gave():
+    gym.register("Broken-v0", lambda **_: len(5), max_episode_steps=5)
+    try:
+        with pytest.raises(ValueError, match=r"^Broken-v0: object of type 'int' has no len") as refused:
+            EnvConfig("Broken-v0").make()
+        assert isinstance(refused.value.__cause__, TypeError)
+    finally:
+        gym.registry.pop("Broken-v0")
 
 
 def test_a_long_text_among_the_options_is_no_file():

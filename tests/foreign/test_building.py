@@ -10,6 +10,7 @@ import pytest
 
 import codrl_mj
 from codrl_mj.actuators import Lag
+from codrl_mj.foreign.building import Building
 from tests.foreign.models import ARM
 
 LOADERS = ("from_xml_path", "from_xml_string")
@@ -35,6 +36,10 @@ def test_models_from_files_text_and_environments_get_motors_inside_and_none_outs
         models = [mujoco.MjModel.from_xml_path(str(path)), mujoco.MjModel.from_xml_string(xml=ARM)]
         models.append(mujoco.MjModel.from_xml_string(ARM_FROM_FILE, {"arm.xml": ARM.encode()}))
         ball, env = mujoco.MjModel.from_xml_string(BALL), gym.make("HalfCheetah-v5")
+    building = Building({"servo": Lag(0.1)})
+    with building.motorising():  # as composer environments build theirs at every reset
+        assert [_families(mujoco.MjModel.from_xml_string(ARM)) for _ in range(3)] == [{"servo": Lag}] * 3
+    assert len(building._met) == 1
     with pytest.raises(ZeroDivisionError), codrl_mj.motorised({"servo": "lag"}):
         raise ZeroDivisionError  # passes, and everything is as before
     assert [_families(model) for model in models] == [{"servo": Lag, "motor": Lag}] * 3

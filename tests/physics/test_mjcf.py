@@ -13,8 +13,10 @@ from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop, JointAdditions, Lag
 from codrl_mj.disturbances import Joint
 from codrl_mj.engine import motors
 from codrl_mj.engine.families import HEAD, slot_size, user_head
-from codrl_mj.physics import Plant
+from codrl_mj.own_code import asset_path
+from codrl_mj.physics import MujocoPhysics, Plant
 from codrl_mj.physics.mjcf import drive, task_model
+from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.tasks import TASKS
 from tests.actuators.strategies import of_every_family
 
@@ -47,6 +49,26 @@ def test_every_family_comes_back_as_it_was_written_and_the_ideal_one_is_none_of_
     if max_force is not None:  # the largest torque at the shaft
         limit = max_force * actuator.arm_radius
         np.testing.assert_array_equal(model.actuator_ctrlrange, [[-limit, limit]])
+
+
+def test_a_motor_s_arm_and_limits_are_its_own_behind_an_actuator_of_several_outputs(tmp_path):
+    """One as it was compiled, one exchanged afterwards, and one of a batch."""
+    asset, text = tmp_path / "pendulum.xml", asset_path("pendulum.xml").read_text()
+    for mark, beside in (
+        ("<worldbody>", '<site name="base"/>'),
+        ('<body name="rod">', '<site name="tip"/>'),
+        ("<actuator>", '<orientation name="wrist" site="tip" refsite="base"/>'),
+    ):
+        text = text.replace(mark, mark + beside)
+    asset.write_text(text)
+    task, (short, long) = dataclasses.replace(TASKS["pendulum"], asset=str(asset)), (Motor(arm_radius=0.2), Motor())
+    compiled, exchanged = (MujocoPhysics(Plant(task, [Actuator(motor)])) for motor in (long, short))
+    exchanged.set_actuators([Actuator(long)])
+    batch = MujocoBatchPhysics(Plant(task, [Actuator(short)]), [[Actuator(long)]])
+    assert compiled.model.nout > compiled.model.nactuator
+    for field in ("actuator_gear", "actuator_ctrlrange", "actuator_user"):
+        np.testing.assert_array_equal(getattr(exchanged.model, field), getattr(compiled.model, field))
+        np.testing.assert_array_equal(batch.field(field)[0], getattr(compiled.model, field))
 
 
 def test_the_ideal_actuator_is_a_plain_motor_of_gear_one_whatever_was_there_before():

@@ -162,7 +162,7 @@ def test_its_own_actuator_is_the_motor_of_the_catalogue_at_every_door():
             for name in NAMED
             if name != "ideal"
         ),
-        ({"physics": "analytic"}, r"joint.armature = 4e-06: the equations have no place for it"),  # the rotor's
+        ({"physics": "analytic"}, r"the Drive's armature = 4e-06: the equations have no place for it"),
     ],
 )
 def test_what_it_has_not_is_refused(arguments, said):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy import integrate, signal
 
-from codrl_mj.actuators import FAMILIES, Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import FAMILIES, Actuator, CurrentLoop, Motor, Supply
 from codrl_mj.validation import drives, motor, own_model, rotors
 from codrl_mj.validation.motor_loops import closed_form, closed_loop, sampled_system
 from codrl_mj.validation.rotors import EVERY_FEATURE, Loop, standard_loops
@@ -152,6 +152,13 @@ def test_a_motor_that_never_saturates_and_one_without_back_emf_have_their_own_ch
     names = {check.name: check for check in motor.checks_of({"mine": Loop(quiet, 0.01)}, quick=True)}
     assert names.keys() == LOOP | {LINE}
     assert all(check.passed for check in names.values())
+
+
+@pytest.mark.parametrize("supply", [Supply(12.0), Supply(24.0, 0.5), Supply(np.inf, 0.5), None])
+def test_a_motor_behind_a_supply_is_held_to_the_torque_that_this_leaves(supply):
+    actuator = Actuator(controller=CurrentLoop(kp=2.0, ki=5.0), supply=supply)
+    checks = {check.name: check for check in motor.checks_of({"mine": Loop(actuator, 0.01)}, quick=True)}
+    assert checks["stall torque at the voltage limit"].passed
 
 
 def test_a_stiff_motor_passes_at_its_own_substeps():
