@@ -175,7 +175,9 @@ def make_dm_control(
             does not go with the actuators or the environment.
     """
     resolved = resolve_patterns(actuators, "an environment of dm_control")
-    settings = MotorSettings(resolved, action, False, randomize, resolve(disturbances, OFF), allow_unstable)
+    settings = MotorSettings(
+        resolved, action, randomize=randomize, disturbances=resolve(disturbances, OFF), allow_unstable=allow_unstable
+    )
     if not isinstance(environment, str):
         return MotorisedEnvironment(lambda: environment(**options), settings, noise_seed)
     domain, _, task = environment.partition("/")

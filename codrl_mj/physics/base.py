@@ -179,7 +179,7 @@ class Physics(abc.ABC):
 
     @abc.abstractmethod
     def step(self, desired_force: Any) -> None:
-        """Advance by one environment step, with the desired force (at most the task's `max_force`) held over it.
+        """Advance by one environment step, with the desired force (at most the plant's `max_forces`) held over it.
 
         Args:
             desired_force: a number; for several actuators an array (n,).
@@ -195,7 +195,7 @@ class Physics(abc.ABC):
             SimulationDivergedError: it did.
         """
         state, task = self.state, self.plant.task
-        if state @ state <= LARGEST:  # the quick answer; false for NaN too
+        if state @ state <= LARGEST:  # the quick answer: all are below 1e5; false for NaN too
             return
         fine = np.abs(state) <= LARGEST
         if fine.all():

@@ -101,7 +101,7 @@ class Disturber:
 
 
 KEY_COLUMN = KEY - len(PULSE_NAMES)
-"""Where a row of a disturber's memory holds the key of the episode's random numbers."""
+"""Where a row of a disturber's memory holds the key of the episode's random numbers, counted from its end."""
 
 
 _pulses = internal(pulse_load)

@@ -57,7 +57,7 @@ class Lane(NamedTuple):
     places: np.ndarray
     """The simulation's, see `codrl_mj.physics.stepping`."""
     settings: np.ndarray
-    """Its own, as the next."""
+    """The lane's own copy; likewise the next."""
     trace: np.ndarray
 
 
@@ -71,8 +71,8 @@ def part(model: mujoco.MjModel, name: str) -> slice:
 def lane(physics: MujocoPhysics, data: mujoco.MjData, fields: Mapping[str, np.ndarray]) -> Lane:
     """The lane of other data, with a model of its own, for simulations like this one; the rows have these fields."""
     rows = [
-        (address_of(data.model, name), rows.ctypes.data, rows.strides[0], rows[0].nbytes)
-        for name, rows in fields.items()
+        (address_of(data.model, name), values.ctypes.data, values.strides[0], values[0].nbytes)
+        for name, values in fields.items()
     ]
     parts = [(name, part(data.model, name)) for name in _MOVING]
     live = [(address_of(data, name), one.start, one.stop - one.start) for name, one in parts]

@@ -32,7 +32,7 @@ _offer_cpu = external(
 )
 CLAIMED, BROKEN, TURN, HELPING = range(0, 32, 8)
 """What a board counts, a cache line each: rows that were taken, simulations no longer of numbers, turns that began and
-that ended, and threads that help in the present one."""
+that ended (so it is odd while one goes on), and threads that help in the present one."""
 
 
 def cpus() -> int:

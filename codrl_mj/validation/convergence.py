@@ -221,13 +221,13 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
         return
     if task.twin is None:
         yield Skipped("equations of motion that are not MuJoCo's", NO_TWIN)
-        equations, whose, ideal = engine_equations(task), "MuJoCo's own accelerations", "MuJoCo"
+        equations, whose, named = engine_equations(task), "MuJoCo's own accelerations", "MuJoCo"
     else:
-        equations, whose, ideal = gymnasium_equations(task), f"the equations of {task.oracle}", task.oracle
+        equations, whose, named = gymnasium_equations(task), f"the equations of {task.oracle}", task.oracle
     start, forces, _ = free_run(task)
     for case, actuators in (("ideal actuator", actuators_named("ideal", task)), ("motor in the loop", analogues(task))):
         solution = solve(task, equations, start, forces, actuators)
         solved = whose if case == "ideal actuator" else f"{whose} and of the motor"
         for integrator in task.integrators:
             yield from order_in_the_step(task, case, integrator, actuators, solution, quick, whose=solved)
-    yield from rate_in_the_bandwidth(task, quick, whose=ideal)
+    yield from rate_in_the_bandwidth(task, quick, whose=named)
