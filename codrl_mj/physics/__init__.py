@@ -1,7 +1,7 @@
 """Simulation of a task: in MuJoCo or on Gymnasium's analytic dynamics, behind one small interface, by name.
 
-Read `base`, then `mjcf` (actuators into the model), `stepping` (a step, compiled), `mujoco_single`; many simulations are
-rows in threads' hands: `rows`, `sharing`, `mujoco_batch`.
+Read `base`, then `mjcf` (actuators into the model), `stepping` (a step, compiled), `mujoco_single`; many simulations
+are rows in threads' hands: `rows`, `sharing`, `mujoco_batch`.
 """
 
 from collections.abc import Callable
