@@ -19,8 +19,8 @@ class AnalyticPhysics(Physics):
             ValueError: something is added to the joint, which Gymnasium's equations have no place for; or the task has
                 no Gymnasium environment.
         """
-        adding = {"joint.": plant.joint} | {f"the {type(one).__name__}'s ": one.additions for one in plant.actuators}
-        for whose, added in adding.items():
+        adding = [(f"the {type(one).__name__}'s ", one.additions) for one in plant.actuators]
+        for whose, added in (*adding, ("joint.", plant.joint)):
             for name in ("armature", "damping", "friction"):
                 if value := getattr(added, name):
                     raise ValueError(
