@@ -32,7 +32,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from codrl_mj.actuators import Actuator, Motor, Supply
+from codrl_mj.actuators import Actuator, Motor
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.validation.drives import drive_checks
 from codrl_mj.validation.motor_loops import analogue, sampled_checks
@@ -275,10 +275,11 @@ def voltage_limit(loops: Mapping[str, Loop]) -> Iterator[Case]:
     Loops without a limit, or without a gain, never do and are left out. The tolerance is that of the other constants.
     """
     for name, loop in loops.items():
-        motor, gains, supply = loop.actuator.motor, loop.actuator.controller, loop.actuator.supply or Supply()
-        sag = motor.resistance / (motor.resistance + supply.resistance)
-        open_circuit = gains.max_voltage if math.isinf(supply.voltage) else supply.voltage
-        limit = min(gains.max_voltage, open_circuit * sag)
+        motor, gains, supply = loop.actuator.motor, loop.actuator.controller, loop.actuator.supply
+        limit = gains.max_voltage
+        if supply is not None:
+            open_circuit = limit if math.isinf(supply.voltage) else supply.voltage
+            limit = min(limit, open_circuit * motor.resistance / (motor.resistance + supply.resistance))
         if not math.isfinite(limit) or not gains.kp + gains.ki + gains.kff > 0:
             continue
         steps = math.ceil(40 * motor.electrical_time_constant / loop.timestep) + 40
