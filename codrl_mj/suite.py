@@ -1,6 +1,7 @@
 """Environments as dm_env agents know them: `suite.load("pendulum", "gym")`, or any of Gymnasium's in a `DmEnvironment`.
 
-Dynamics, rewards and ends are the Gymnasium environment's, bit for bit. Needs the extra `dm-control`.
+Dynamics, rewards and ends are the Gymnasium environment's, bit for bit. Needs the extra `dm-control`, which brings
+MuJoCo 3. With MuJoCo 4 it works where dm_env is installed, but for `physics`: dm_control 1.0.50 needs MuJoCo 3.
 """
 
 import copy
@@ -12,13 +13,12 @@ from typing import Any
 import dm_env
 import gymnasium
 import numpy as np
-from dm_control import mujoco as dm_mujoco
-from dm_control.mujoco import wrapper
 from dm_env import specs
 from gymnasium import spaces
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
+from codrl_mj.foreign import check_dm_control
 from codrl_mj.tasks import TASKS
 
 TASK_NAME = "gym"
@@ -56,7 +56,7 @@ class DmEnvironment(dm_env.Environment):
         elif random is not None:
             self._seed = operator.index(random)
         self._names = () if flat_observation else getattr(env.unwrapped, "observation_names", ())
-        self._physics: dm_mujoco.Physics | None = None
+        self._physics: Any = None  # a dm_control.mujoco.Physics, which is imported when it is first asked for
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode."""
@@ -109,11 +109,19 @@ class DmEnvironment(dm_env.Environment):
         return specs.BoundedArray(space.shape, space.dtype, space.low, space.high, name="action")
 
     @property
-    def physics(self) -> dm_mujoco.Physics:
+    def physics(self) -> Any:
         """dm_control's view of the simulation's present model and data: named indexing, `render`, `reset_context`.
 
-        Steps are the environment's own; so are complete saved states, `snapshot` and `restore`.
+        It is a `dm_control.mujoco.Physics`. Steps are the environment's own; so are complete saved states, `snapshot`
+        and `restore`.
+
+        Raises:
+            RuntimeError: dm_control does not work with the installed MuJoCo.
         """
+        check_dm_control()
+        from dm_control import mujoco as dm_mujoco
+        from dm_control.mujoco import wrapper
+
         data = self.data
         if self._physics is None or self._physics.data.ptr is not data:
             self._physics = dm_mujoco.Physics(wrapper.MjData(data))

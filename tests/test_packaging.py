@@ -116,7 +116,10 @@ def test_the_wheel_has_the_program_the_version_and_the_license(wheel, metadata):
 def test_the_training_and_rendering_libraries_are_extras(metadata):
     needed = [line for line in metadata if line.startswith("Requires-Dist: ") and "extra ==" not in line]
     core = {line.split()[1].split("<")[0].split(">")[0] for line in needed}
-    assert core == {"gymnasium", "mujoco", "numba", "numpy", "pint", "platformdirs", "rich", "tyro"}
+    assert core == {
+        *("filelock", "gymnasium[mujoco]", "mujoco", "numba", "numpy"),
+        *("pint", "platformdirs", "pyyaml", "rich", "scipy", "tyro"),
+    }
 
 
 def test_the_wheel_alone_steps_and_draws_every_task(program, tmp_path):

@@ -21,6 +21,7 @@ import gymnasium
 import mujoco
 
 import codrl_mj
+from codrl_mj.cli.extras import missing_module_message
 from codrl_mj.cli.parsing import parse, understood
 from codrl_mj.runs.files import check_file, check_page, check_writable
 
@@ -198,10 +199,7 @@ def _sentence(error: BaseException) -> str:
     """What is wrong, in one line."""
     text = " ".join(str(error).split())
     if isinstance(error, ModuleNotFoundError):
-        return (
-            f"{text}. Training and evaluation need the extra 'train', videos and pictures the extra 'render', "
-            "certificates and margins the extra 'validate': pip install 'codrl-mj[all]'"
-        )
+        return missing_module_message(error)
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, ValueError | OSError | RuntimeError | ArithmeticError | gymnasium.error.Error):

@@ -16,6 +16,7 @@ from codrl_mj.disturbances import OFF, resolve
 from codrl_mj.engine.specs import resolve_patterns
 from codrl_mj.envs.motors import Motors, MotorSettings
 from codrl_mj.fields import did_you_mean
+from codrl_mj.foreign import check_dm_control
 from codrl_mj.foreign.building import Building
 
 
@@ -173,7 +174,9 @@ def make_dm_control(
     Raises:
         ValueError: see `codrl_mj.motorise`; an unknown environment; its model is not built from XML; or an argument
             does not go with the actuators or the environment.
+        RuntimeError: dm_control does not work with the installed MuJoCo.
     """
+    check_dm_control()
     resolved = resolve_patterns(actuators, "an environment of dm_control")
     settings = MotorSettings(
         resolved, action, randomize=randomize, disturbances=resolve(disturbances, OFF), allow_unstable=allow_unstable

@@ -1,0 +1,43 @@
+"""Name the optional dependencies that a missing module belongs to."""
+
+import importlib.metadata
+import re
+
+DISTRIBUTIONS = {"PIL": "pillow", "serial": "pyserial"}
+"""Modules whose distribution has another name than they have."""
+_NOT_FOR_USERS = {"bench", "dev", "docs"}
+
+
+def missing_module_message(error: ModuleNotFoundError) -> str:
+    """Return a sentence that names a missing module, and the extras of this package that install it.
+
+    The extras are read from the metadata of the installed package, so there is no second list of them.
+
+    Args:
+        error: the error of an import, or of `importlib.metadata`.
+    """
+    module = (error.name or "").partition(".")[0]
+    distribution = DISTRIBUTIONS.get(module, module).replace("_", "-").lower()
+    extras = _extras_with(distribution)
+    if not extras:
+        return f"{' '.join(str(error).split())}: install what provides it"
+    if len(extras) == 1:
+        return f"{module} is not installed. The extra '{extras[0]}' brings it: pip install 'codrl-mj[{extras[0]}]'"
+    names = ", ".join(f"'{extra}'" for extra in extras)
+    return f"{module} is not installed. Each of the extras {names} brings it: pip install one, or 'codrl-mj[all]'"
+
+
+def _extras_with(distribution: str) -> list[str]:
+    """Return the extras that require a distribution, without those that contain another one of them."""
+    try:
+        requirements = importlib.metadata.requires("codrl-mj") or []
+    except importlib.metadata.PackageNotFoundError:  # a checkout that was not installed
+        return []
+    extras: dict[str, set[str]] = {}
+    for requirement in requirements:
+        name = re.match(r"[\w-]+", requirement)
+        extra = re.search(r"extra == ['\"](?P<name>[\w-]+)['\"]", requirement)
+        if name and extra and extra["name"] not in _NOT_FOR_USERS:
+            extras.setdefault(extra["name"], set()).add(name[0].lower())
+    having = {extra: names for extra, names in extras.items() if distribution in names}
+    return [extra for extra, names in having.items() if not any(other < names for other in having.values())]

@@ -1,0 +1,166 @@
+"""Everything that the README offers without extras works where only the core dependencies are installed."""
+
+import importlib.metadata
+import json
+import os
+import re
+import subprocess
+import sysconfig
+import tomllib
+import venv
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from codrl_mj.cli import VERBS, extras
+
+REPOSITORY = Path(__file__).parents[1]
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+
+USE = """
+import json
+import gymnasium as gym
+import numpy as np
+import codrl_mj
+
+done = {}
+for task in ("pendulum", "furuta"):
+    env = codrl_mj.make(task, "maxon-ec45-flat-50w" if task == "pendulum" else None, render_mode="rgb_array")
+    env.reset(seed=0)
+    done[task] = bool(np.isfinite(env.step(env.action_space.sample())[1])) and env.render().std() > 0
+envs = codrl_mj.make_vec("cartpole", 4, "weaker")
+done["vector"] = envs.reset(seed=0)[0].shape == (4, 4)
+cheetah = codrl_mj.make("HalfCheetah-v5", {".*": "lag"})
+cheetah.reset(seed=0)
+done["third-party"] = bool(np.isfinite(cheetah.step(cheetah.action_space.sample())[1]))
+print(json.dumps({name: bool(value) for name, value in done.items()}))
+"""
+COMMANDS = [
+    "motor list",
+    "motor show maxon-ec45-flat-50w",
+    "motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20",
+    "identify simulate maxon-ec45-flat-50w --duration 1 --out log.csv",
+    "identify check log.csv --columns time=time:s,voltage=voltage:V,current=current:A,position=position:rad",
+]
+"""Verbs that neither train nor draw."""
+
+
+def _core_distributions():
+    """Names of the core dependencies and of everything that these need, from the metadata of what is installed."""
+    waiting, names = [Requirement(text) for text in PROJECT["dependencies"]], set()
+    while waiting:
+        requirement = waiting.pop()
+        name = re.sub(r"[-_.]+", "-", requirement.name).lower()
+        wanted = [{"extra": extra} for extra in ("", *requirement.extras)]
+        if name in names or (requirement.marker and not requirement.marker.evaluate({"extra": ""})):
+            continue
+        names.add(name)
+        for text in importlib.metadata.requires(name) or []:
+            needed = Requirement(text)
+            if needed.marker is None or any(needed.marker.evaluate(extra) for extra in wanted):
+                needed.marker = None
+                waiting.append(needed)
+    return names
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory):
+    """Run Python in a virtual environment that has this package and the core dependencies, and nothing else."""
+    folder = tmp_path_factory.mktemp("core")
+    venv.create(folder, symlinks=True)
+    library = Path(sysconfig.get_path("purelib", "venv", {"base": str(folder), "platbase": str(folder)}))
+    for name in [*_core_distributions(), "codrl-mj"]:
+        distribution = importlib.metadata.distribution(name)
+        for entry in {file.parts[0] for file in distribution.files} - {"..", "__pycache__"}:
+            source = Path(distribution.locate_file(entry)).resolve()
+            if not (library / entry).exists() and not entry.endswith(".pth"):
+                (library / entry).symlink_to(source)
+    (library / "repository.pth").write_text(str(REPOSITORY))
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+
+    def run(*arguments):
+        line = [folder / "bin" / "python", *arguments]
+        return subprocess.run(line, cwd=folder, env=clean, capture_output=True, text=True, timeout=300, check=False)
+
+    return run
+
+
+def test_environments_work_with_the_core_dependencies_alone(python):
+    done = python("-c", USE)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == {
+        "pendulum": True,
+        "furuta": True,
+        "vector": True,
+        "third-party": True,
+    }
+
+
+def test_the_extras_are_really_missing_there(python):
+    modules = ["torch", "stable_baselines3", "matplotlib", "jinja2", "dm_control", "viser", "control", "onnx", "pytest"]
+    program = f"import importlib.util as u; print([m for m in {modules} if u.find_spec(m)])"
+    assert python("-c", program).stdout.strip() == "[]"
+
+
+def test_verbs_that_neither_train_nor_draw_work_with_the_core_dependencies_alone(python):
+    program = "import sys; from codrl_mj.cli import main; import json\n"
+    program += f"print([main(line.split()) for line in {COMMANDS}])"
+    done = python("-c", program)
+    assert done.stdout.splitlines()[-1:] == [str([0] * len(COMMANDS))], done.stdout[-500:] + done.stderr
+
+
+def test_every_verb_explains_itself_with_the_core_dependencies_alone(python):
+    program = f"""
+import contextlib, io
+from codrl_mj.cli import main
+silent = []
+for name in {list(VERBS)}:
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+        main([*name.split(), "--help"])
+    if "usage" not in text.getvalue().lower():
+        silent.append(name)
+print(silent)
+"""
+    done = python("-c", program)
+    assert done.stdout.splitlines()[-1:] == ["[]"], done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "module", "extra"),
+    [
+        ("train pendulum --total-steps 10 --out runs/a", "stable_baselines3", "train"),
+        ("view pendulum", "trimesh", "view"),
+    ],
+)
+def test_a_verb_that_needs_an_extra_names_it(python, line, module, extra):
+    done = python("-c", f"import sys; from codrl_mj.cli import main; sys.exit(main({line.split()}))")
+    assert done.returncode == 2
+    assert f"pip install 'codrl-mj[{extra}]'" in done.stderr
+    assert module in done.stderr.replace("-", "_")
+
+
+@pytest.mark.parametrize(
+    ("module", "brought_by"),
+    [
+        ("torch", ["train"]),
+        ("serial.tools", ["deploy"]),
+        ("PIL", ["render"]),
+        ("matplotlib", ["render", "train", "validate"]),
+        ("onnxruntime", ["deploy"]),
+    ],
+)
+def test_the_message_on_a_missing_module_names_the_extras_that_declare_it(module, brought_by):
+    distribution = extras.DISTRIBUTIONS.get(module.partition(".")[0], module.partition(".")[0])
+    declaring = [name for name in brought_by if any(text.startswith(distribution) for text in EXTRAS[name])]
+    assert declaring == brought_by  # pyproject.toml says the same
+    text = extras.missing_module_message(ModuleNotFoundError(f"No module named {module!r}", name=module))
+    assert all(f"'{name}'" in text or f"[{name}]" in text for name in brought_by)
+    assert "dev" not in re.findall(r"'(\w+)'", text)
+
+
+def test_the_message_on_an_unknown_module_keeps_its_name():
+    error = ModuleNotFoundError("No module named 'nothing_such'", name="nothing_such")
+    assert extras.missing_module_message(error) == "No module named 'nothing_such': install what provides it"
