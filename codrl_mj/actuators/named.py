@@ -14,7 +14,7 @@ from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name
 from codrl_mj.actuators.servo import Servo
-from codrl_mj.own_code import look_up
+from codrl_mj.own_code import look_up, read_yaml
 
 NAMED: dict[str, tuple[str, Callable[[Actuator], ActuatorModel]]] = {
     "ideal": ("force = desired force: no motor at all", lambda _: IDEAL),
@@ -204,19 +204,17 @@ def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
 
     Refuses a file that is no mapping, and one whose motor was not identified: it has a `problem`.
     """
-    import yaml
-
     if not path.is_file():
         raise FileNotFoundError(f"no actuator file at {path}")
     try:
-        fields = yaml.safe_load(path.read_text())
+        fields = read_yaml(path)
         if not isinstance(fields, dict):
             raise ValueError(f"{fields!r}: must be a mapping of an actuator's fields")
         section = fields.pop("identified", None)
         section = section if isinstance(section, Mapping) else {}
         if section.get("problem"):
             raise ValueError(f"identified from {', '.join(map(str, section.get('logs', ())))}: {section['problem']}")
-    except (yaml.YAMLError, ValueError) as error:
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return fields, section
 
@@ -227,7 +225,7 @@ def _from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
     try:
         other = Path(str(fields.get("name")))
         if other.suffix in _FILES and Path(str(_read(other)[0].get("name"))).suffix in _FILES:
-            raise ValueError(f"name = {fields['name']!r}: that file names another file; it must name an actuator")
+            raise ValueError(f"name = {fields['name']!r}: must be an actuator's name, or a file that names no other")
         made = resolve(fields, paper, whose)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None

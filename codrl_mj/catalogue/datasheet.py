@@ -10,7 +10,7 @@ from typing import Any
 from codrl_mj.catalogue.derivation import MotorNumbers, derive
 from codrl_mj.catalogue.units import Kind, read
 from codrl_mj.fields import check_names
-from codrl_mj.own_code import asset_folder
+from codrl_mj.own_code import asset_folder, read_text
 
 
 def _printed(unit: str, example: str, power: int = 0, zero: bool = False, also: str = "") -> Any:
@@ -247,10 +247,10 @@ def motor_entry(name: str) -> MotorEntry:
         check_names([name], motor_names(), "motor", listed_by="codrl-mj motor list")
         path = asset_folder() / "motors" / f"{name}.toml"
     try:
-        return _entry(path.stem, tomllib.loads(path.read_text(encoding="utf-8")), name.endswith(".toml"))
+        return _entry(path.stem, tomllib.loads(read_text(path)), name.endswith(".toml"))
     except FileNotFoundError as error:
         raise ValueError(f"motor {name!r}: there is no such file; codrl-mj motor new {name} writes one") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, tomllib.TOMLDecodeError) as error:
         raise ValueError(f"motor {name!r}: {path} is no TOML file that can be read: {error}") from error
     except ValueError as error:
         raise ValueError(f"motor {name!r} ({path}): {error}") from error

@@ -15,6 +15,7 @@ from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, Supply, actuato
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.worlds import find_world, is_world
 from codrl_mj.fields import field_docs, parts
+from codrl_mj.own_code import read_yaml
 from codrl_mj.runs import CONFIG
 
 
@@ -177,14 +178,12 @@ def _patterns(items: Sequence[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for item in items:
         if "=" not in item and Path(item).suffix in (".yaml", ".yml", ".json"):
-            import yaml
-
             try:
-                content = yaml.safe_load(Path(item).read_text())
+                content = read_yaml(Path(item))
                 if not isinstance(content, Mapping):
                     raise ValueError("must be a mapping of patterns to actuators")
                 found |= resolve_patterns(content, f"the file {item}")
-            except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
+            except ValueError as error:
                 raise ValueError(f"--actuators {item}: {error}") from None
         else:
             pattern, equals, name = item.rpartition("=")  # the last: a regular expression may have its own

@@ -187,7 +187,7 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
         ({"family": "lag", "time_constnt": 1.0}, r"unknown actuator field time_constnt; did you mean time_constant\?"),
         ({"family": "lag", "motor": {}}, "unknown actuator field motor; known: time_constant, delay"),
         ({"family": "lag", "delay": -1.0}, r"Lag\.delay = -1\.0: must be a finite number >= 0"),
-        ({"family": "torque_speed", "max_torque": 0}, r"TorqueSpeed\.max_torque = 0: must be a finite number > 0"),
+        ({"family": "torque_speed", "max_torque": 0}, r"TorqueSpeed\.max_torque = 0: must be a number > 0"),
         ({"family": "ideal", "motor": {}}, "unknown actuator field motor"),
         (
             {"family": "nowhere_at_all:Mine"},
@@ -208,7 +208,7 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
         ("nowhere_at_all:MINE", "No module named 'nowhere_at_all'"),
         (":", "must be module:NAME"),
         (f"{__name__}:", "must be module:NAME"),
-        ("itself.yaml", r"^itself\.yaml: name = 'itself\.yaml': must be an actuator's name, and no file"),
+        ("itself.yaml", r"^itself\.yaml: name = 'itself\.yaml': must be an actuator's name, or a file that"),
         *((name, rf"^{name}: ") for name in WRONG_FILES),
         (
             {"name": "ideal", "motor": {"resistance": 1.0}},
