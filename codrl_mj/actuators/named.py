@@ -106,6 +106,11 @@ def labelled(actuator: ActuatorModel, label: str) -> Any:
     return actuator
 
 
+def is_family(given: Any) -> bool:
+    """Return True for a class of actuators, which stands for an actuator with its defaults."""
+    return isinstance(given, type) and issubclass(given, ActuatorModel)
+
+
 def _unshared(actuator: ActuatorModel) -> ActuatorModel:
     return actuator if actuator is IDEAL else copy.copy(actuator)
 
@@ -143,9 +148,9 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
 
     Args:
         given: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file, `module:NAME` of an
-            actuator or a family, a YAML or JSON file of such a mapping, an actuator, a mapping of its fields (with a
-            `name`, over that actuator's; with a `label`, what to call it), or None (ideal). Files may be given as a
-            `pathlib.Path`.
+            actuator or a family, a YAML or JSON file of such a mapping, an actuator, a family's class, a mapping of its
+            fields (with a `name`, over that actuator's; with a `label`, what to call it), or None (ideal). Files may be
+            given as a `pathlib.Path`.
         paper: the actuator that the names vary; None where there is none.
         whose: whose it is, for messages.
 
@@ -156,6 +161,9 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
         return IDEAL
     if isinstance(given, ActuatorModel):
         return given
+    if is_family(given):
+        check_family(given)
+        return given()
     if isinstance(given, Mapping) and "label" in given:
         rest = {name: value for name, value in given.items() if name != "label"}
         return labelled(_unshared(resolve(rest, paper, whose)), given["label"])
@@ -186,12 +194,10 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     if given in motor_names() or Path(given).suffix == ".toml":
         return labelled(Drive.of(motor_entry(given).numbers), Path(given).stem)
     found = look_up(given, NAMED | FAMILIES, "actuator", others={"the motors of `codrl-mj motor list`": motor_names()})
-    made = found
-    if isinstance(found, type) and issubclass(found, ActuatorModel):
-        check_family(found)  # type: ignore[arg-type]
-        made = found()
-    if isinstance(made, ActuatorModel):
-        return made if made is not found else labelled(_unshared(made), given)
+    if is_family(found):
+        return resolve(found, paper, whose)
+    if isinstance(found, ActuatorModel):
+        return labelled(_unshared(found), given)
     raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
 
 

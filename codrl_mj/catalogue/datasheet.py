@@ -66,7 +66,8 @@ class Datasheet:
     speed_constant: str | None = _printed("rad/s/V", "380 rpm/V", 1, also="kv")
     """Speed per voltage, Kv."""
     rotor_inertia: str | None = _printed("kg*m^2", "135 g*cm^2", -2)
-    """Inertia of the rotor; at the output, the reflected one (`armature`)."""
+    """Inertia of the rotor; at the output, the reflected one (`armature`). With `shaft = "output"` it must end in
+    `at motor` or `at output`."""
     mechanical_time_constant: str | None = _printed("s", "9.92 ms")
     """How fast the free rotor follows a step of voltage: R*J/(kT*kE)."""
     gear_ratio: str | float | None = _printed("", "30", also="gear reduction")
@@ -110,6 +111,13 @@ class Datasheet:
             raise ValueError(
                 f"datasheet.shaft is missing: {', '.join(either)} may be before or past the gear of "
                 f'{self.gear_ratio}; write shaft = "motor" or shaft = "output", or "... at motor" in a single value'
+            )
+        inertia = found.get("rotor_inertia")
+        if self.shaft == "output" and inertia and inertia.shaft is None and found.get("gear_ratio", inertia).value != 1.0:
+            raise ValueError(
+                f"datasheet.rotor_inertia = {self.rotor_inertia!r}: the rotor's own, or as it is seen at the output, "
+                f'gear_ratio^2 times that? shaft = "output" leaves it open: write "{inertia.printed} at motor" (what '
+                f'motors\' datasheets print) or "{inertia.printed} at output" (reflected, an armature)'
             )
         at = self.shaft or "motor"
         found = {name: reading._replace(shaft=reading.shaft or at) for name, reading in found.items()}

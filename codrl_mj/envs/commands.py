@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Drive, Ideal, Servo
-from codrl_mj.disturbances import OFF, Disturbances
+from codrl_mj.disturbances import OFF, Disturbances, check_delay
 from codrl_mj.engine.specs import ON_JOINT
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
@@ -193,6 +193,7 @@ class ControlCommands:
             return
         if step_duration is None:
             raise ValueError("disturbances: the environment has no dt, the duration of its steps [s]; give it one")
+        check_delay(disturbances, step_duration, None)
         self._data, self._pulses = data, disturbances.random
         self._controls = places = model.actuator_ctrladr[indices]
         limited = model.actuator_ctrllimited[places].astype(bool)
