@@ -240,6 +240,7 @@ def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:
     if not isinstance(mapping, Mapping):
         raise ValueError(f"{what} {prefix.rstrip('.')!r} = {mapping!r}: must be a mapping of {cls.__name__}'s fields")
     nested = parts(cls)
+    absent = {field.name: field.metadata["absent"] for field in dataclasses.fields(cls) if "absent" in field.metadata}
     inner = [f"{name}.{field.name}" for name, kind in nested.items() for field in dataclasses.fields(kind)]
     check_names(mapping, (field.name for field in dataclasses.fields(cls)), what, prefix, inner=inner)
 
@@ -247,6 +248,8 @@ def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:
         """Return a part of a mapping as its dataclass; one that is a dataclass already stays."""
         if key not in nested or value is None or isinstance(value, nested[key]):
             return value
+        if isinstance(value, Mapping) and key in absent:  # over what stands for the part where it is left out
+            value = {**dataclasses.asdict(absent[key]), **value}
         return build(nested[key], value, what, f"{prefix}{key}.")
 
     return cls(**{key: built(key, value) for key, value in mapping.items()})
