@@ -154,6 +154,7 @@ def check_names(
     for name in given:
         if name not in known:
             near = [one for one in inner if one.rpartition(".")[2] == name][:3] or _nearest(name, known)
+            near = near or _nearest(name, inner)
             hints = [f"did you mean {' or '.join(f'{prefix}{one}' for one in near)}?"] if near else []
             if every or not near:
                 hints.append(f"`{listed_by}` lists the known ones" if listed_by else f"known: {', '.join(known)}")

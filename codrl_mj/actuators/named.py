@@ -277,6 +277,7 @@ def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
     given = {name: value for name, value in changes.items() if value != {}}
     kind: Any = type(base)
     family = given.pop("family", family_name(kind))
+    family = family_name(family) if is_family(family) else family
     if family == family_name(kind) and not given:
         return base
     if isinstance(base, Ideal):
@@ -286,8 +287,7 @@ def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
     if family != family_name(kind):
         kind = _related_family(family, kind)
     _check_fields(given, kind)
-    fields = {field.name for field in dataclasses.fields(kind)}
-    merged: dict[str, Any] = {name: value for name, value in base.as_mapping().items() if name in fields}
+    merged: dict[str, Any] = {key: value for key, value in base.as_mapping().items() if key in _field_names(kind)}
     for name, value in given.items():
         inner = merged.get(name)
         merged[name] = {**(inner or {}), **value} if isinstance(value, Mapping) else value
@@ -318,12 +318,16 @@ def _related_family(family: str, kind: Any) -> Any:
     return other
 
 
+def _field_names(kind: Any) -> set[str]:
+    """Return the names of a family's fields."""
+    return {field.name for field in dataclasses.fields(kind)}
+
+
 def _check_fields(given: Mapping[str, Any], kind: Any) -> None:
     """Refuse fields that the family does not have, but a related family has, with the name of that family."""
-    fields = {field.name for field in dataclasses.fields(kind)}
-    for name in set(given) - fields:
-        owners = [other for other, one in FAMILIES.items() if issubclass(one, kind) and hasattr(one, name)]
-        if owners:
+    for name in given:
+        owners = [other for other, one in FAMILIES.items() if issubclass(one, kind) and name in _field_names(one)]
+        if owners and name not in _field_names(kind):
             raise ValueError(f"unknown actuator field {name} of a {family_name(kind)}: add family = {owners[0]!r}")
 
 
