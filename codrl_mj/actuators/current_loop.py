@@ -258,7 +258,8 @@ class Actuator(ActuatorModel):
         most, voltage = self.controller.max_voltage, math.inf if self.supply is None else self.supply.voltage
         if not (most == CurrentLoop.max_voltage and most < voltage < math.inf):
             return ""
-        return f"assumed, for none is given: controller.max_voltage = {most:g} V, which limits the supply of {voltage:g} V"
+        limit = f"controller.max_voltage = {most:g} V, which limits the supply of {voltage:g} V"
+        return f"assumed, for none is given: {limit}"
 
     def commands(self) -> Mapping[str, Command]:
         """A reference `current` [A], or a `voltage` [V] past the controller: end to end."""

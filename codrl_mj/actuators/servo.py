@@ -195,7 +195,7 @@ class Servo(Drive):
 
     @property
     def default_velocity_gain(self) -> float:
-        """Gain [N*m*s/rad] of a velocity loop that nobody tuned: ten times the slope kT*kE/R of the motor at its output.
+        """Gain [N*m*s/rad] of an untuned velocity loop: ten times the slope kT*kE/R of the motor, at its output.
 
         An error of a tenth of the free speed then asks for the stall torque. It is rounded to three digits, so that a
         message has the same number; 0 for a motor without back-EMF.

@@ -112,8 +112,8 @@ class Datasheet:
                 f"datasheet.shaft is missing: {', '.join(either)} may be before or past the gear of "
                 f'{self.gear_ratio}; write shaft = "motor" or shaft = "output", or "... at motor" in a single value'
             )
-        inertia = found.get("rotor_inertia")
-        if self.shaft == "output" and inertia and inertia.shaft is None and found.get("gear_ratio", inertia).value != 1.0:
+        inertia, ratio = found.get("rotor_inertia"), found.get("gear_ratio")
+        if self.shaft == "output" and inertia and inertia.shaft is None and ratio and ratio.value != 1.0:
             raise ValueError(
                 f"datasheet.rotor_inertia = {self.rotor_inertia!r}: the rotor's own, or as it is seen at the output, "
                 f'gear_ratio^2 times that? shaft = "output" leaves it open: write "{inertia.printed} at motor" (what '

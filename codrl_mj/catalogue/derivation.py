@@ -194,7 +194,7 @@ class MotorNumbers:
 
 
 AT_OUTPUT = ("stall_torque_at_output", "continuous_torque_at_output", "torque_constant_at_output")
-"""Torques, and torque per current, past a gear's losses, which do not tell the motor's before its efficiency is known."""
+"""Torques, and torque per current, past a gear's losses, which tell the motor's only once its efficiency is known."""
 _LEAST_EFFICIENCY = 0.2
 """No off-the-shelf gear for a servo is worse: a derived efficiency below it is a slip of units."""
 OTHER_NAMES = {

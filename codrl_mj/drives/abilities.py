@@ -30,7 +30,7 @@ def find_drive(
     delayed: bool | None = None,
     max_current: float | None = None,
 ) -> Drive:
-    """A drive by name, with single fields set over it; None leaves a field as it is. A servo's outer loops are left out.
+    """A drive by name, of a servo without its outer loops, with single fields set over it; None leaves a field.
 
     Args:
         name: whatever `codrl_mj.actuators.resolve` takes, such as a motor of the catalogue.

@@ -125,9 +125,9 @@ def test_what_makes_no_servo_is_refused_with_the_way_to_one(given, message):
 
 def test_the_command_line_makes_a_servo_of_a_name_and_a_run_keeps_it(files, monkeypatch):
     configs = []
-    monkeypatch.setattr("codrl_mj.training.train", lambda config, out, **_: configs.append(config))
-    line = "--actuator sheet.toml --actuator.family servo --actuator.motor.gear-ratio 50 --actuator.loop.position-gain 10"
-    ran(f"train pendulum {line} --env.action position {TINY} --out run")
+    monkeypatch.setattr("codrl_mj.training.train", lambda config, *_, **__: configs.append(config))
+    line = "--actuator sheet.toml --actuator.family servo --actuator.loop.position-gain 10"
+    ran(f"train pendulum {line} --actuator.motor.gear-ratio 50 --env.action position {TINY} --out run")
     Path("run").mkdir()
     Path("run/config.json").write_text(json.dumps(admit(Path("other"), configs[0], resume=False, accept_changes=False)))
     made = load_config(Path("run")).actuators[0]

@@ -41,8 +41,8 @@ def test_points_in_four_quadrants_are_those_of_others(motor, desired, speed, exp
     assert signals.saturated == (torque != sign * desired)
 
 
-LEG = """<mujoco><option timestep="1e-6"/><worldbody><body><joint name="knee" axis="0 1 0"/><geom size=".1" mass="5"/></body>
-</worldbody><actuator><motor name="knee" joint="knee"/></actuator></mujoco>"""
+LEG = """<mujoco><option timestep="1e-6"/><worldbody><body><joint name="knee" axis="0 1 0"/>
+<geom size=".1" mass="5"/></body></worldbody><actuator><motor name="knee" joint="knee"/></actuator></mujoco>"""
 
 
 @pytest.mark.parametrize("more", [{}, {"max_torque": 30.0}, {"max_torque": 10.0}])
