@@ -70,7 +70,7 @@ class Lag(ActuatorModel):
     """What of the desired torque is delivered in the end, > 0: 0.9 for a torque constant that is 10 % too small."""
 
     def check(self, timestep: float) -> None:
-        """Refuse a delay longer than what is remembered, and warn of a time constant that can only be one in ms.
+        """Refuse a delay longer than what is remembered, and warn of a time constant that looks like one in ms.
 
         Raises:
             ValueError: the delay is more than `HISTORY` steps.
