@@ -5,6 +5,7 @@ These are plain Python on purpose: `codrl_mj.physics.disturber` compiles them.
 
 import dataclasses
 import math
+import warnings
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from codrl_mj import fields
 from codrl_mj.actuators.noise import LOAD_STREAM, philox, unit
 from codrl_mj.fields import real
 
-__all__ = ["OFF", "PLAIN", "Disturbances", "Joint", "resolve"]
+__all__ = ["OFF", "PLAIN", "Disturbances", "Joint", "check_delay", "resolve"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +100,23 @@ def resolve(given: Any, absent: Any) -> Any:
     if given is None or isinstance(given, type(absent)):
         return absent if given is None else given
     return fields.build(type(absent), given, "field", f"{type(absent).__name__.lower()}.")
+
+
+def check_delay(disturbances: Disturbances, step_duration: float, max_steps: int | None) -> None:
+    """Refuse a delay [s] as long as an episode, in which no command arrives; warn of one over twenty of its steps.
+
+    Args:
+        disturbances: with the delay.
+        step_duration: of an environment step [s].
+        max_steps: the longest episode [environment steps]; None if it is not known.
+    """
+    delay, episode = disturbances.command_delay, math.inf if max_steps is None else max_steps * step_duration
+    text = f"Disturbances.command_delay = {delay:g}: "
+    remedy = f"it is in seconds: for {delay:g} ms write {delay / 1e3:g}"
+    if delay >= episode:
+        raise ValueError(f"{text}must be < {episode:g} s, the longest episode, or no command would arrive; {remedy}")
+    if delay > 20.0 * step_duration:
+        warnings.warn(f"{text}a delay of {delay / step_duration:.3g} environment steps; {remedy}", stacklevel=2)
 
 
 _NEAR = 1e-9  # of an integration step: nearer to a whole number of steps is that number

@@ -131,7 +131,13 @@ class Checked:
 
 
 def check_names(
-    given: Iterable[Any], known: Iterable[str], what: str, prefix: str = "", every: bool = False, listed_by: str = ""
+    given: Iterable[Any],
+    known: Iterable[str],
+    what: str,
+    prefix: str = "",
+    every: bool = False,
+    listed_by: str = "",
+    inner: Iterable[str] = (),
 ) -> None:
     """Refuse names that are not known; the nearest known ones are suggested.
 
@@ -142,11 +148,13 @@ def check_names(
         prefix: stands before each of them in the message.
         every: list the known ones beside the nearest, too: for names that somebody else has for the same.
         listed_by: the command that lists them, where they are many.
+        inner: dotted names of what is in their parts, to be suggested to whoever leaves the part out.
     """
-    known = list(known)
+    known, inner = list(known), list(inner)
     for name in given:
         if name not in known:
-            near = _nearest(name, known)
+            near = [one for one in inner if one.rpartition(".")[2] == name][:3] or _nearest(name, known)
+            near = near or _nearest(name, inner)
             hints = [f"did you mean {' or '.join(f'{prefix}{one}' for one in near)}?"] if near else []
             if every or not near:
                 hints.append(f"`{listed_by}` lists the known ones" if listed_by else f"known: {', '.join(known)}")
@@ -185,10 +193,30 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def _nearest(name: object, known: Iterable[str]) -> list[str]:
-    """The few names that begin with a name of which the end was left out, or else the one that is most like it."""
+    """Return the few names that begin with a name or have all of its words, or else the one that is most like it.
+
+    Of dotted names only the last parts are compared where the parts before it are known: what two names begin with
+    alike makes them no more similar.
+    """
     text, spelt = str(name).lower(), {one.lower(): one for one in known}
     begun = [spelt[one] for one in spelt if len(text) > 2 and one.startswith(text)]
-    return begun if 0 < len(begun) < 4 else [spelt[one] for one in difflib.get_close_matches(text, spelt, n=1)]
+    if 0 < len(begun) < 4:
+        return begun
+    start, dot, last = text.rpartition(".")
+    ends = {one[len(start + dot) :]: one for one in spelt if dot and one.startswith(start + dot)}
+    if not ends:
+        ends, last = {one: one for one in spelt}, text
+    words = _words(last)
+    same = [spelt[one] for end, one in ends.items() if words and words <= _words(end.rpartition(".")[2])]
+    if 0 < len(same) < 4:
+        return same
+    beside = [end for end in ends if last == text or "." not in end]
+    return [spelt[ends[one]] for one in difflib.get_close_matches(last, beside, n=1)]
+
+
+def _words(name: str) -> set[str]:
+    """Return the words of a name or a flag."""
+    return set(re.findall(r"[a-z0-9]{3,}", name.replace("_", " ")))
 
 
 @functools.cache
@@ -212,14 +240,20 @@ def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:
     """Build a dataclass, and those in its fields, from nested mappings; absent fields take their defaults."""
     if not isinstance(mapping, Mapping):
         raise ValueError(f"{what} {prefix.rstrip('.')!r} = {mapping!r}: must be a mapping of {cls.__name__}'s fields")
-    check_names(mapping, (field.name for field in dataclasses.fields(cls)), what, prefix)
     nested = parts(cls)
-    return cls(
-        **{
-            key: build(nested[key], value, what, f"{prefix}{key}.") if key in nested and value is not None else value
-            for key, value in mapping.items()
-        }
-    )
+    absent = {field.name: field.metadata["absent"] for field in dataclasses.fields(cls) if "absent" in field.metadata}
+    inner = [f"{name}.{field.name}" for name, kind in nested.items() for field in dataclasses.fields(kind)]
+    check_names(mapping, (field.name for field in dataclasses.fields(cls)), what, prefix, inner=inner)
+
+    def built(key: str, value: Any) -> Any:
+        """Return a part of a mapping as its dataclass; one that is a dataclass already stays."""
+        if key not in nested or value is None or isinstance(value, nested[key]):
+            return value
+        if isinstance(value, Mapping) and key in absent:  # over what stands for the part where it is left out
+            value = {**dataclasses.asdict(absent[key]), **value}
+        return build(nested[key], value, what, f"{prefix}{key}.")
+
+    return cls(**{key: built(key, value) for key, value in mapping.items()})
 
 
 def part(absent: Any) -> Any:

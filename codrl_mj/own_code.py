@@ -3,6 +3,7 @@
 Errors in them are one sentence.
 """
 
+import codecs
 import contextlib
 import contextvars
 import functools
@@ -99,6 +100,56 @@ def asset_path(name: str) -> Path:
     if Path(name).parent == Path():
         raise FileNotFoundError(f"no model {name!r} in {Path.cwd()}, nor among codrl_mj's: give the whole path")
     raise FileNotFoundError(f"no model file {name}")
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file, without the byte order mark that some editors put in front.
+
+    Raises:
+        ValueError: it is not UTF-8; the message has the line, and the character if it was saved in Windows-1252.
+    """
+    content = path.read_bytes()
+    try:
+        wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+        return content.decode("utf-16" if wide else "utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError as error:
+        line, byte = content.count(b"\n", 0, error.start) + 1, content[error.start : error.start + 1]
+        meant = byte.decode("cp1252", "replace")
+        raise ValueError(
+            f"line {line} has the byte 0x{byte.hex()} ({meant} in Windows-1252), which is not UTF-8: save the file as "
+            "UTF-8"
+        ) from None
+
+
+def read_yaml(path: Path) -> Any:
+    """Return what a YAML or JSON file holds, with numbers as in YAML 1.2 and JSON: 3e-4, Infinity; 20:1 is a text.
+
+    Raises:
+        ValueError: it is not YAML, or one mapping has a key twice.
+    """
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            keys = [key.value for key, _ in node.value]
+            for key, _ in node.value[::-1]:
+                if keys.count(key.value) > 1 and key.value != "<<":
+                    raise ValueError(f"line {key.start_mark.line + 1}: {key.value} is given twice: leave one out")
+            return super().construct_mapping(node, deep)
+
+    kinds = {"int": r"[-+]?(0|[1-9][\d_]*)$|0x[\da-fA-F]+$", "float": r"[-+]?(\d[\d_]*(\.\d*)?|\.\d+)([eE][-+]?\d+)?$"}
+    kinds["float"] += r"|[-+]?(\.(inf|Inf|INF)|Infinity)$|\.?(nan|NaN|NAN)$"
+    tags = {f"tag:yaml.org,2002:{kind}": re.compile(text) for kind, text in kinds.items()}
+    Loader.yaml_implicit_resolvers = {
+        start: [one for one in several if one[0] not in tags]
+        for start, several in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+    for tag, pattern in tags.items():
+        Loader.add_implicit_resolver(tag, pattern, list("-+.0123456789INn"))
+    try:
+        return yaml.load(read_text(path), Loader)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from None
 
 
 _TRUSTED = contextvars.ContextVar("trusted", default=True)

@@ -29,8 +29,8 @@ PAGES = {
     if "results" not in path.parts and ("reference" not in path.parts or path.name == "python.md")
 }
 """What is written by hand; `make docs` writes the other pages of the reference, from the code."""
-WRITTEN = (ROOT / ".gitignore").read_text().splitlines()
-"""What it writes, among others."""
+NOT_CLONED = {"docs/reference/settings.md", "docs/reference/command_line.md"}
+"""What it writes: such pages are in no clone."""
 TUTORIALS = {"docs/tutorial_log_to_policy.md", "docs/tutorial_datasheet_to_board.md"}
 """Pages whose commands have tests of their own, which follow them."""
 OF_THEIR_OWN = ("own_robot", "training", "other_agents", "randomization")
@@ -231,7 +231,23 @@ def test_a_page_links_to_what_exists(page):
     for link in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", PAGES[page]):
         if not link.startswith("http"):
             target = (ROOT / page).parent / link
-            assert target.exists() or f"docs/reference/{target.name}" in WRITTEN, link
+            assert target.exists(), link
+            assert str(target.resolve().relative_to(ROOT)) not in NOT_CLONED, link
+
+
+TEXTS = ("*.py", "*.toml", "*.xml", "*.jinja", "*.md", "*.html", "*.js", "*.yml", "Makefile")
+"""What may name a page: messages, help, docstrings, generated files."""
+
+
+def test_every_page_that_code_assets_and_help_name_is_in_a_clone():
+    folders = [ROOT / name for name in ("codrl_mj", "assets", "examples", "scripts")]
+    files = [file for folder in folders for kind in TEXTS for file in folder.rglob(kind)]
+    files += [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "Makefile", "pyproject.toml", "zensical.toml")]
+    named = {page: file for file in files for page in re.findall(r"docs/[\w/]+\.md", file.read_text(errors="replace"))}
+    assert "docs/motors.md" in named
+    for page, file in named.items():
+        assert (ROOT / page).is_file(), f"{file} names {page}"
+        assert page not in NOT_CLONED, f"{file} names {page}"
 
 
 def test_the_file_of_upright_tolerances_has_the_pendulum_s_own():

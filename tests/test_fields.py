@@ -221,3 +221,28 @@ def test_names_are_refused_exactly_if_they_are_not_known(given_names, known):
         return
     with pytest.raises(ValueError, match=re.escape(f"unknown thing in.{wrong[0]}; ")):
         check_names(given_names, known, "thing", "in.")
+
+
+FLAGS = [
+    *("--actuators", "--env.levels", "--env.timestep", "--env.disturbances.command-delay", "--actuator.supply.voltage"),
+    *(f"--actuator.motor.{one}" for one in ("resistance", "inductance", "coulomb-friction", "viscous-friction")),
+    *("--actuator.motor.arm-radius", "--actuator.motor.rotor-inertia", "--actuator.controller.max-current"),
+]
+
+
+@pytest.mark.parametrize(
+    ("flag", "near"),
+    {
+        "--actuator.motor.friction": ["--actuator.motor.coulomb-friction", "--actuator.motor.viscous-friction"],
+        "--actuator.motor.inertia": ["--actuator.motor.rotor-inertia"],
+        "--actuator.controller.current": ["--actuator.controller.max-current"],
+        "--actuator.motor.inductanse": ["--actuator.motor.inductance"],
+        "--actuator.motr.inductance": ["--actuator.motor.inductance"],
+        "--env.delay": ["--env.disturbances.command-delay"],
+        "--env.time-step": ["--env.timestep"],
+        **{flag: [] for flag in ("--actuator.backlash", "--actuator.motor.backlash", "--backlash", "--env.encoder")},
+    }.items(),
+)
+def test_a_suggestion_means_the_same_and_where_nothing_does_there_is_none(flag, near):
+    said = did_you_mean(flag, FLAGS)
+    assert said == (f"did you mean {' or '.join(map(repr, near))}? " if near else "")

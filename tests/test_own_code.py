@@ -1,5 +1,6 @@
 """What users write for tasks and families is refused in one sentence where it is wrong, and never ends the process."""
 
+import math
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ from codrl_mj.actuators import resolve
 from codrl_mj.engine import load_family
 from codrl_mj.engine.families import compiled_observe
 from codrl_mj.foreign import environments
+from codrl_mj.own_code import read_yaml
 from codrl_mj.physics.compiled_task import compiled_constrain, compiled_outcomes
 from tests import slips
 from tests.matrix import but
@@ -163,3 +165,33 @@ def reset(task, **options):
 )
 def test_other_doors_say_what_they_want(door, given, message):
     refused(lambda: door(*given), message)
+
+
+@pytest.mark.parametrize(
+    ("text", "read"),
+    [
+        (
+            "{a: 3e-4, b: -Infinity, c: 010, d: 0x1F, e: 1_000, f: .5, g: NaN2}",
+            [3e-4, -math.inf, 10.0, 31, 1000, 0.5, "NaN2"],
+        ),
+        ("{a: 20:1, b: 12:30:45}", ["20:1", "12:30:45"]),  # 1201 and 45045 in YAML 1.1
+        ("\ufeffa: µ\r\nb: yes", ["µ", True]),
+    ],
+)
+def test_numbers_of_a_yaml_file_are_those_of_yaml_1_2_and_json(tmp_path, text, read):
+    file = tmp_path / "read.yaml"
+    for encoding in ("utf-8", "utf-16"):
+        file.write_bytes(text.encode(encoding))
+        assert [*read_yaml(file).values()] == read
+
+
+def test_what_is_no_yaml_file_is_refused_with_its_line(tmp_path):
+    file = tmp_path / "read.yaml"
+    for content, message in {
+        b"a: 1\nb: \xb5m": r"line 2 has the byte 0xb5 \(µ in Windows-1252\).*save the file as UTF-8",
+        b"a:\n  b: 1\n  c: 2\n  b: 3": "line 4: b is given twice",
+        b"[1, 2": "expected",
+    }.items():
+        file.write_bytes(content)
+        with pytest.raises(ValueError, match=message):
+            read_yaml(file)

@@ -252,6 +252,15 @@ class Actuator(ActuatorModel):
         """The largest voltage [V] without a current."""
         return min(self.controller.max_voltage, math.inf if self.supply is None else self.supply.voltage)
 
+    @property
+    def assumed(self) -> str:
+        """As `ActuatorModel.assumed`: the controller's default limit, where the supply has more."""
+        most, voltage = self.controller.max_voltage, math.inf if self.supply is None else self.supply.voltage
+        if not (most == CurrentLoop.max_voltage and most < voltage < math.inf):
+            return ""
+        limit = f"controller.max_voltage = {most:g} V, which limits the supply of {voltage:g} V"
+        return f"assumed, for none is given: {limit}"
+
     def commands(self) -> Mapping[str, Command]:
         """A reference `current` [A], or a `voltage` [V] past the controller: end to end."""
         torque = self.motor.torque_constant

@@ -220,11 +220,16 @@ class Drive(ActuatorModel):
     @property
     def assumed(self) -> str:
         """As `ActuatorModel.assumed`: the supply, the largest current, the inertia of the rotor."""
+        motor = self.motor
+        alike = 0.5 <= motor.back_emf_constant / motor.torque_constant <= 2.0
         missing = {
-            f"supply.voltage = {self.voltage_limit:g} V": self.supply is None,
+            f"supply.voltage = {self.voltage_limit:g} V": self.supply is None or math.isinf(self.supply.voltage),
             "controller.max_current = inf": math.isinf(self.controller.max_current),
-            "motor.rotor_inertia = 0": self.motor.rotor_inertia == 0.0,
+            "motor.rotor_inertia = 0": motor.rotor_inertia == 0.0,
         }
+        for name in ("torque_constant", "back_emf_constant"):  # of another motor: the two are equal but for losses
+            value = getattr(motor, name)
+            missing[f"motor.{name} = {value:g}, a default"] = not alike and value == getattr(GearMotor, name)
         told = ", ".join(text for text, is_missing in missing.items() if is_missing)
         return f"assumed, for none is given: {told}" if told else ""
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -69,11 +70,17 @@ class Lag(ActuatorModel):
     """What of the desired torque is delivered in the end, > 0: 0.9 for a torque constant that is 10 % too small."""
 
     def check(self, timestep: float) -> None:
-        """Refuse a delay longer than what is remembered.
+        """Refuse a delay longer than what is remembered, and warn of a time constant that looks like one in ms.
 
         Raises:
             ValueError: the delay is more than `HISTORY` steps.
         """
+        if self.time_constant > 2.0:
+            warnings.warn(
+                f"Lag.time_constant = {self.time_constant:g}: 63 % of a step is delivered after {self.time_constant:g} "
+                f"s; it is in seconds: for {self.time_constant:g} ms write {self.time_constant / 1e3:g}",
+                stacklevel=2,
+            )
         if self.delay > HISTORY * timestep * (1 + 1e-9):
             raise ValueError(
                 f"Lag.delay = {self.delay:g}: must be <= {HISTORY * timestep:g} s, {HISTORY} steps of {timestep:g} s. "

@@ -13,7 +13,8 @@ from codrl_mj.actuators.drive import Drive
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name
-from codrl_mj.own_code import look_up
+from codrl_mj.actuators.servo import Servo
+from codrl_mj.own_code import look_up, read_yaml
 
 NAMED: dict[str, tuple[str, Callable[[Actuator], ActuatorModel]]] = {
     "ideal": ("force = desired force: no motor at all", lambda _: IDEAL),
@@ -55,6 +56,11 @@ def actuator_from_mapping(mapping: Mapping[str, Any]) -> Any:
         ValueError: unknown family or field, or a value out of bounds.
     """
     fields = dict(mapping)
+    if isinstance(motor := fields.get("motor"), str | Path):
+        raise ValueError(
+            f"motor = {str(motor)!r}: must be a mapping of a motor's fields; for a motor of the catalogue or of a file "
+            f"write name = {str(motor)!r} beside the family"
+        )
     return find_family(fields.pop("family", Actuator.family)).from_mapping(fields)
 
 
@@ -100,6 +106,11 @@ def labelled(actuator: ActuatorModel, label: str) -> Any:
     return actuator
 
 
+def is_family(given: Any) -> bool:
+    """Return True for a class of actuators, which stands for an actuator with its defaults."""
+    return isinstance(given, type) and issubclass(given, ActuatorModel)
+
+
 def _unshared(actuator: ActuatorModel) -> ActuatorModel:
     return actuator if actuator is IDEAL else copy.copy(actuator)
 
@@ -137,9 +148,9 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
 
     Args:
         given: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file, `module:NAME` of an
-            actuator or a family, a YAML or JSON file of such a mapping, an actuator, a mapping of its fields (with a
-            `name`, over that actuator's; with a `label`, what to call it), or None (ideal). Files may be given as a
-            `pathlib.Path`.
+            actuator or a family, a YAML or JSON file of such a mapping, an actuator, a family's class, a mapping of its
+            fields (with a `name`, over that actuator's; with a `label`, what to call it), or None (ideal). Files may be
+            given as a `pathlib.Path`.
         paper: the actuator that the names vary; None where there is none.
         whose: whose it is, for messages.
 
@@ -150,6 +161,9 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
         return IDEAL
     if isinstance(given, ActuatorModel):
         return given
+    if is_family(given):
+        check_family(given)
+        return given()
     if isinstance(given, Mapping) and "label" in given:
         rest = {name: value for name, value in given.items() if name != "label"}
         return labelled(_unshared(resolve(rest, paper, whose)), given["label"])
@@ -180,12 +194,10 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     if given in motor_names() or Path(given).suffix == ".toml":
         return labelled(Drive.of(motor_entry(given).numbers), Path(given).stem)
     found = look_up(given, NAMED | FAMILIES, "actuator", others={"the motors of `codrl-mj motor list`": motor_names()})
-    made = found
-    if isinstance(found, type) and issubclass(found, ActuatorModel):
-        check_family(found)  # type: ignore[arg-type]
-        made = found()
-    if isinstance(made, ActuatorModel):
-        return made if made is not found else labelled(_unshared(made), given)
+    if is_family(found):
+        return resolve(found, paper, whose)
+    if isinstance(found, ActuatorModel):
+        return labelled(_unshared(found), given)
     raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
 
 
@@ -198,19 +210,17 @@ def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
 
     Refuses a file that is no mapping, and one whose motor was not identified: it has a `problem`.
     """
-    import yaml
-
     if not path.is_file():
         raise FileNotFoundError(f"no actuator file at {path}")
     try:
-        fields = yaml.safe_load(path.read_text())
+        fields = read_yaml(path)
         if not isinstance(fields, dict):
             raise ValueError(f"{fields!r}: must be a mapping of an actuator's fields")
         section = fields.pop("identified", None)
         section = section if isinstance(section, Mapping) else {}
         if section.get("problem"):
             raise ValueError(f"identified from {', '.join(map(str, section.get('logs', ())))}: {section['problem']}")
-    except (yaml.YAMLError, ValueError) as error:
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return fields, section
 
@@ -219,8 +229,9 @@ def _from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
     """An actuator from a YAML or JSON file that holds a mapping of its fields."""
     fields, _ = _read(path)
     try:
-        if Path(str(fields.get("name"))).suffix in _FILES:
-            raise ValueError(f"name = {fields['name']!r}: must be an actuator's name, and no file")
+        other = Path(str(fields.get("name")))
+        if other.suffix in _FILES and Path(str(_read(other)[0].get("name"))).suffix in _FILES:
+            raise ValueError(f"name = {fields['name']!r}: must be an actuator's name, or a file that names no other")
         made = resolve(fields, paper, whose)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
@@ -255,31 +266,69 @@ def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
 
     Args:
         base: the other one.
-        changes: nested, for example `{"controller": {"kp": 2.0}}`.
+        changes: nested, for example `{"controller": {"kp": 2.0}}`. A `family` turns a drive into a servo, or back: the
+            motor, the controller and the supply stay the same. A servo that is made so and is given no
+            `loop.velocity_gain` gets `Servo.default_velocity_gain`.
 
     Raises:
-        ValueError: a field is unknown or out of bounds, or set over the ideal actuator, which has none.
+        ValueError: a field is unknown or out of bounds, or set over the ideal actuator, which has none; or the family
+            is not related to the actuator's.
     """
     given = {name: value for name, value in changes.items() if value != {}}
-    family = given.pop("family", family_name(type(base)))
-    if family != family_name(type(base)):
-        raise ValueError(
-            f"family = {family!r}: what it is set over is a {family_name(type(base))!r}; give the fields of a "
-            f"{family!r} without a name"
-        )
-    if not given:
+    kind: Any = type(base)
+    family = given.pop("family", family_name(kind))
+    family = family_name(family) if is_family(family) else family
+    if family == family_name(kind) and not given:
         return base
     if isinstance(base, Ideal):
         raise ValueError(
             "the ideal actuator has no motor and no controller to set fields of: name another actuator, such as paper"
         )
-    merged: dict[str, Any] = base.as_mapping()
+    if family != family_name(kind):
+        kind = _related_family(family, kind)
+    _check_fields(given, kind)
+    merged: dict[str, Any] = {key: value for key, value in base.as_mapping().items() if key in _field_names(kind)}
     for name, value in given.items():
         inner = merged.get(name)
         merged[name] = {**(inner or {}), **value} if isinstance(value, Mapping) else value
-    made = type(base).from_mapping({name: value for name, value in merged.items() if name != "family"})
+    made = kind.from_mapping(merged)
+    if issubclass(kind, Servo) and not isinstance(base, Servo) and isinstance(given.get("loop", {}), Mapping):
+        made = made.with_default_gain(given.get("loop", {}))
     label = label_of(base).removesuffix(_CHANGED)
+    if kind is not type(base) and label:  # a motor's name alone stands for its drive
+        label = label.removesuffix(f" {family_name(type(base))}") + ("" if kind is Drive else f" {family}")
     return labelled(made, label + _CHANGED * (_own_numbers(made) != _own_numbers(base))) if label else made
+
+
+def _related_family(family: str, kind: Any) -> Any:
+    """Return the family of a name, to be set over an actuator of a `kind`: one of the two is a subclass of the other.
+
+    A servo is a drive with outer loops, so a drive's motor, controller and supply become a servo's, and back.
+
+    Raises:
+        ValueError: there is no such family, or it is not related to the kind.
+    """
+    other = find_family(family)
+    if not (issubclass(other, kind) or issubclass(kind, other)):
+        raise ValueError(
+            f"family = {family!r}: cannot be set over an actuator of the family {family_name(kind)!r}, whose fields "
+            f"are others. Name an actuator of a related family (a motor of `codrl-mj motor list` or a datasheet is a "
+            f"'drive', which can become a 'servo'), or give all fields of the {family!r} without a name"
+        )
+    return other
+
+
+def _field_names(kind: Any) -> set[str]:
+    """Return the names of a family's fields."""
+    return {field.name for field in dataclasses.fields(kind)}
+
+
+def _check_fields(given: Mapping[str, Any], kind: Any) -> None:
+    """Refuse fields that the family does not have, but a related family has, with the name of that family."""
+    for name in given:
+        owners = [other for other, one in FAMILIES.items() if issubclass(one, kind) and name in _field_names(one)]
+        if owners and name not in _field_names(kind):
+            raise ValueError(f"unknown actuator field {name} of a {family_name(kind)}: add family = {owners[0]!r}")
 
 
 def check_same_family(actuators: Sequence[ActuatorModel]) -> Family:

@@ -193,6 +193,41 @@ class Servo(Drive):
     loop: ServoLoop = ServoLoop()
     """The loops around the drive's."""
 
+    @property
+    def default_velocity_gain(self) -> float:
+        """Gain [N*m*s/rad] of an untuned velocity loop: ten times the slope kT*kE/R of the motor, at its output.
+
+        An error of a tenth of the free speed then asks for the stall torque. It is rounded to three digits, so that a
+        message has the same number; 0 for a motor without back-EMF.
+        """
+        motor = self.motor
+        slope = motor.torque_constant * motor.back_emf_constant / motor.resistance * motor.gear_ratio**2
+        return float(f"{10.0 * slope:.3g}")
+
+    def with_default_gain(self, loop: Mapping[str, Any]) -> "Servo":
+        """Return this servo with `default_velocity_gain` if the fields that are given for its loop have no gain.
+
+        Raises:
+            ValueError: the motor has no back-EMF, and nothing tells a gain.
+        """
+        if "velocity_gain" in loop:
+            return self
+        if not self.default_velocity_gain:
+            raise ValueError(
+                "loop.velocity_gain is missing: must be given where a motor has no back-EMF; for a bandwidth f it is "
+                "2*pi*f times the inertia at the output, the rotor's included"
+            )
+        return self.replaced({"loop.velocity_gain": self.default_velocity_gain})
+
+    @property
+    def assumed(self) -> str:
+        """As `Drive.assumed`, and the velocity gain where it is a default."""
+        gain, text = self.loop.velocity_gain, super().assumed
+        if gain not in (ServoLoop.velocity_gain, self.default_velocity_gain):
+            return text
+        told = f"loop.velocity_gain = {gain:g} N*m*s/rad"
+        return f"{text}, {told}" if text else f"assumed, for none is given: {told}"
+
     def commands(self) -> Mapping[str, Command]:
         """A `position` [rad] or [m] within `loop.max_position`; or a `velocity` that is reached without a load."""
         loop, motor, arm = self.loop, self.motor, self.arm_radius

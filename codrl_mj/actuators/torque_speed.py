@@ -5,6 +5,7 @@ supply draws through stall torque and no-load speed, and a limit of the torque.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -25,10 +26,10 @@ def advance(parameters: Any, timestep: float, state: Nothing, inputs: Inputs) ->
 
     At speed w the voltage that drives forward leaves stall_torque*(1 - w/no_load_speed), the one that drives backward
     stall_torque*(-1 - w/no_load_speed). Beyond the speeds at which the line reaches +-max_torque it ends there: a
-    controller's current limit holds in every quadrant.
+    controller's current limit holds in every quadrant. Without a `max_torque` the stall torque has its place.
     """
     ratio = inputs.speed / parameters.no_load_speed
-    limit = parameters.max_torque
+    limit = parameters.max_torque if parameters.max_torque < math.inf else parameters.stall_torque
     upper = min(max(parameters.stall_torque * (1.0 - ratio), -limit), limit)
     lower = min(max(parameters.stall_torque * (-1.0 - ratio), -limit), limit)
     torque = min(max(inputs.desired_torque, lower), upper)
@@ -53,5 +54,5 @@ class TorqueSpeed(ActuatorModel):
     """Torque [N*m] at standstill under full voltage, > 0."""
     no_load_speed: float = real(10.0, above=0.0, unit="rad/s")
     """Speed [rad/s] at which full voltage makes no torque, > 0."""
-    max_torque: float = real(1.0, above=0.0, unit="N*m")
-    """Largest torque [N*m] of the drive, > 0; often well below the stall torque."""
+    max_torque: float = real(math.inf, above=0.0, unit="N*m", infinite=True)
+    """Largest torque [N*m] of the drive, > 0; often well below the stall torque. `inf`: the stall torque."""

@@ -10,7 +10,7 @@ from typing import Any
 from codrl_mj.catalogue.derivation import MotorNumbers, derive
 from codrl_mj.catalogue.units import Kind, read
 from codrl_mj.fields import check_names
-from codrl_mj.own_code import asset_folder
+from codrl_mj.own_code import asset_folder, read_text
 
 
 def _printed(unit: str, example: str, power: int = 0, zero: bool = False, also: str = "") -> Any:
@@ -66,7 +66,8 @@ class Datasheet:
     speed_constant: str | None = _printed("rad/s/V", "380 rpm/V", 1, also="kv")
     """Speed per voltage, Kv."""
     rotor_inertia: str | None = _printed("kg*m^2", "135 g*cm^2", -2)
-    """Inertia of the rotor; at the output, the reflected one (`armature`)."""
+    """Inertia of the rotor; at the output, the reflected one (`armature`). With `shaft = "output"` it must end in
+    `at motor` or `at output`."""
     mechanical_time_constant: str | None = _printed("s", "9.92 ms")
     """How fast the free rotor follows a step of voltage: R*J/(kT*kE)."""
     gear_ratio: str | float | None = _printed("", "30", also="gear reduction")
@@ -110,6 +111,13 @@ class Datasheet:
             raise ValueError(
                 f"datasheet.shaft is missing: {', '.join(either)} may be before or past the gear of "
                 f'{self.gear_ratio}; write shaft = "motor" or shaft = "output", or "... at motor" in a single value'
+            )
+        inertia, ratio = found.get("rotor_inertia"), found.get("gear_ratio")
+        if self.shaft == "output" and inertia and inertia.shaft is None and ratio and ratio.value != 1.0:
+            raise ValueError(
+                f"datasheet.rotor_inertia = {self.rotor_inertia!r}: the rotor's own, or as it is seen at the output, "
+                f'gear_ratio^2 times that? shaft = "output" leaves it open: write "{inertia.printed} at motor" (what '
+                f'motors\' datasheets print) or "{inertia.printed} at output" (reflected, an armature)'
             )
         at = self.shaft or "motor"
         found = {name: reading._replace(shaft=reading.shaft or at) for name, reading in found.items()}
@@ -247,10 +255,10 @@ def motor_entry(name: str) -> MotorEntry:
         check_names([name], motor_names(), "motor", listed_by="codrl-mj motor list")
         path = asset_folder() / "motors" / f"{name}.toml"
     try:
-        return _entry(path.stem, tomllib.loads(path.read_text(encoding="utf-8")), name.endswith(".toml"))
+        return _entry(path.stem, tomllib.loads(read_text(path)), name.endswith(".toml"))
     except FileNotFoundError as error:
         raise ValueError(f"motor {name!r}: there is no such file; codrl-mj motor new {name} writes one") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, tomllib.TOMLDecodeError) as error:
         raise ValueError(f"motor {name!r}: {path} is no TOML file that can be read: {error}") from error
     except ValueError as error:
         raise ValueError(f"motor {name!r} ({path}): {error}") from error

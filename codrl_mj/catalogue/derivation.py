@@ -8,7 +8,7 @@ behind the gear, where the simulation has it: at no load it is gear_efficiency*k
 import dataclasses
 import functools
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import CodeType
 from typing import Any, NamedTuple
 
@@ -44,6 +44,7 @@ RULES = (
     ("back_emf_constant", "torque_constant"),
     ("back_emf_constant", "(nominal_voltage - resistance * continuous_current) / continuous_speed"),
     ("gear_efficiency", "stall_torque_at_output / (gear_ratio * torque_constant * (stall_current - no_load_current))"),
+    ("gear_efficiency", "torque_constant_at_output / (gear_ratio * torque_constant)"),
     (
         "gear_efficiency",
         "continuous_torque_at_output / (gear_ratio * torque_constant * (continuous_current - no_load_current))",
@@ -83,6 +84,7 @@ CHECKS = (
         "gear_ratio * gear_efficiency * torque_constant * (stall_current - no_load_current)",
         _LOAD,
     ),
+    ("torque_constant_at_output", "gear_ratio * gear_efficiency * torque_constant", _LOAD),
     ("continuous_torque", "torque_constant * (continuous_current - no_load_current)", _LOAD),
     (
         "continuous_torque_at_output",
@@ -191,8 +193,8 @@ class MotorNumbers:
     """Values that are printed and also follow from others, the worst first; not those that agree to 1e-9."""
 
 
-AT_OUTPUT = ("stall_torque_at_output", "continuous_torque_at_output")
-"""Torques past a gear's losses, which do not tell the motor's before its efficiency is known."""
+AT_OUTPUT = ("stall_torque_at_output", "continuous_torque_at_output", "torque_constant_at_output")
+"""Torques, and torque per current, past a gear's losses, which tell the motor's only once its efficiency is known."""
 _LEAST_EFFICIENCY = 0.2
 """No off-the-shelf gear for a servo is worse: a derived efficiency below it is a slip of units."""
 OTHER_NAMES = {
@@ -214,7 +216,8 @@ def derive(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: b
     """The numbers that follow from what is printed; the arguments and errors of `from_datasheet`."""
     if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance > 0.0:
         raise ValueError(f"tolerance = {tolerance!r}: must be a number > 0, such as 0.2")
-    found = _Derivation(readings, kinds)
+    lossy = ("torque_constant",) if strict and _has_loss(readings, kinds, tolerance) else ()
+    found = _Derivation(readings, kinds, lossy)
     known, how, printed = found.known, found.how, {*found.known, "torque_constant"}
     known.setdefault("no_load_current", 0.0)
     found.apply_rules()
@@ -246,15 +249,31 @@ def derive(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: b
     )
 
 
+def _has_loss(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], tolerance: float) -> bool:
+    """Return True if a torque constant printed at the output can only be past the gear's losses, as servos print it.
+
+    That is, no efficiency is printed, and a gear without losses makes it smaller than the back-EMF constant, which
+    follows from the rest, by more than the tolerance.
+    """
+    reading, ratio = readings.get("torque_constant"), readings.get("gear_ratio")
+    if reading is None or ratio is None or reading.shaft != "output" or "gear_efficiency" in readings:
+        return False
+    others = _Derivation({name: one for name, one in readings.items() if name != "torque_constant"}, kinds)
+    others.known.setdefault("no_load_current", 0.0)
+    others.apply_rules()
+    constant = others.known.get("back_emf_constant", 0.0)
+    return bool(reading.value / ratio.value < constant / (1.0 + tolerance))
+
+
 class _Derivation:
     """What is known of a motor, seen at its shaft, and a sentence on how each number came about."""
 
-    def __init__(self, readings: Mapping[str, Reading], kinds: Mapping[str, Kind]) -> None:
-        """Begin with what is printed; torques at the output keep their place, under names of their own."""
+    def __init__(self, readings: Mapping[str, Reading], kinds: Mapping[str, Kind], lossy: Sequence[str] = ()) -> None:
+        """Begin with what is printed; torques at the output, and what is `lossy`, keep their place, by other names."""
         self.known: dict[str, Any] = {}
         self.how: dict[str, str] = {}
         self._units = {name: kind.unit for name, kind in kinds.items()}
-        self._units |= dict.fromkeys(AT_OUTPUT, "N*m")
+        self._units |= {name: self._units[name.removesuffix("_at_output")] for name in AT_OUTPUT}
         for name, (value, printed, shaft) in readings.items():
             power, at, place = kinds[name].power, name, ""
             if shaft != "motor" and power != 0:
@@ -264,7 +283,7 @@ class _Derivation:
                         "gear_ratio = 1 to describe the motor as it is seen at the output"
                     )
                 place = " at the output"
-                if name.endswith("torque"):
+                if name.endswith("torque") or name in lossy:
                     at = f"{name}_at_output"
                 else:
                     ratio = readings["gear_ratio"].value

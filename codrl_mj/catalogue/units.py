@@ -7,10 +7,16 @@ from typing import Any, NamedTuple
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _PRINTED = re.compile(rf"\s*({_NUMBER}(?:\s*\*\s*{_NUMBER})*)\s*(.*?)\s*(?:\bat\s+(?:the\s+)?(motor|output))?\s*", re.S)
+_TIME, _ANGLE = rf"({_NUMBER})\s*(m?)s(?:ec|econds?)?\.?", rf"({_NUMBER})\s*(?:°|º|deg(?:rees?)?)"
+_TRANSIT = re.compile(
+    rf"\s*(?:{_TIME}\s*(?:/|per)\s*{_ANGLE}|{_ANGLE}\s*(?:/|per)\s*{_TIME})\s*(?:\bat\s+(?:the\s+)?(motor|output))?\s*",
+    re.I,
+)
+"""How servos print their speed: the time for an angle, 0.16 s/60deg."""
 _ANGLES = {"radian", "degree", "turn", "revolution", "revolutions_per_minute", "revolutions_per_second"}
 _SPELLINGS = (
     (r"([mkµμ]?N)([cm]?)m\b", r"\1*\2m"),  # mNm, Nm, Ncm
-    (r"(k?g)([cm]?)m(?:\^2|\*\*2|²|2)", r"\1*\2m**2"),  # gcm2, kgm²
+    (r"(k?g)[-.*· ]?([cm]?)m(?:\^2|\*\*2|²|2)", r"\1*\2m**2"),  # gcm2, kg.m²
     (r"\bmin(?:\^-1|⁻¹|-¹|-1)|(?:\b(?:rev|r|U|tr|1)|^)/min\b", "rpm"),
     (r"(?i)rpm", "rpm"),  # RPM, kRPM
     (r"(?i)ohms?\b", "ohm"),
@@ -75,6 +81,11 @@ def read(name: str, printed: Any, kind: Kind) -> Reading:
         printed = str(printed)
     if not kind.unit and isinstance(printed, str):
         printed = re.sub(r"\s*:\s*1\s*$", "", printed)  # 30:1
+    if kind.unit == "rad/s" and isinstance(printed, str) and (transit := _TRANSIT.fullmatch(printed)):
+        time, milli, angle = transit.groups()[:3] if transit[1] else (transit[5], transit[6], transit[4])
+        time, angle = float(time) * (1e-3 if milli else 1.0), math.radians(float(angle))
+        if time > 0.0 and angle > 0.0:
+            return Reading(angle / time, printed.strip(), transit[7])
     match = _PRINTED.fullmatch(printed) if isinstance(printed, str) else None
     remedy = f'write a number and its unit, such as {name} = "{kind.example}"'
     if match is None:

@@ -11,10 +11,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, Supply, actuator_over, identified_ranges
+from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, Supply, actuator_over, find_family, identified_ranges
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.worlds import find_world, is_world
 from codrl_mj.fields import field_docs, parts
+from codrl_mj.own_code import read_yaml
 from codrl_mj.runs import CONFIG
 
 
@@ -62,15 +63,19 @@ Actuators = Annotated[
         "as codrl-mj motor choose writes.",
     ),
 ]
+FAMILY = "actuator.family"
+"""Flag that `scan` is asked for besides `actuator`."""
+_FAMILY_HELP = "Another family for the same motor: `servo` makes a motor or datasheet one that is asked for positions."
 AS_TRAINED, AS_CONFIGURED = "as-trained", "as-configured"
 """Instead of a name: the actuator that the policy was trained on; that of the configuration file or run."""
 
 
-def environment_fields(defaults: EnvConfig, name: str | None, task: str) -> list[Any]:
+def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: str) -> list[Any]:
     """Flags for an environment: single fields over its actuators, all else that its world has, and its options.
 
-    The family of what `--actuator` names has the fields, of the ideal one a current loop, to be refused. What cannot be
-    made is refused here: its flags would be unknown. `environment` reads what `dataclasses.make_dataclass` makes.
+    The family of what `--actuator` names, or `--actuator.family`, has the fields, of the ideal one a current loop, to
+    be refused. What cannot be made is refused here: its flags would be unknown. `environment` reads what
+    `dataclasses.make_dataclass` makes; `chosen` is what `scan` found of the two.
     """
     world, every = defaults.world, (field.name for field in dataclasses.fields(EnvConfig))
     without = tuple(one for one in every if one not in world.fields or one in ("task", "actuator", "options"))
@@ -83,13 +88,20 @@ def environment_fields(defaults: EnvConfig, name: str | None, task: str) -> list
         for option, hint, text, value in world.option_flags(defaults)
     ]
     env, family = flags(EnvConfig, defaults, without, options), type(defaults.actuators[0])
+    name, wanted = chosen.actuator, getattr(chosen, FAMILY)
     if name not in (None, AS_TRAINED, AS_CONFIGURED):
         try:
             family = type(EnvConfig(task, name).actuators[0])
         except ValueError as error:
             several = f"; a file of patterns and actuators goes by --actuators {name}"
             raise ValueError(f"{error}{several if str(name).endswith(('.yaml', '.yml')) else ''}") from None
-    over = flags(Actuator if issubclass(family, Ideal) else family)
+    family = family if wanted is None else find_family(wanted)
+    as_family = (
+        "family",
+        Annotated[str | None, tyro.conf.arg(metavar="FAMILY", help=_FAMILY_HELP, help_behavior_hint="")],
+        None,
+    )
+    over = flags(Actuator if issubclass(family, Ideal) else family, adding=[as_family])
     return [
         ("actuators", Actuators, ()),
         ("actuator_fields", Annotated[over, tyro.conf.arg(name="actuator", help="Single fields over it.")], over()),
@@ -119,14 +131,14 @@ def with_environment(verb: Any, arguments: Sequence[str]) -> Any:
     """A verb about a run, with flags for environment and actuator: those of the first run that the line names."""
     from codrl_mj.training.folder import load_config
 
-    chosen = scan(arguments, "actuator")
+    chosen = scan(arguments, "actuator", FAMILY)
     known = EnvConfig("cartpole", Actuator())
     run = next((run for run in map(Path, arguments) if (run / CONFIG).is_file()), None)
     if run is not None:
         known = load_config(run, chosen.trust).evaluation_env
     elif chosen.task is not None:
         known = EnvConfig(chosen.task, Actuator())
-    fields = environment_fields(known, chosen.actuator, known.task)
+    fields = environment_fields(known, chosen, known.task)
     made: Any = dataclasses.make_dataclass(verb.__name__, fields, bases=(verb,), frozen=True)
     made.__doc__, made.line = verb.__doc__, tuple(arguments)
     return made
@@ -166,14 +178,12 @@ def _patterns(items: Sequence[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for item in items:
         if "=" not in item and Path(item).suffix in (".yaml", ".yml", ".json"):
-            import yaml
-
             try:
-                content = yaml.safe_load(Path(item).read_text())
+                content = read_yaml(Path(item))
                 if not isinstance(content, Mapping):
                     raise ValueError("must be a mapping of patterns to actuators")
                 found |= resolve_patterns(content, f"the file {item}")
-            except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
+            except ValueError as error:
                 raise ValueError(f"--actuators {item}: {error}") from None
         else:
             pattern, equals, name = item.rpartition("=")  # the last: a regular expression may have its own

@@ -121,10 +121,10 @@ class Show:
 
     def run(self) -> tuple[int, Any]:
         """Print the tables, draw the diagram."""
-        from codrl_mj.drives import explain, find_entry
+        from codrl_mj.drives import explain, find_entry, find_loop
 
         drive, entry = self.changes.drive(self.name), find_entry(self.name)
-        found = explain(drive, entry)
+        found = explain(drive, entry, find_loop(self.name))
         if self.out is not None:
             from codrl_mj.pages.diagrams import torque_speed_diagram
 

@@ -106,7 +106,18 @@ def _refuse_words(tokens: Sequence[str], text: str, shown: str) -> None:
     hint = "".join(inner[:1]) or did_you_mean(flag, known)
     if flag in _SHORT and "--actuator" in known:
         raise ValueError(f"{flag}: the actuator has no {_SHORT[flag]}; motors of codrl-mj motor list have one")
+    if "--actuator" in known and (owners := _families_with(flag)):
+        hint = f"this actuator has no such field; a {' or a '.join(owners)} has; "
+        hint += "add --actuator.family servo to make a motor a servo; " if owners == ["servo"] else ""
     raise ValueError(f"unknown flag {flag}: {hint}{shown} --help lists them")
+
+
+def _families_with(flag: str) -> list[str]:
+    """Return the families of actuators that have the field of an `--actuator.` flag."""
+    from codrl_mj.actuators import FAMILIES, field_paths
+
+    path = flag.removeprefix("--actuator.").replace("-", "_")
+    return [name for name, family in FAMILIES.items() if path in field_paths(family)]
 
 
 def _called(argument: Any) -> str:
@@ -135,7 +146,7 @@ def understood(arguments: Sequence[str]) -> list[str]:
         if counted and number:
             value = float(number[2] + (number[3] or ""))
             word = f"{number[1] or ''}{int(value) if value.is_integer() else value}"
-        elif file := re.fullmatch(r"(.*=)?([^=:]+\.py):([\w.-]+)", word):
+        elif file := re.fullmatch(r"(.*=)?([^=:]+\.py):([\w./-]+)", word):
             word = f"{file[1] or ''}{_module(Path(file[2]), here)}:{file[3]}"
         found.append(word)
     typed = re.findall(r"^(?:.*=)?(\w+)[\w.]*:[\w./-]+$", "\n".join(found), re.MULTILINE)

@@ -18,6 +18,7 @@ from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
 from codrl_mj.cli.environments import (
     AS_CONFIGURED,
+    FAMILY,
     ActuatorName,
     environment,
     environment_fields,
@@ -40,7 +41,7 @@ _OWN_FLAGS = ("agent", "env")  # of the configuration: not made from its fields'
 
 def train_verb(arguments: list[str]) -> Any:
     """The verb's dataclass for a command line, whose agent, task, settings and files decide on flags and defaults."""
-    chosen = scan(arguments, "agent", "settings", "actuator", "config", "resume")
+    chosen = scan(arguments, "agent", "settings", "actuator", FAMILY, "config", "resume")
     if chosen.task is None and arguments and not arguments[0].startswith("-"):
         try:
             find_world(arguments[0])
@@ -84,7 +85,7 @@ def train_verb(arguments: list[str]) -> Any:
         ("actuator_name", ActuatorName, AS_CONFIGURED if configured else base.env.world.default_actuator),
         *((field.name, field.type, field.default) for field in dataclasses.fields(rest)),
         ("agent", Annotated[agent_flags, tyro.conf.arg(help="The agent's settings.")], agent_flags()),
-        *environment_fields(base.env, chosen.actuator, base.task),
+        *environment_fields(base.env, chosen, base.task),
     ]
     verb: Any = dataclasses.make_dataclass("Train", fields, bases=(Train,), frozen=True, kw_only=True)
     verb.__doc__ = Train.__doc__
@@ -143,7 +144,8 @@ class Train:
             },
         )
         through = "-".join(dict.fromkeys(Path(each.rpartition("=")[2]).stem for each in self.actuators))
-        parts = config.task, config.agent.name, through or self.actuator_name, str(config.seed)
+        through = "-".join(filter(None, (through or self.actuator_name, self.actuator_fields.family)))
+        parts = config.task, config.agent.name, through, str(config.seed)
         families = (family_name(type(each)) for each in config.env.actuators)
         own = any(":" in one for one in (*parts, *families))  # module:NAME
         following = "next: codrl-mj evaluate" + (" --trust" if own else "")

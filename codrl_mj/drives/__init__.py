@@ -7,6 +7,7 @@ from codrl_mj.drives.abilities import (
     explain,
     find_drive,
     find_entry,
+    find_loop,
     torque_limits,
     unknown_in_words,
 )
@@ -45,6 +46,7 @@ from codrl_mj.drives.swing import Swing, least_gain, least_pumped, least_voltage
 __all__ = [
     "find_drive",
     "find_entry",
+    "find_loop",
     "Abilities",
     "abilities",
     "torque_limits",

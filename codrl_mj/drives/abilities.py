@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import Drive, GearMotor, actuator_over, resolve
+from codrl_mj.actuators import Drive, GearMotor, Servo, ServoLoop, actuator_over, resolve
 from codrl_mj.catalogue import MotorEntry, MotorNumbers, motor_entry, motor_names
 from codrl_mj.catalogue.datasheet import KINDS
 from codrl_mj.catalogue.derivation import OTHER_NAMES
@@ -30,7 +30,7 @@ def find_drive(
     delayed: bool | None = None,
     max_current: float | None = None,
 ) -> Drive:
-    """A drive by name, with single fields set over it; None leaves a field as it is.
+    """A drive by name, of a servo without its outer loops, with single fields set over it; None leaves a field.
 
     Args:
         name: whatever `codrl_mj.actuators.resolve` takes, such as a motor of the catalogue.
@@ -47,6 +47,8 @@ def find_drive(
     loop = {"sample_rate": sample_rate, "bandwidth": bandwidth, "delayed": delayed, "max_current": max_current}
     changes = {"motor": {"gear_ratio": gear_ratio}, "controller": loop, "supply": {"voltage": voltage}}
     base = resolve(name, None, "a motor on its own")
+    if isinstance(base, Servo):
+        base = actuator_over(base, {"family": Drive.family})
     if type(base) is not Drive:
         raise ValueError(
             f"motor = {name!r}: no motor behind a drive, but the actuator family {base.family}; name a motor of the "
@@ -215,20 +217,28 @@ def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: (row[sort] is None, -(row[sort] or 0.0)))
 
 
-def explain(drive: Drive, entry: MotorEntry | None = None) -> dict[str, Any]:
+def find_loop(name: Any) -> ServoLoop | None:
+    """Return the outer loops of the servo that a name of `find_drive` stands for; None where it is no servo's."""
+    base = resolve(name, None, "a motor on its own")
+    return base.loop if isinstance(base, Servo) else None
+
+
+def explain(drive: Drive, entry: MotorEntry | None = None, loop: ServoLoop | None = None) -> dict[str, Any]:
     """All that is known of a motor: JSON-serialisable but for infinite values.
 
     Args:
         drive: the motor with its drive.
         entry: its datasheet, where it has one.
+        loop: the outer loops, where it is a servo's.
 
     Returns:
-        `drive`, the fields of motor, controller and supply, and `abilities`, each a list of mappings with `name`,
+        `drive`, the fields of motor, controller, supply and loop, and `abilities`, each a list of mappings with `name`,
         `value` and `unit`; `assumed`; and of a datasheet `manufacturer`, `product`, `kind`, `numbers`, such mappings
         with `how` it came about, its `sources` and their `places`, from 1, among all that are `cited`, `unknown`,
         `disagreements`, `estimated` and `notes`.
     """
     parts: dict[str, Any] = {"motor": drive.motor, "controller": drive.controller, "supply": drive.supply}
+    parts["loop"] = loop
     found: dict[str, Any] = {
         "drive": [
             _value(f"{part}.{field.name}", getattr(owner, field.name), field.metadata.get("unit", ""))

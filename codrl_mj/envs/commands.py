@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.actuators import ActuatorModel, Command, Ideal
-from codrl_mj.disturbances import OFF, Disturbances
+from codrl_mj.actuators import ActuatorModel, Command, Drive, Ideal, Servo
+from codrl_mj.disturbances import OFF, Disturbances, check_delay
 from codrl_mj.engine.specs import ON_JOINT
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
@@ -24,11 +24,21 @@ def command_of(actuator: ActuatorModel, name: str, whose: str = "") -> Command:
         if isinstance(actuator, Ideal) and name in ("current", "voltage"):
             raise ValueError(f"action = {name!r}: the {kind} has no {name} to command; choose another actuator")
         names = ", ".join(["force", *known])
-        raise ValueError(
-            f"action = {name!r}: must be one of {names}, which the {kind} takes; or choose another actuator"
-        )
+        remedy = _servo_remedy(actuator, name) or "or choose another actuator"
+        raise ValueError(f"action = {name!r}: must be one of {names}, which the {kind} takes; {remedy}")
     command = known[name]
     return command._replace(fixed={field: f"with action={name!r} {why}" for field, why in command.fixed.items()})
+
+
+def _servo_remedy(actuator: ActuatorModel, name: str) -> str:
+    """Return how to ask a motor for a position or a velocity; empty if the actuator or the action is another."""
+    if name not in ("position", "velocity") or not isinstance(actuator, Drive):
+        return ""
+    changes = {} if isinstance(actuator, Servo) else {"family": "servo"}
+    changes |= {"loop.controls": name} if isinstance(actuator, Servo) or name == "velocity" else {}
+    flags = " ".join(f"--actuator.{field} {value}" for field, value in changes.items())
+    fields = " and ".join(f"{field} = {value!r}" for field, value in changes.items())
+    return f"for a {name} of the same motor set {fields} over it ({flags})"
 
 
 class TaskCommands:
@@ -183,6 +193,7 @@ class ControlCommands:
             return
         if step_duration is None:
             raise ValueError("disturbances: the environment has no dt, the duration of its steps [s]; give it one")
+        check_delay(disturbances, step_duration, None)
         self._data, self._pulses = data, disturbances.random
         self._controls = places = model.actuator_ctrladr[indices]
         limited = model.actuator_ctrllimited[places].astype(bool)

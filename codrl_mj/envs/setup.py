@@ -10,6 +10,7 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Ideal, check_same_family
 from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.disturbances import check_delay
 from codrl_mj.engine.reading import check_shafts
 from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
@@ -53,6 +54,7 @@ class Setup:
     def _check(self) -> None:
         """Refuse what does not go together: with each other, with the step, with what the motors move."""
         plant, unstable = self.plant, self.config.allow_unstable
+        check_delay(self.config.disturbances, self.task.step_duration, self.config.time_limit)
         _ = self.sensors  # which are refused where there is nothing to observe
         if not self.randomization.draws_actuator:  # else every draw is checked
             for one in plant.actuators:

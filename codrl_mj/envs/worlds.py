@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.actuators import IDEAL, ActuatorModel
+from codrl_mj.actuators import IDEAL, ActuatorModel, is_family
 from codrl_mj.own_code import load_object
 from codrl_mj.tasks import TASKS, reference_of
 
@@ -293,7 +293,7 @@ def patterns_of(given: Any) -> Mapping[str, Any] | None:
             name in ("family", "name") or dataclasses.is_dataclass(value) or isinstance(value, Mapping)
             for name, value in fields
         )
-        if not (one is None or of_actuator or isinstance(one, str | Path | ActuatorModel)):
+        if not (one is None or of_actuator or isinstance(one, str | Path | ActuatorModel) or is_family(one)):
             return None
     return given or None
 

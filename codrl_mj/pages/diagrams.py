@@ -108,7 +108,8 @@ def limits(actuator: Any, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray] |
         return torque_limits(actuator.replaced(free), speeds, actuator.controller.max_current)
     if isinstance(actuator, TorqueSpeed):
         ends = (actuator.stall_torque * (side - speeds / actuator.no_load_speed) for side in (-1.0, 1.0))
-        low, high = (np.clip(end, -actuator.max_torque, actuator.max_torque) for end in ends)
+        most = actuator.max_torque if math.isfinite(actuator.max_torque) else actuator.stall_torque
+        low, high = (np.clip(end, -most, most) for end in ends)
         return low, high
     if isinstance(actuator, Actuator) and actuator.voltage_limit is not None:
         motor, supply, most = actuator.motor, actuator.supply or Supply(), actuator.controller.max_voltage

@@ -127,7 +127,7 @@ def read_json(path: Path, what: str) -> Any:
     if not path.is_file():
         raise FileNotFoundError(f"no {what} at {path}")
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not a {what}: it is truncated or not JSON ({error})") from None
     if not isinstance(content, dict) or _SEAL not in content:

@@ -1,7 +1,6 @@
 """What to train, on what, for how long: from Python, a YAML file or the command line."""
 
 import dataclasses
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, find_preset
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import Checked, check_names, integer
+from codrl_mj.own_code import read_yaml
 
 EVALUATION_SEED = 1_000_000
 """Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""
@@ -177,12 +177,10 @@ def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConf
         FileNotFoundError: there is no such file.
         ValueError: it is not YAML, has an unknown key, or a value out of bounds; the message has the file's name.
     """
-    import yaml
-
     if not path.is_file():
         raise FileNotFoundError(f"no configuration file at {path}")
     try:
-        content = yaml.load(path.read_text(), _yaml_loader())
+        content = read_yaml(path)
         if isinstance(content, Mapping) and "train" in content:
             content = content["train"]
         if isinstance(content, Mapping):
@@ -192,17 +190,5 @@ def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConf
             content = {**content, **{key: value for key, value in overriding.items() if value is not None}}
         with trusting(trust):
             return TrainConfig.from_mapping(content)
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError) as error:
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-def _yaml_loader() -> Any:
-    """PyYAML's safe loader, which knows neither `3e-4`, a number in YAML 1.2 and JSON, nor JSON's `Infinity`."""
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        pass
-
-    number = r"(?:[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?|-?Infinity|NaN)$"
-    Loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(number), list("-+.0123456789IN"))
-    return Loader

@@ -44,3 +44,8 @@ def test_delays_longer_than_what_is_remembered_are_refused():
     Lag(delay=HISTORY * 0.01).check(0.01)
     with pytest.raises(ValueError, match=r"Lag\.delay = 0\.0801: must be <= 0\.08 s, 8 steps of 0\.01 s"):
         Lag(delay=0.0801).check(0.01)
+
+
+def test_a_time_constant_in_milliseconds_is_warned_of():
+    with pytest.warns(UserWarning, match=r"Lag\.time_constant = 50: .*for 50 ms write 0\.05"):
+        Lag(50.0).check(0.01)

@@ -187,7 +187,7 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
         ({"family": "lag", "time_constnt": 1.0}, r"unknown actuator field time_constnt; did you mean time_constant\?"),
         ({"family": "lag", "motor": {}}, "unknown actuator field motor; known: time_constant, delay"),
         ({"family": "lag", "delay": -1.0}, r"Lag\.delay = -1\.0: must be a finite number >= 0"),
-        ({"family": "torque_speed", "max_torque": 0}, r"TorqueSpeed\.max_torque = 0: must be a finite number > 0"),
+        ({"family": "torque_speed", "max_torque": 0}, r"TorqueSpeed\.max_torque = 0: must be a number > 0"),
         ({"family": "ideal", "motor": {}}, "unknown actuator field motor"),
         (
             {"family": "nowhere_at_all:Mine"},
@@ -208,7 +208,7 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
         ("nowhere_at_all:MINE", "No module named 'nowhere_at_all'"),
         (":", "must be module:NAME"),
         (f"{__name__}:", "must be module:NAME"),
-        ("itself.yaml", r"^itself\.yaml: name = 'itself\.yaml': must be an actuator's name, and no file"),
+        ("itself.yaml", r"^itself\.yaml: name = 'itself\.yaml': must be an actuator's name, or a file that"),
         *((name, rf"^{name}: ") for name in WRONG_FILES),
         (
             {"name": "ideal", "motor": {"resistance": 1.0}},
@@ -357,3 +357,24 @@ def test_single_fields_are_set_over_anothers():
     assert actuator_over(Lag(0.1, 0.2), {"delay": 0.3}) == Lag(0.1, 0.3)
     assert actuator_over(TorqueSpeed(), {"max_torque": 2.0}) == TorqueSpeed(max_torque=2.0)
     assert actuator_over(IDEAL, {"motor": {}}) is IDEAL
+
+
+def test_a_part_that_is_given_in_part_is_over_what_stands_for_it():
+    """A drive without a supply has 24 V; one that is told its supply's resistance alone has them as well."""
+    for drive in ({"family": "drive"}, {"name": "maxon-ec45-flat-339285"}):
+        there = resolve({**drive, "supply": {"resistance": 0.5}}, None, "x")
+        assert there.supply == Supply(24.0, 0.5)
+    assert resolve({"supply": {"resistance": 0.5}}, None, "x").supply == Supply(resistance=0.5)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"family": "drive", "motor": {"torque_constant": 0.007}}, "motor.back_emf_constant = 0.042, a default"),
+        ({"family": "drive", "motor": {"back_emf_constant": 0.5}}, "motor.torque_constant = 0.042, a default"),
+        ({"supply": {"voltage": 48.0}}, "controller.max_voltage = 24 V, which limits the supply of 48 V"),
+    ],
+)
+def test_a_default_that_cuts_what_is_given_is_said(given, said):
+    assert said in resolve(given, None, "x").assumed
+    assert said not in resolve({"family": given.get("family", "current_loop")}, None, "x").assumed

@@ -1,8 +1,12 @@
 """The torque-speed line: against what Isaac Lab and mjlab expect of their DC motors."""
 
+import math
+
+import mujoco
 import pytest
 
-from codrl_mj.actuators import Inputs, TorqueSpeed, parameters_type
+import codrl_mj
+from codrl_mj.actuators import Inputs, TorqueSpeed, actuator_over, parameters_type
 
 # Isaac Lab, source/isaaclab/test/actuators/test_dc_motor.py, test_dc_motor_clip, at saturation_effort 100,
 # velocity_limit 50, effort_limit 60; mjlab, tests/test_dc_actuator.py, at saturation_effort 20, velocity_limit 30
@@ -35,3 +39,28 @@ def test_points_in_four_quadrants_are_those_of_others(motor, desired, speed, exp
     assert torque == pytest.approx(sign * expected, rel=1e-12, abs=1e-12)
     assert signals.lower_limit <= torque <= signals.upper_limit
     assert signals.saturated == (torque != sign * desired)
+
+
+LEG = """<mujoco><option timestep="1e-6"/><worldbody><body><joint name="knee" axis="0 1 0"/>
+<geom size=".1" mass="5"/></body></worldbody><actuator><motor name="knee" joint="knee"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("more", [{}, {"max_torque": 30.0}, {"max_torque": 10.0}])
+@pytest.mark.parametrize("speed", [0.0, 6.0, 15.0, 29.0])
+def test_nothing_but_what_is_given_limits_a_printed_line_in_mujoco(speed, more):
+    """The closed form min(asked, stall*(1 - w/w0), most), where most is the stall torque unless it is given."""
+    given = {"family": "torque_speed", "stall_torque": 24.0, "no_load_speed": 30.0, **more}
+    model = codrl_mj.motorise(mujoco.MjSpec.from_string(LEG), {"knee": given}).compile()
+    data = mujoco.MjData(model)
+    data.ctrl[0], data.qvel[0] = 20.0, speed
+    mujoco.mj_step(model, data)
+    expected = min(20.0, 24.0 * (1.0 - speed / 30.0), more.get("max_torque", 24.0))
+    assert data.actuator_force[0] == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_stall_torque_set_over_the_defaults_is_not_cut_either():
+    motor = actuator_over(TorqueSpeed(), {"stall_torque": 24.0})
+    for asked, expected in ((30.0, 24.0), (-30.0, -24.0)):
+        numbers = parameters_type(TorqueSpeed)(*motor.numbers)
+        assert motor.advance(numbers, 0.01, (), Inputs(asked, 0.0, 0.0, 0.0, 0.0))[1] == expected
+    assert math.isinf(motor.max_torque)

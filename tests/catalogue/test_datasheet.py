@@ -1,5 +1,6 @@
 """Datasheets: what is printed comes back as the motor that it was printed of, and slips are refused."""
 
+import dataclasses
 import math
 import subprocess
 import sys
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from codrl_mj.catalogue import Datasheet, derivation, from_datasheet, units
+from codrl_mj.catalogue import Datasheet, derivation, from_datasheet, motor_entry, units
 from codrl_mj.catalogue.datasheet import KINDS, named
 
 UNITS = {  # by definition: SI value of one unit
@@ -115,6 +116,7 @@ def test_a_geared_motor_comes_back_from_its_output(data, ratio, efficiency):
     printed["no_load_speed"] /= ratio
     printed["rotor_inertia"] = motor["rotor_inertia"] * ratio**2
     text = data.draw(_print(printed))
+    text["rotor_inertia"] += " at output"
     numbers = from_datasheet(shaft="output", gear_ratio=ratio, **text)
     assert numbers.gear_efficiency == pytest.approx(efficiency, rel=1e-11)
     free = efficiency * motor["torque_constant"] * printed["no_load_current"]  # what the gear leaves of the torque
@@ -349,3 +351,77 @@ def test_the_rules_speak_of_fields():
 def test_pint_is_imported_only_when_a_datasheet_is_read():
     script = "import sys, codrl_mj.catalogue.datasheet; assert 'pint' not in sys.modules"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
+
+
+SERVO = {
+    "gear_ratio": "345:1",
+    "shaft": "output",
+    "nominal_voltage": "12 V",
+    "stall_torque": "30 kg.cm",
+    "stall_current": "2.7 A",
+    "no_load_speed": "0.222 s/60deg",
+    "no_load_current": "180 mA",
+    "electrical_time_constant": "0.3 ms",
+}
+"""As servos are printed: Feetech's STS3215."""
+
+
+@pytest.mark.parametrize(
+    "printed",
+    [
+        *("0.222 s/60deg", "0.222sec/60°", "0.222 Sec / 60 degrees", "222 ms/60º", "0.222 seconds per 60 deg"),
+        *("60°/0.222s", "0.222 s/60deg at output", "0.222s/60Deg"),
+    ],
+)
+def test_the_time_of_an_angle_is_a_speed(printed):
+    reading = Datasheet(**SERVO | {"no_load_speed": printed}).readings()["no_load_speed"]
+    assert reading.value == pytest.approx(math.pi / 3.0 / 0.222, rel=1e-15)
+    assert reading.shaft == "output"
+
+
+@pytest.mark.parametrize("printed", ["0 s/60deg", "0.2 s/60", "0.2 s", "0.2 s/60deg at 6 V", "0,2 s/60deg"])
+def test_what_is_no_time_of_an_angle_is_refused(printed):
+    with pytest.raises(ValueError, match=r"^datasheet\.no_load_speed = "):
+        from_datasheet(**SERVO | {"no_load_speed": printed})
+
+
+def test_a_rotors_inertia_behind_a_gear_says_its_shaft():
+    """Printed values are nearly always the rotor's own; reflected they are ratio^2 times as large."""
+    for unit in ("g*cm2", "g.cm2", "g cm²", "gcm2", "g*cm^2"):
+        assert from_datasheet(**SERVO, rotor_inertia=f"60 {unit} at motor").rotor_inertia == pytest.approx(6e-6)
+    reflected = from_datasheet(**SERVO, rotor_inertia="60 gcm2 at output").rotor_inertia
+    assert reflected == pytest.approx(6e-6 / 345.0**2)
+    with pytest.raises(ValueError, match=r'rotor_inertia = \'60 gcm2\'.*"60 gcm2 at motor".*"60 gcm2 at output"'):
+        from_datasheet(**SERVO, rotor_inertia="60 gcm2")
+    unsaid = {**SERVO, "gear_ratio": 1, "stall_torque": "0.04 Nm"} | {"no_load_speed": "1600 rad/s"}
+    assert from_datasheet(strict=False, **unsaid, rotor_inertia="60 gcm2").rotor_inertia == pytest.approx(6e-6)
+
+
+def test_a_torque_constant_at_the_output_has_the_gears_loss_in_it():
+    """With V = R*I0 + kE*w0 and kT = kE, what is printed over N*kT is the efficiency; the rest is as without it."""
+    speed, resistance = 345.0 * math.pi / 3.0 / 0.222, 12.0 / 2.7
+    constant = (12.0 - resistance * 0.18) / speed
+    with_it = from_datasheet(**SERVO, torque_constant="11 kg.cm/A")
+    assert with_it.torque_constant == pytest.approx(constant, rel=1e-12)
+    assert with_it == dataclasses.replace(from_datasheet(**SERVO), disagreements=with_it.disagreements)
+    alone = from_datasheet(**{k: v for k, v in SERVO.items() if k != "stall_torque"}, torque_constant="11 kg.cm/A")
+    assert alone.gear_efficiency == pytest.approx(11.0 * 0.0980665 / (345.0 * constant), rel=1e-12)
+    with pytest.raises(ValueError, match="contradicts the rest"):  # the motor's own, said to be the output's
+        from_datasheet(**SERVO, torque_constant="6.88 mNm/A")
+    for said in ({"torque_constant": "2.5 Nm/A"}, {"torque_constant": "11 kg.cm/A", "gear_efficiency": "45 %"}):
+        told = from_datasheet(strict=False, **SERVO, **said)  # of a gear without losses, as ever
+        value = {"2": 2.5, "1": 11.0 * 0.0980665}[said["torque_constant"][0]]
+        assert told.torque_constant == pytest.approx(value / 345.0, rel=1e-12)
+
+
+def test_a_file_is_read_whatever_editor_saved_it(tmp_path):
+    file = tmp_path / "servo.toml"
+    lines = ["[datasheet]", *(f'{name} = "{value}"' for name, value in SERVO.items())]
+    expected = from_datasheet(**SERVO)
+    for end in ("\n", "\r\n"):
+        for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+            file.write_bytes(end.join(lines).encode(encoding))
+            assert motor_entry(str(file)).numbers == expected
+    file.write_bytes("\n".join([*lines, 'rotor_inertia = "60 µg*m^2 at motor"']).encode("cp1252"))
+    with pytest.raises(ValueError, match=r"line 10 has the byte 0xb5 \(µ in Windows-1252\).*save the file as UTF-8"):
+        motor_entry(str(file))

@@ -114,3 +114,15 @@ def test_so_is_the_file_of_a_model_of_somebody_s_own(tmp_path):
         path.write_text(text)
         digests |= {code_of(own), code_of(foreign)}
     assert len(digests) == 4
+
+
+def test_an_environment_that_a_file_registers_goes_by_the_file_and_its_id(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    entry = "gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv"
+    registers = f"gymnasium.register('my/Arm-v0', entry_point='{entry}', max_episode_steps=60)"
+    Path("armenv.py").write_text(f"import gymnasium\n\n{registers}\n")
+    made = []
+    monkeypatch.setattr("codrl_mj.training.train", lambda config, *_, **__: made.append(config))
+    ran(f"train armenv.py:my/Arm-v0 {TINY}")
+    assert made[0].env.task == "armenv:my/Arm-v0"
+    assert "there is no such file" in refused(capsys, "train armenvs.py:my/Arm-v0")

@@ -3,6 +3,7 @@
 import dataclasses
 import re
 
+import gymnasium
 import pytest
 
 import codrl_mj
@@ -59,3 +60,17 @@ def test_a_mapping_is_as_good(kind, off, given):
 def test_what_is_no_description_is_refused(given, off, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         resolve(given, off)
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, codrl_mj.make, codrl_mj.make_vec])
+def test_a_delay_in_milliseconds_is_refused_where_no_command_would_arrive(make):
+    env = "codrl_mj/Pendulum-v0" if make is gymnasium.make else "pendulum"
+    with pytest.raises(ValueError, match=r"command_delay = 20: must be < 10 s, .*for 20 ms write 0\.02"):
+        make(env, actuator="ideal", disturbances={"command_delay": 20})
+
+
+@pytest.mark.filterwarnings("default::UserWarning")
+def test_a_delay_of_many_steps_is_warned_of():
+    for env in ("pendulum", "HalfCheetah-v5"):
+        with pytest.warns(UserWarning, match=r"command_delay = 5: a delay of 100 environment steps; .* write 0\.005"):
+            codrl_mj.make(env, "ideal", disturbances={"command_delay": 5})

@@ -19,6 +19,7 @@ import codrl_mj
 from codrl_mj.actuators import Actuator, CurrentLoop, Drive, Motor, Servo, TorqueSpeed, VoltageDrive
 from codrl_mj.catalogue import motor_entry
 from codrl_mj.engine.reading import slots
+from codrl_mj.envs.config import EnvConfig
 from tests.foreign.models import ARM, V5, ArmEnv, BareEnv, actions, assert_same, run
 from tests.matrix import but
 from tests.motorised.models import full_state
@@ -396,3 +397,9 @@ def test_an_action_of_another_shape_is_refused(options):
     env.reset()
     with pytest.raises(ValueError, match=r"action has shape \(1,\): must be \(6,\)"):
         env.step(np.zeros(1, np.float32))
+
+
+def test_a_family_s_class_stands_for_its_defaults():
+    for given in ({".*": TorqueSpeed}, TorqueSpeed):
+        assert EnvConfig("InvertedPendulum-v5", given) == EnvConfig("InvertedPendulum-v5", {".*": TorqueSpeed()})
+        codrl_mj.make("InvertedPendulum-v5", given).close()
