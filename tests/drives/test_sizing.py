@@ -34,8 +34,10 @@ from codrl_mj.evaluation import run_episodes
 from codrl_mj.tasks import TASKS
 from tests.matrix import but
 
-PAPER = GearMotor(resistance=1.0, inductance=0.01, torque_constant=1.0, back_emf_constant=1.0, rotor_inertia=0.0)
+PAPER = GearMotor(resistance=1.0, inductance=0.01, torque_constant=1.0, back_emf_constant=1.0, rotor_inertia=1e-9)
 MOTOR = GearMotor(resistance=2.0, inductance=1e-3, torque_constant=0.05, back_emf_constant=0.04, rotor_inertia=1e-5)
+COOL = math.inf
+"""A continuous current for which heat does not matter."""
 
 
 def drive(motor=PAPER, voltage=24.0, **loop):
@@ -142,7 +144,7 @@ def test_stall_and_heat():
 
 def test_what_is_recorded_is_to_be_delivered_and_what_a_policy_asks_may_be_asked_otherwise():
     asked = steady(2.0, 8.0)
-    assert feasibility(drive(voltage=10.0), asked).verdict == SURELY
+    assert feasibility(drive(voltage=10.0), asked, COOL).verdict == SURELY
     assert feasibility(drive(voltage=9.9), asked).verdict == SURELY_NOT
     assert feasibility(drive(voltage=9.9), dataclasses.replace(asked, exact=False)).verdict == TRY_IT
 
@@ -219,7 +221,7 @@ def test_what_is_surely_enough_changes_nothing(pendulum):
     """10 V for 2 N*m at 8 rad/s: the run on the ideal actuator, but for what a winding of L/R = 0.1 ms delays."""
     quick = drive(dataclasses.replace(PAPER, inductance=1e-4), 10.0)
     assert operation(pendulum, quick).voltage.max() <= 10.0
-    assert feasibility(quick, pendulum).verdict == SURELY
+    assert feasibility(quick, pendulum, COOL).verdict == SURELY
     assert np.abs(from_hanging(quick) - from_hanging(Ideal())).max() < 0.005
 
 
