@@ -46,6 +46,8 @@ class Feasible:
     """Turns of the rotor for a turn of the joint, or radians for a metre; the motor's own unless given."""
     voltage: float | None = None
     """Voltage of the supply [V]."""
+    max_current: float | None = None
+    """Largest current that the drive gives [A]; the motor's own unless given."""
     motor: OfMotor = None
     out: Path | None = None
     """Folder for torque_speed.png: what was asked for over what the motor can do."""
@@ -54,20 +56,11 @@ class Feasible:
 
     def run(self) -> tuple[int, Any]:
         """Print the bounds, and the verdict last."""
-        from codrl_mj.drives import (
-            DEPENDS,
-            HOPELESS,
-            SURELY_NOT,
-            demand_of,
-            equal_gears,
-            feasibility,
-            find_drive,
-            find_entry,
-            geared,
-            uncounted,
-        )
+        from codrl_mj import drives
+        from codrl_mj.drives import demand_of, feasibility, find_drive, find_entry, geared, uncounted
 
-        drive, entry = find_drive(self.name, self.gear_ratio, voltage=self.voltage), find_entry(self.name)
+        drive = find_drive(self.name, self.gear_ratio, voltage=self.voltage, max_current=self.max_current)
+        entry = find_entry(self.name)
         continuous, unknown = entry.numbers.continuous_current if entry else None, uncounted(entry)
         demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
         found = feasibility(drive, demand, continuous)
@@ -76,11 +69,11 @@ class Feasible:
         for bound in found.bounds:
             numbers = (f"{value:.4g}" if value == value else "unknown" for value in (bound.needed, bound.available))
             mark = Text("holds", "green") if bound.holds else Text("fails", "red")
-            mark = Text("unknown", "yellow") if bound.verdict == DEPENDS else mark
+            mark = Text("unknown", "yellow") if bound.verdict == drives.DEPENDS else mark
             rows.append((bound.name, bound.formula, *numbers, bound.unit, mark, bound.verdict))
         print_table(title, ("bound", "of", "needs", "has", "unit", "", "says"), rows, right=("needs", "has"))
         asked, best = found.operation, geared(drive, demand, continuous)
-        at_best, (low, high) = feasibility(best, demand, continuous), equal_gears(best, demand, continuous)
+        at_best, (low, high) = feasibility(best, demand, continuous), drives.equal_gears(best, demand, continuous)
         say(
             f"{asked.energy_drawn:.3g} J drawn and {asked.copper_loss:.3g} J of heat in an episode, "
             f"{asked.rms_current:.3g} A rms; share of rotor and friction in the largest load: {_share(drive, asked)}",
@@ -103,16 +96,11 @@ class Feasible:
             "margin": found.margin,
             "bounds": found.bounds,
             **_asked(asked),
-            "best": {
-                "gear_ratio": 1.0 / best.arm_radius,
-                "verdict": at_best.verdict,
-                "margin": at_best.margin,
-                "from_gear_ratio": low,
-                "to_gear_ratio": high,
-            },
+            "best": {"gear_ratio": 1.0 / best.arm_radius, "verdict": at_best.verdict, "margin": at_best.margin},
+            "gear_ratios_as_good": (low, high),
             "unknown": unknown,
         }
-        return int(found.verdict in (HOPELESS, SURELY_NOT)), content
+        return int(found.verdict in (drives.HOPELESS, drives.SURELY_NOT)), content
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +131,8 @@ class Choose:
     """Share of voltage, largest and continuous current that has to be left."""
     voltage: float | None = None
     """Voltage of the supply [V]; each motor's own unless given."""
+    max_current: float | None = None
+    """Largest current that the drive gives [A]; each motor's own unless given."""
     gears: Annotated[tuple[float, ...], tyro.conf.arg(metavar="RATIO ...")] = ()
     """Gears that can be bought, turns of the rotor for a turn of the joint, or radians for a metre: every motor is
     judged with each of them. None: the motor's own gear, or its best one if it has none."""
@@ -164,10 +154,8 @@ class Choose:
         asked, motors = _told_apart(self.words)
         one = self.motor is not None and {self.motor: demand_of(asked, trust=self.trust, motor=self.motor)}
         demands = one or demands_of(asked, trust=self.trust)
-        ranked = {
-            name: choose(demand, motors or None, self.voltage, self.margin, self.gears)
-            for name, demand in demands.items()
-        }
+        settings = motors or None, self.voltage, self.margin, self.gears, self.max_current
+        ranked = {name: choose(demand, *settings) for name, demand in demands.items()}
         alone = next(iter(demands.values())) if len(demands) == 1 else None
         if alone is not None and alone.model_gear != 1.0:
             text = f"gears are at the joint; the model's actuator has one of {alone.model_gear:g}, which the motor's "
@@ -183,7 +171,10 @@ class Choose:
             if about and (choice.lacks or place < len(shown)):
                 say(f"{at}: {about}" if alone else f"{name}: {at}: {about}")
         if self.out is not None:
-            motors = told_apart([Path(choice.name).with_suffix("") for _, choice in shown])
+            names = [choice.name.removesuffix(Path(choice.name).suffix) for _, choice in shown]
+            if self.gears:
+                names = [f"{name}-{choice.ratio:.4g}" for name, (_, choice) in zip(names, shown, strict=True)]
+            motors = told_apart(list(map(Path, names)))
             for (name, choice), motor in zip(shown, motors, strict=True):
                 picture = motor.replace("/", "-") if alone else name
                 _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")
@@ -191,6 +182,8 @@ class Choose:
                 chosen = actuators_of({name: (found[0], demands[name]) for name, found in ranked.items()})
                 temporary.write_text(yaml.safe_dump(chosen, sort_keys=False))
             print(f"wrote {self.out / 'actuators.yaml'}")
+            if short := [found[0].name for found in ranked.values() if found[0].lacks]:
+                say(f"no motor does it; written is the nearest: {', '.join(short)}")
         content = [
             {
                 "drives": name or None,
@@ -212,6 +205,7 @@ class Choose:
 
 _UNITS = {
     "gear_ratio": "1, or rad/m on a slide",
+    "gear_ratios_as_good": "1, or rad/m on a slide",
     "voltage": "V",
     "power": "W",
     "margin": "1",

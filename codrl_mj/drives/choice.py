@@ -89,6 +89,7 @@ def choose(
     voltage: float | None = None,
     least_margin: float = MARGIN,
     gears: Sequence[float] | None = None,
+    max_current: float | None = None,
 ) -> list[Candidate]:
     """Rank motors with their gears: those that do it, from the smallest; then the others by verdict and shortage.
 
@@ -103,6 +104,7 @@ def choose(
         least_margin: share of voltage, largest and continuous current that has to be left, in [0, 1).
         gears: ratios that can be had, turns of the rotor for one of the joint, on a slide rad/m; every motor is judged
             with each of them.
+        max_current: that the drive gives [A]; None: each motor's own.
 
     Raises:
         ValueError: there is no such motor, or the margin or a gear is out of bounds.
@@ -116,7 +118,7 @@ def choose(
         entry = find_entry(name)
         continuous = entry.numbers.continuous_current if entry else None
         for gear in gears or [None]:
-            drive = find_drive(name, gear, voltage=voltage)
+            drive = find_drive(name, gear, voltage=voltage, max_current=max_current)
             fixed = gear is not None or (drive.motor.gear_ratio != 1.0 and not demand.linear)
             drive = drive if fixed else geared(drive, demand, continuous)
             found = feasibility(drive, demand, continuous)
@@ -161,13 +163,12 @@ def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Dri
         return max(1.0 - margin(with_gear, asked, continuous), share)
 
     def best(highest: float) -> Drive:
-        bounds = low, max(min(highest, high), low + 1e-9)
-        return _with_ratio(
-            drive, demand, float(minimize_scalar(load, bounds=bounds, method="bounded", options={"xatol": 0.01}).x)
-        )
+        within = low, max(min(highest, high), low + 1e-9)
+        at = minimize_scalar(load, bounds=within, method="bounded", options={"xatol": 0.01}).x
+        return _with_ratio(drive, demand, float(at))
 
     rubbed = 0.0 if demand.exact else friction_share(_with_ratio(drive, demand, 0.0), demand)  # it grows with the ratio
-    if rubbed > 0.0:
+    if rubbed > 0.0 and MOST_FRICTION / rubbed > math.exp(low):
         smooth = best(math.log(MOST_FRICTION / rubbed))
         if margin(smooth, operation(demand, smooth), continuous) >= 0.0:
             return smooth
@@ -182,8 +183,10 @@ def equal_gears(best: Drive, demand: Demand, continuous: float | None = None) ->
         within = middle
         for _ in range(12):
             tried = (within + beyond) / 2.0
-            same = feasibility(_with_ratio(best, demand, tried), demand, continuous).verdict == verdict
-            within, beyond = (tried, beyond) if same else (within, tried)
+            if feasibility(_with_ratio(best, demand, tried), demand, continuous).verdict == verdict:
+                within = tried
+            else:
+                beyond = tried
         return math.exp(within)
 
     low, high = _logarithms(best, demand)
