@@ -32,9 +32,8 @@ OfMotor = Annotated[
 class Feasible:
     """Ask whether a motor can do a task, before training; docs/motors.md.
 
-    The last line is surely, it depends (on what the datasheet lacks), try it, hopeless or surely not.
-
-    Exit status 1 for the last two. Example: codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
+    The last line is surely, it depends (on what the datasheet lacks), try it, hopeless or surely not; exit status 1 for
+    the last two. Example: codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
     """
 
     name: Annotated[
@@ -171,10 +170,9 @@ class Choose:
             if about and (choice.lacks or place < len(shown)):
                 say(f"{at}: {about}" if alone else f"{name}: {at}: {about}")
         if self.out is not None:
-            names = [choice.name.removesuffix(Path(choice.name).suffix) for _, choice in shown]
-            if self.gears:
-                names = [f"{name}-{choice.ratio:.4g}" for name, (_, choice) in zip(names, shown, strict=True)]
-            motors = told_apart(list(map(Path, names)))
+            gears = [f"-{choice.ratio:.4g}" if self.gears else "" for _, choice in shown]
+            stems = [choice.name.removesuffix(Path(choice.name).suffix) for _, choice in shown]
+            motors = told_apart([Path(f"{stem}{gear}") for stem, gear in zip(stems, gears, strict=True)])
             for (name, choice), motor in zip(shown, motors, strict=True):
                 picture = motor.replace("/", "-") if alone else name
                 _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")

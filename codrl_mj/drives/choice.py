@@ -117,7 +117,7 @@ def choose(
     for name in motor_names() if motors is None else motors:
         entry = find_entry(name)
         continuous = entry.numbers.continuous_current if entry else None
-        for gear in gears or [None]:
+        for gear in gears or (None,):
             drive = find_drive(name, gear, voltage=voltage, max_current=max_current)
             fixed = gear is not None or (drive.motor.gear_ratio != 1.0 and not demand.linear)
             drive = drive if fixed else geared(drive, demand, continuous)
@@ -183,10 +183,8 @@ def equal_gears(best: Drive, demand: Demand, continuous: float | None = None) ->
         within = middle
         for _ in range(12):
             tried = (within + beyond) / 2.0
-            if feasibility(_with_ratio(best, demand, tried), demand, continuous).verdict == verdict:
-                within = tried
-            else:
-                beyond = tried
+            same = feasibility(_with_ratio(best, demand, tried), demand, continuous).verdict == verdict
+            within, beyond = (tried, beyond) if same else (within, tried)
         return math.exp(within)
 
     low, high = _logarithms(best, demand)

@@ -217,8 +217,6 @@ _HOPELESS = ("voltage", "current", "heat", "stall")
 """The bounds that may be so short that a task is hopeless; over power a policy may take its time."""
 _LATER = ("voltage", "current", "rotor", "power")
 """The bounds on what a servo asks for on ideal motors, where it is as fast as its force allows."""
-
-
 _Row = tuple[str, str, Any, float, str, tuple[str, str], str]
 
 
