@@ -128,6 +128,7 @@ def test_no_policy_that_was_trained_for_it_contradicts_a_verdict(furuta):
         assert found.operation.own_share == pytest.approx(float(row["own_share"]), rel=0.05)
         assert found.verdict != SURELY or float(row["success"]) >= 0.9
         assert found.verdict not in (HOPELESS, SURELY_NOT) or float(row["success"]) <= 0.2
+    assert {SURELY, TRY_IT} == {row["verdict"] for row in rows}
     assert any(float(row["success"]) == 0.0 for row in rows)  # of what was once called surely
 
 
