@@ -30,9 +30,10 @@ OfMotor = Annotated[
 
 @dataclasses.dataclass(frozen=True)
 class Feasible:
-    """Ask whether a motor can do a task, before training: surely, try it, hopeless, surely not; docs/motors.md.
+    """Ask whether a motor can do a task, before training; docs/motors.md.
 
-    Exit status 1 for the last two. Example: codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
+    The last line is surely, it depends (on what the datasheet lacks), try it, hopeless or surely not; exit status 1 for
+    the last two. Example: codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
     """
 
     name: Annotated[
@@ -44,6 +45,8 @@ class Feasible:
     """Turns of the rotor for a turn of the joint, or radians for a metre; the motor's own unless given."""
     voltage: float | None = None
     """Voltage of the supply [V]."""
+    max_current: float | None = None
+    """Largest current that the drive gives [A]; the motor's own unless given."""
     motor: OfMotor = None
     out: Path | None = None
     """Folder for torque_speed.png: what was asked for over what the motor can do."""
@@ -52,36 +55,31 @@ class Feasible:
 
     def run(self) -> tuple[int, Any]:
         """Print the bounds, and the verdict last."""
-        from codrl_mj.drives import (
-            HOPELESS,
-            SURELY_NOT,
-            demand_of,
-            feasibility,
-            find_drive,
-            find_entry,
-            geared,
-            uncounted,
-        )
+        from codrl_mj import drives
+        from codrl_mj.drives import demand_of, feasibility, find_drive, find_entry, geared, uncounted
 
-        drive, entry = find_drive(self.name, self.gear_ratio, voltage=self.voltage), find_entry(self.name)
+        drive = find_drive(self.name, self.gear_ratio, voltage=self.voltage, max_current=self.max_current)
+        entry = find_entry(self.name)
         continuous, unknown = entry.numbers.continuous_current if entry else None, uncounted(entry)
         demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
         found = feasibility(drive, demand, continuous)
         title = f"{self.name}, {_gear(drive, demand)}, {drive.voltage_limit:g} V: {demand.source}"
         rows: list[Any] = []
         for bound in found.bounds:
-            numbers = f"{bound.needed:.4g}", f"{bound.available:.4g}"
+            numbers = (f"{value:.4g}" if value == value else "unknown" for value in (bound.needed, bound.available))
             mark = Text("holds", "green") if bound.holds else Text("fails", "red")
+            mark = Text("unknown", "yellow") if bound.verdict == drives.DEPENDS else mark
             rows.append((bound.name, bound.formula, *numbers, bound.unit, mark, bound.verdict))
         print_table(title, ("bound", "of", "needs", "has", "unit", "", "says"), rows, right=("needs", "has"))
         asked, best = found.operation, geared(drive, demand, continuous)
-        at_best = feasibility(best, demand, continuous)
+        at_best, (low, high) = feasibility(best, demand, continuous), drives.equal_gears(best, demand, continuous)
         say(
             f"{asked.energy_drawn:.3g} J drawn and {asked.copper_loss:.3g} J of heat in an episode, "
             f"{asked.rms_current:.3g} A rms; share of rotor and friction in the largest load: {_share(drive, asked)}",
-            *(f"{bound.name}: {bound.remedy}" for bound in found.bounds if not bound.holds),
-            f"best: {_gear(best, demand)}, {at_best.verdict}, with a margin of {at_best.margin:.0%}",
-            f"not known, and not counted: {', '.join(unknown)}" if unknown else "",
+            *map(str, found.in_the_way),
+            f"best {_gear(best, demand)}: {at_best.verdict}, with a margin of {at_best.margin:.0%}; the verdict is the "
+            f"same from {low:.3g} to {high:.3g}",
+            _uncounted(unknown, found.why),
             drive.assumed,
         )
         if self.out is not None:
@@ -98,9 +96,10 @@ class Feasible:
             "bounds": found.bounds,
             **_asked(asked),
             "best": {"gear_ratio": 1.0 / best.arm_radius, "verdict": at_best.verdict, "margin": at_best.margin},
+            "gear_ratios_as_good": (low, high),
             "unknown": unknown,
         }
-        return int(found.verdict in (HOPELESS, SURELY_NOT)), content
+        return int(found.verdict in (drives.HOPELESS, drives.SURELY_NOT)), content
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,13 +107,13 @@ class Choose:
     """Rank motors for a task, the smallest that does it first, and say what is wrong with the others.
 
     Motors of your own (files) or of the catalogue are named beside the task; without any the catalogue's are ranked.
-    Each is taken at its best gear. It does the task if voltage, largest current and heat hold with the margin, its heat
-    is known, and the rotor leaves half to the load; smallest means by the most mechanical power at its supply. A run
-    with several motors gets one for each of them. With --out there is the file actuators.yaml, which train, evaluate
-    and render take as --actuators FILE.
+    Each keeps the gear of its datasheet, gets its best one if it has none, or is judged with each of --gears. It does
+    the task if motor feasible says surely, with the margin; smallest means by the most mechanical power at its supply.
+    A run with several motors gets one for each of them. With --out there is the file actuators.yaml, which train,
+    evaluate and render take as --actuators FILE.
 
-    Example: codrl-mj motor choose pendulum --top 5 --out chosen, codrl-mj motor choose a.toml b.toml pendulum, or
-    codrl-mj motor choose runs/Hopper_v5-sac-ideal-0
+    Example: codrl-mj motor choose pendulum --top 5 --out chosen, codrl-mj motor choose a.toml b.toml pendulum,
+    codrl-mj motor choose a.toml pendulum --gears 6.25 18.75 30, or codrl-mj motor choose runs/Hopper_v5-sac-ideal-0
     """
 
     words: Annotated[
@@ -131,6 +130,11 @@ class Choose:
     """Share of voltage, largest and continuous current that has to be left."""
     voltage: float | None = None
     """Voltage of the supply [V]; each motor's own unless given."""
+    max_current: float | None = None
+    """Largest current that the drive gives [A]; each motor's own unless given."""
+    gears: Annotated[tuple[float, ...], tyro.conf.arg(metavar="RATIO ...")] = ()
+    """Gears that can be bought, turns of the rotor for a turn of the joint, or radians for a metre: every motor is
+    judged with each of them. None: the motor's own gear, or its best one if it has none."""
     motor: OfMotor = None
     out: Path | None = None
     """Folder for NAME.png of those shown: what was asked for over what the motor can do."""
@@ -149,7 +153,8 @@ class Choose:
         asked, motors = _told_apart(self.words)
         one = self.motor is not None and {self.motor: demand_of(asked, trust=self.trust, motor=self.motor)}
         demands = one or demands_of(asked, trust=self.trust)
-        ranked = {name: choose(demand, motors or None, self.voltage, self.margin) for name, demand in demands.items()}
+        settings = motors or None, self.voltage, self.margin, self.gears, self.max_current
+        ranked = {name: choose(demand, *settings) for name, demand in demands.items()}
         alone = next(iter(demands.values())) if len(demands) == 1 else None
         if alone is not None and alone.model_gear != 1.0:
             text = f"gears are at the joint; the model's actuator has one of {alone.model_gear:g}, which the motor's "
@@ -160,13 +165,14 @@ class Choose:
         _print_ranking(shown, demands, f"smallest that does it with {self.margin:.0%} left first: {source}")
         for place, (name, choice) in enumerate(told):
             at = f"{choice.name} at {_gear(choice.drive, demands[name])}"
-            rest = ", ".join(one for one in choice.unknown if one not in choice.lacks)
-            unknown = f"not known, and not counted: {rest}" if rest else ""
+            unknown = _uncounted(choice.unknown, choice.lacks)
             about = "; ".join(filter(None, (choice.lacks, unknown, choice.drive.assumed)))
             if about and (choice.lacks or place < len(shown)):
                 say(f"{at}: {about}" if alone else f"{name}: {at}: {about}")
         if self.out is not None:
-            motors = told_apart([Path(choice.name).with_suffix("") for _, choice in shown])
+            gears = [f"-{choice.ratio:.4g}" if self.gears else "" for _, choice in shown]
+            stems = [choice.name.removesuffix(Path(choice.name).suffix) for _, choice in shown]
+            motors = told_apart([Path(f"{stem}{gear}") for stem, gear in zip(stems, gears, strict=True)])
             for (name, choice), motor in zip(shown, motors, strict=True):
                 picture = motor.replace("/", "-") if alone else name
                 _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")
@@ -174,6 +180,8 @@ class Choose:
                 chosen = actuators_of({name: (found[0], demands[name]) for name, found in ranked.items()})
                 temporary.write_text(yaml.safe_dump(chosen, sort_keys=False))
             print(f"wrote {self.out / 'actuators.yaml'}")
+            if short := [found[0].name for found in ranked.values() if found[0].lacks]:
+                say(f"no motor does it; written is the nearest: {', '.join(short)}")
         content = [
             {
                 "drives": name or None,
@@ -181,6 +189,7 @@ class Choose:
                 "gear_ratio": choice.ratio,
                 "voltage": choice.drive.voltage_limit,
                 "power": choice.power,
+                "verdict": choice.feasibility.verdict,
                 "does_it": not choice.lacks,
                 "lacks": choice.lacks,
                 "margin": choice.feasibility.margin,
@@ -194,6 +203,7 @@ class Choose:
 
 _UNITS = {
     "gear_ratio": "1, or rad/m on a slide",
+    "gear_ratios_as_good": "1, or rad/m on a slide",
     "voltage": "V",
     "power": "W",
     "margin": "1",
@@ -209,6 +219,12 @@ def _asked(found: Any) -> dict[str, Any]:
     """What an episode asks of a motor, by names in `_UNITS`."""
     named = {name: getattr(found, name) for name in ("own_share", "rms_current", "energy_drawn", "copper_loss")}
     return {"peak_current": float(abs(found.current).max()), **named}
+
+
+def _uncounted(unknown: Sequence[str], said: str) -> str:
+    """Say which numbers a judgment leaves out, but for those that it names itself."""
+    rest = ", ".join(name for name in unknown if name not in said)
+    return f"not known, and not counted: {rest}" if rest else ""
 
 
 def _told_apart(words: Sequence[str]) -> tuple[str, list[str]]:
@@ -240,14 +256,17 @@ def _share(drive: Any, asked: Any) -> str:
 def _print_ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str) -> None:
     """A row for each choice; of several motors, each with what it drives."""
     columns: tuple[str, ...]
-    columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "does\nit", "mar-\ngin", "rotor\nshare", "peak\n[A]")
+    columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "verdict", "mar-\ngin", "rotor\nshare", "peak\n[A]")
     columns += ("rms\n[A]", "drawn\n[J]", "heat\n[J]")
-    right, rows = [name for name in columns if name not in ("motor", "does\nit")], []
+    right, rows = [name for name in columns if name not in ("motor", "verdict")], []
     several = len(demands) > 1
     for name, choice in choices:
         asked = choice.feasibility.operation
         numbers = abs(asked.current).max(), asked.rms_current, asked.energy_drawn, asked.copper_loss
-        gear, does = _gear(choice.drive, demands[name]), Text("no", "red") if choice.lacks else Text("yes", "green")
+        gear, does = (
+            _gear(choice.drive, demands[name]),
+            Text(choice.feasibility.verdict, "red" if choice.lacks else "green"),
+        )
         row = (
             *((name, choice.name) if several else (choice.name,)),
             *(gear.removeprefix("gear "), f"{choice.drive.voltage_limit:g}", f"{choice.power:,.0f}", does),

@@ -11,9 +11,10 @@ from codrl_mj.drives.abilities import (
     torque_limits,
     unknown_in_words,
 )
-from codrl_mj.drives.choice import Candidate, actuators_of, choose, geared, uncounted
+from codrl_mj.drives.choice import Candidate, actuators_of, choose, equal_gears, geared, uncounted
 from codrl_mj.drives.demand import Demand, demand_of, demands_of, recorded
 from codrl_mj.drives.feasibility import (
+    DEPENDS,
     HOPELESS,
     SURELY,
     SURELY_NOT,
@@ -78,12 +79,14 @@ __all__ = [
     "Feasibility",
     "feasibility",
     "SURELY",
+    "DEPENDS",
     "SURELY_NOT",
     "HOPELESS",
     "TRY_IT",
     "Candidate",
     "choose",
     "geared",
+    "equal_gears",
     "uncounted",
     "actuators_of",
     "Swing",

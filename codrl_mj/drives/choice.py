@@ -1,4 +1,4 @@
-"""Which motor of the catalogue, with which gear: the smallest that does it with a margin."""
+"""The choice of a motor and of its gear: the smallest that does it with a margin."""
 
 import math
 import re
@@ -12,15 +12,21 @@ from codrl_mj.actuators import Drive, labelled, named_mapping
 from codrl_mj.catalogue import MotorEntry, motor_names
 from codrl_mj.drives.abilities import find_drive, find_entry, most_power
 from codrl_mj.drives.demand import Demand
-from codrl_mj.drives.feasibility import SURELY, VERDICTS, Feasibility, best_ratio, feasibility, margin, operation
+from codrl_mj.drives.feasibility import (
+    MOST_FRICTION,
+    MOST_SHARE,
+    SURELY,
+    VERDICTS,
+    Feasibility,
+    best_ratio,
+    feasibility,
+    friction_share,
+    margin,
+    operation,
+)
 
 MARGIN = 0.2
 """Share of voltage and currents that a motor is to leave: a rule of thumb, for the tolerances of motor and supply."""
-MOST_SHARE = 0.5
-"""Largest share that rotor and friction may take of the largest load: in a task a policy can ask for no more."""
-MOST_FRICTION = 0.05
-"""Largest share that Coulomb friction at the joint may take of it. Policies that never met as much lost at most 0.05 of
-the score on five tasks and 0.10 on Mountain Car, and with twice as much up to 0.18 (docs/results/actuators.md)."""
 _SPREAD = math.log(16.0)
 """Gears are tried up to this far, in logarithms, from that of the largest torque and the largest speed."""
 _WANTED = ("coulomb_friction", "viscous_friction", "gear_efficiency", "continuous_current")
@@ -28,18 +34,18 @@ _WANTED = ("coulomb_friction", "viscous_friction", "gear_efficiency", "continuou
 
 
 class Candidate(NamedTuple):
-    """A motor of the catalogue at its best gear."""
+    """A motor with a gear, judged."""
 
     name: str
-    """The motor's."""
+    """Of the motor."""
     drive: Drive
-    """With gear and supply."""
+    """The motor with gear and supply."""
     unknown: tuple[str, ...]
-    """What its datasheet leaves open, and is not counted."""
+    """Numbers that its datasheet leaves open, and that are not counted."""
     feasibility: Feasibility
-    """What it can do."""
+    """The judgment."""
     lacks: str
-    """Why it is not to be taken; empty where it is."""
+    """The reason why it is not to be taken; empty where it is."""
 
     def behind(self, gear: float) -> Drive:
         """The drive for an actuator of a model with a gear of its own, which the arm undoes: `Demand.model_gear`."""
@@ -78,23 +84,30 @@ def uncounted(entry: MotorEntry | None) -> tuple[str, ...]:
 
 
 def choose(
-    demand: Demand, motors: Sequence[str] | None = None, voltage: float | None = None, least_margin: float = MARGIN
+    demand: Demand,
+    motors: Sequence[str] | None = None,
+    voltage: float | None = None,
+    least_margin: float = MARGIN,
+    gears: Sequence[float] | None = None,
+    max_current: float | None = None,
 ) -> list[Candidate]:
-    """Motors at their best gears: those that do it, from the smallest; then the others by verdict and margin.
+    """Rank motors with their gears: those that do it, from the smallest; then the others by verdict and shortage.
 
-    A motor does it if voltage, largest current and heat hold with a margin, its heat is known, and it leaves to the
-    load what a policy can ask for; a recording asks for whatever it takes. More than enough of a motor is no merit:
-    it is dear and heavy, and moves itself. A motor with a gear of its own keeps it, and on a slide gets a wheel; the
-    others get the gear at which the tightest of these is widest.
+    A motor does it if `feasibility` says `surely`, with a margin. More than enough of a motor is no merit: it is dear
+    and heavy, and moves itself. A motor with a gear of its own keeps it, and on a slide gets a wheel; the others get
+    the gear of `geared`.
 
     Args:
         demand: what is asked.
         motors: names; None: the whole catalogue.
         voltage: of the supply [V]; None: each motor's own.
         least_margin: share of voltage, largest and continuous current that has to be left, in [0, 1).
+        gears: ratios that can be had, turns of the rotor for one of the joint, on a slide rad/m; every motor is judged
+            with each of them.
+        max_current: that the drive gives [A]; None: each motor's own.
 
     Raises:
-        ValueError: there is no such motor, or the margin is out of bounds.
+        ValueError: there is no such motor, or the margin or a gear is out of bounds.
     """
     if not 0.0 <= least_margin < 1.0:
         raise ValueError(
@@ -102,48 +115,35 @@ def choose(
         )
     choices = []
     for name in motor_names() if motors is None else motors:
-        drive, entry = find_drive(name, voltage=voltage), find_entry(name)
+        entry = find_entry(name)
         continuous = entry.numbers.continuous_current if entry else None
-        fixed = drive.motor.gear_ratio != 1.0 and not demand.linear
-        best = drive if fixed else geared(drive, demand, continuous)
-        found = feasibility(best, demand, continuous)
-        choices.append(
-            Candidate(name, best, uncounted(entry), found, _lacks(best, found, demand, continuous, least_margin))
-        )
+        for gear in gears or (None,):
+            drive = find_drive(name, gear, voltage=voltage, max_current=max_current)
+            fixed = gear is not None or (drive.motor.gear_ratio != 1.0 and not demand.linear)
+            drive = drive if fixed else geared(drive, demand, continuous)
+            found = feasibility(drive, demand, continuous)
+            choices.append(Candidate(name, drive, uncounted(entry), found, _lacks(found, least_margin)))
 
-    def rank(choice: Candidate) -> tuple[bool, int, float]:
+    def rank(choice: Candidate) -> tuple[bool, int, float, float]:
         found = choice.feasibility
-        return choice.lacks != "", VERDICTS.index(found.verdict), -found.margin if choice.lacks else choice.power
+        size = 0.0 if choice.lacks else choice.power
+        return choice.lacks != "", VERDICTS.index(found.verdict), size, found.shortage
 
     return sorted(choices, key=rank)
 
 
-def _lacks(drive: Drive, found: Feasibility, demand: Demand, continuous: float | None, least: float) -> str:
-    """Why a motor is not to be taken."""
+def _lacks(found: Feasibility, least: float) -> str:
+    """Return the reason why a motor is not to be taken; empty where it is."""
     if found.verdict != SURELY:
         return f"{found.verdict}. {found.why}"
-    if found.margin < least:
-        return f"surely, but with a margin of {found.margin:.0%}, must be {least:.0%}"
-    if not demand.exact and found.operation.own_share > MOST_SHARE:
-        share = f"{found.operation.own_share:.0%} of the largest load, must be <= {MOST_SHARE:.0%}"
-        return f"surely, but its rotor and friction take {share}: a policy cannot ask for so much more"
-    if not demand.exact and (friction := _friction(drive, demand)) > MOST_FRICTION:
-        share = f"{friction:.0%} of the largest load, must be <= {MOST_FRICTION:.0%}"
-        return f"surely, but its friction takes {share}: a policy that never met it would notice"
-    if continuous is None:
-        return "surely, but how long: its continuous current is not known"
-    return ""
-
-
-def _friction(drive: Drive, demand: Demand) -> float:
-    return drive.additions.friction / float(np.abs(demand.torque).max())
+    return "" if found.margin >= least else f"surely, but with a margin of {found.margin:.0%}, must be {least:.0%}"
 
 
 def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Drive:
-    """The drive with the gear, or on a slide the wheel, of the largest margin, what it takes itself considered.
+    """Return the drive with its best gear, or on a slide wheel: that of the largest margin, rotor and friction counted.
 
-    Friction may take `MOST_FRICTION` of the load where that leaves a `MARGIN`. Each of the margin's parts is, but for
-    friction, the largest of functions a/N + b*N, so it has one maximum over N.
+    A gear has a ratio >= 1. Friction may take `MOST_FRICTION` of the load where that leaves a margin. Each of the
+    margin's parts is, but for friction, the largest of functions a/N + b*N, so it has one maximum over N.
 
     Args:
         drive: the motor, with any gear.
@@ -152,28 +152,61 @@ def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Dri
     """
     from scipy.optimize import minimize_scalar
 
-    motor, own = drive.motor, drive.motor.gear_ratio
-    torque, speed = np.abs(demand.torque).max(), np.abs(demand.speed).max()
-    if not torque * speed * motor.back_emf_constant > 0.0:
+    low, high = _logarithms(drive, demand)
+    if low == high:
         return drive
-    middle = math.log(best_ratio(torque, speed, motor))
-
-    def at(logarithm: float) -> Drive:
-        ratio = math.exp(logarithm)
-        return drive.replaced({"motor.arm_radius": own / ratio} if demand.linear else {"motor.gear_ratio": ratio})
 
     def load(logarithm: float) -> float:
-        asked = operation(demand, at(logarithm))
+        with_gear = _with_ratio(drive, demand, logarithm)
+        asked = operation(demand, with_gear)
         share = 0.0 if demand.exact else asked.own_share / MOST_SHARE
-        return max(1.0 - margin(at(logarithm), asked, continuous), share)
+        return max(1.0 - margin(with_gear, asked, continuous), share)
 
-    def best(high: float) -> Drive:
-        bounds = middle - _SPREAD, max(min(high, middle + _SPREAD), middle - _SPREAD)
-        return at(float(minimize_scalar(load, bounds=bounds, method="bounded", options={"xatol": 0.01}).x))
+    def best(highest: float) -> Drive:
+        within = low, max(min(highest, high), low + 1e-9)
+        at = minimize_scalar(load, bounds=within, method="bounded", options={"xatol": 0.01}).x
+        return _with_ratio(drive, demand, float(at))
 
-    rubbed = 0.0 if demand.exact else _friction(at(0.0), demand)  # of a ratio of 1; it grows with it
-    if rubbed > 0.0:
+    rubbed = 0.0 if demand.exact else friction_share(_with_ratio(drive, demand, 0.0), demand)  # it grows with the ratio
+    if rubbed > 0.0 and MOST_FRICTION / rubbed > math.exp(low):
         smooth = best(math.log(MOST_FRICTION / rubbed))
-        if margin(smooth, operation(demand, smooth), continuous) >= MARGIN:
+        if margin(smooth, operation(demand, smooth), continuous) >= 0.0:
             return smooth
     return best(math.inf)
+
+
+def equal_gears(best: Drive, demand: Demand, continuous: float | None = None) -> tuple[float, float]:
+    """Return the lowest and the highest ratio around the best one that have its verdict."""
+    verdict, middle = feasibility(best, demand, continuous).verdict, -math.log(best.arm_radius)
+
+    def edge(beyond: float) -> float:
+        within = middle
+        for _ in range(12):
+            tried = (within + beyond) / 2.0
+            same = feasibility(_with_ratio(best, demand, tried), demand, continuous).verdict == verdict
+            within, beyond = (tried, beyond) if same else (within, tried)
+        return math.exp(within)
+
+    low, high = _logarithms(best, demand)
+    return edge(low), edge(high)
+
+
+def _logarithms(drive: Drive, demand: Demand) -> tuple[float, float]:
+    """Return the logarithms of the lowest and the highest ratio to try: the drive's own where all are alike.
+
+    A gear does not speed a motor up.
+    """
+    torque, speed = np.abs(demand.torque).max(), np.abs(demand.speed).max()
+    if not torque * speed * drive.motor.back_emf_constant > 0.0:
+        return -math.log(drive.arm_radius), -math.log(drive.arm_radius)
+    middle = math.log(best_ratio(torque, speed, drive.motor))
+    low = middle - _SPREAD if demand.linear else max(middle - _SPREAD, 0.0)
+    return low, max(middle + _SPREAD, low + 1e-9)
+
+
+def _with_ratio(drive: Drive, demand: Demand, logarithm: float) -> Drive:
+    """Return the drive with a ratio of exp(logarithm), by its gear, or on a slide by its wheel."""
+    ratio = math.exp(logarithm)
+    if demand.linear:
+        return drive.replaced({"motor.arm_radius": drive.motor.gear_ratio / ratio})
+    return drive.replaced({"motor.gear_ratio": ratio})

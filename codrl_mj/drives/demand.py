@@ -42,6 +42,8 @@ class Demand:
     """Whether it has to be delivered as it is; otherwise another policy may do the task with less."""
     linear: bool = False
     """Whether the joint is a slide."""
+    servo: bool = False
+    """Whether the model's own position or velocity servo makes the torque: it gets there with less, only later."""
     swing: Swing | None = None
     """The pendulum, where the task is to swing one up."""
     model_gear: float = 1.0
@@ -178,6 +180,7 @@ def _gathered(source: str, env: Any, ran: Sequence[Any]) -> dict[str, Demand]:
             acceleration=np.concatenate([np.diff(one) / ran[0].timestep for one in before]) / gear,
             episodes=len(ran),
             linear=bool(sliding),
+            servo=bool(np.any(model.actuator_biasprm[index, 1:3])),
             swing=swing,
             model_gear=gear,
         )
