@@ -33,6 +33,8 @@ class Model(abc.ABC):
     driven_by: str  # signal of a log
     output: str  # signal that a simulation is compared with
     known: Mapping[str, float]  # values of parameters that are not fitted
+    defaults: Mapping[str, float] = dataclasses.field(default_factory=lambda: DEFAULTS)
+    """Values of parameters that are neither fitted nor known."""
     names: tuple[str, ...] = ()  # free parameters; none before `begun`
     scales: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(0))
     """What a change of each is measured by, > 0, shape (p,)."""
@@ -46,7 +48,7 @@ class Model(abc.ABC):
 
     def all_values(self, values: np.ndarray) -> dict[str, float]:
         """Free and known parameters by name."""
-        return {**DEFAULTS, **self.known, **dict(zip(self.names, map(float, values), strict=True))}
+        return {**self.defaults, **self.known, **dict(zip(self.names, map(float, values), strict=True))}
 
     @abc.abstractmethod
     def segments(self, logs: Sequence[Log]) -> list[Segment]:
@@ -284,7 +286,7 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
             costs[one] = refit(model, model.segments(late(one)), fit.values, 20, fit.scale).costs(fit.scale)
             on_step()
         best = min(costs, key=lambda one: costs[one].sum())
-        return best if _better(costs[best], costs[0]) else 0
+        return best if clearly_better(costs[best], costs[0]) else 0
 
     delay = measure(*DELAYS)
     while delay != 0 and delay in (min(costs), max(costs)) and abs(delay) < LONGEST:
@@ -294,8 +296,8 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
         whole = costs[delay]
         measure(delay - 0.5, delay + 0.5)
         half = min(delay - 0.5, delay + 0.5, key=lambda one: costs[one].sum())
-        delay = half if _better(costs[half], whole) else delay
-        if delay == half or _better(whole, costs[half]):
+        delay = half if clearly_better(costs[half], whole) else delay
+        if delay == half or clearly_better(whole, costs[half]):
             told = [dataclasses.replace(log, mean_voltage=True) for log in late(delay)]
     if delay != 0:
         segments = model.segments(told)
@@ -304,8 +306,8 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
     return dataclasses.replace(fit, logs=tuple(told), delay=delay, tried=tried)
 
 
-def _better(these: np.ndarray, those: np.ndarray) -> bool:
-    """Whether costs of segments are lower than others, by more than chance."""
+def clearly_better(these: np.ndarray, those: np.ndarray, share: float = BETTER) -> bool:
+    """Return True if costs of segments are below a share of others, by more than chance."""
     gained = those - these
     error = gained.std(ddof=1) / np.sqrt(len(gained)) if len(gained) > 1 else 0.0
-    return bool(these.sum() < BETTER * those.sum() and gained.mean() > SURE * error)
+    return bool(these.sum() < share * those.sum() and gained.mean() > SURE * error)

@@ -41,6 +41,8 @@ OF_MOTOR = (
     *("gear_efficiency", "coulomb_friction", "viscous_friction", "stribeck_friction", "stribeck_speed"),
 )
 """Fields of `GearMotor` that are identified or known."""
+OF_LOSS = ("gear_efficiency", "stribeck_friction", "stribeck_speed", "stribeck_exponent")
+"""Fields of `GearMotor` that the simulation of a shaft has from a base where they are neither fitted nor known."""
 OF_FRICTION: dict[str, tuple[str, ...]] = {
     "coulomb": ("coulomb_friction", "viscous_friction"),
     "stribeck": ("coulomb_friction", "viscous_friction", "stribeck_friction", "stribeck_speed"),
