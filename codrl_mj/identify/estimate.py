@@ -286,7 +286,7 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
             costs[one] = refit(model, model.segments(late(one)), fit.values, 20, fit.scale).costs(fit.scale)
             on_step()
         best = min(costs, key=lambda one: costs[one].sum())
-        return best if clearly_better(costs[best], costs[0]) else 0
+        return best if _better(costs[best], costs[0]) else 0
 
     delay = measure(*DELAYS)
     while delay != 0 and delay in (min(costs), max(costs)) and abs(delay) < LONGEST:
@@ -296,8 +296,8 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
         whole = costs[delay]
         measure(delay - 0.5, delay + 0.5)
         half = min(delay - 0.5, delay + 0.5, key=lambda one: costs[one].sum())
-        delay = half if clearly_better(costs[half], whole) else delay
-        if delay == half or clearly_better(whole, costs[half]):
+        delay = half if _better(costs[half], whole) else delay
+        if delay == half or _better(whole, costs[half]):
             told = [dataclasses.replace(log, mean_voltage=True) for log in late(delay)]
     if delay != 0:
         segments = model.segments(told)
@@ -306,8 +306,8 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
     return dataclasses.replace(fit, logs=tuple(told), delay=delay, tried=tried)
 
 
-def clearly_better(these: np.ndarray, those: np.ndarray, share: float = BETTER) -> bool:
-    """Return True if costs of segments are below a share of others, by more than chance."""
+def _better(these: np.ndarray, those: np.ndarray) -> bool:
+    """Whether costs of segments are lower than others, by more than chance."""
     gained = those - these
     error = gained.std(ddof=1) / np.sqrt(len(gained)) if len(gained) > 1 else 0.0
-    return bool(these.sum() < share * those.sum() and gained.mean() > SURE * error)
+    return bool(these.sum() < BETTER * those.sum() and gained.mean() > SURE * error)

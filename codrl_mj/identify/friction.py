@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, clearly_better, refit, search
+from codrl_mj.identify.estimate import Fit, refit, search
 from codrl_mj.identify.log import SIGNALS, Log
 from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.result import predict
 
 LEAST_LOGS = 3  # Fewer logs give no standard deviation of what a richer friction gains on the one left out.
 _LOADED = {"coulomb": "load", "stribeck": "both"}
-_HINTED = 0.9  # An efficiency is hinted at where it takes the robust cost to less than this share,
+_HINTED = 0.9  # An efficiency is hinted at where it takes all cost, and half of the segments', to less than this share,
 _APART = 0.05  # and differs by more than this from the one that the fit took as known.
 
 
@@ -76,11 +76,12 @@ def load_hint(fit: Fit) -> str | None:
     loaded = dataclasses.replace(model, names=(*model.names, "gear_efficiency"), scales=np.append(model.scales, 0.1))
     known = model.defaults["gear_efficiency"]
     richer = refit(loaded, fit.segments, np.append(fit.values, min(known, 0.9)), 20, fit.scale)
-    costs, costs_before = richer.costs(fit.scale), fit.costs(fit.scale)
-    if abs(richer.values[-1] - known) <= _APART or not clearly_better(costs, costs_before, _HINTED):
+    costs, before = richer.costs(fit.scale), fit.costs(fit.scale)
+    left = max(costs.sum() / before.sum(), float(np.median(costs / before)))
+    if abs(richer.values[-1] - known) <= _APART or left > _HINTED:
         return None
     return (
         f"friction grows with the load: an efficiency of {richer.values[-1]:.2g} instead of {known:.2g} would take "
-        f"{1.0 - costs.sum() / costs_before.sum():.0%} off what is not explained; fit it by --friction "
+        f"{1.0 - left:.0%} off what is not explained; fit it by --friction "
         f"{_LOADED[model.friction]}"
     )

@@ -1,6 +1,5 @@
 """A geared motor of the catalogue, moved by MuJoCo, identified beside its datasheet, and played back by MuJoCo."""
 
-
 import mujoco
 import numpy as np
 import pytest
