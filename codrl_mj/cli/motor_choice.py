@@ -107,6 +107,7 @@ class Feasible:
 class Choose:
     """Rank motors for a task, the smallest that does it first, and say what is wrong with the others.
 
+    Exit status 1 if none does it.
     Motors of your own (files) or of the catalogue are named beside the task; without any the catalogue's are ranked.
     Each is taken at its best gear. It does the task if voltage, largest current and heat hold with the margin, its heat
     is known, and the rotor leaves half to the load; smallest means by the most mechanical power at its supply. A run
@@ -189,7 +190,8 @@ class Choose:
             }
             for name, choice in told
         ]
-        return 0, {"units": _UNITS, "demand": source, "ranking": content}
+        nothing_does_it = any(found[0].lacks for found in ranked.values())
+        return int(nothing_does_it), {"units": _UNITS, "demand": source, "ranking": content}
 
 
 _UNITS = {

@@ -1,7 +1,11 @@
 """Of motors that are drawn: what is said to be identified is within its interval, and what no log tells is not said."""
 
+import itertools
+
 import pytest
 
+from codrl_mj.identify import identify
+from codrl_mj.identify.result import USABLE
 from tests.identify import draws
 
 DRAWS = 2
@@ -26,3 +30,28 @@ def test_what_is_identified_is_within_its_interval(row):
         assert all(identified.values()), numbers
         assert not identified.keys() & set(SILENT[row])
         assert "R" in SILENT[row] or "R" in identified
+
+
+def narrower(one, other):
+    return one.high - one.low <= other.high - other.low
+
+
+@pytest.mark.matrix
+@pytest.mark.parametrize("draw", [0, 1])
+def test_a_column_or_a_log_more_turns_no_narrower_interval_into_a_refusal(draw):
+    """With an encoder of 64 steps, from voltage and position to the current beside them and to a second log."""
+    motor, known = draws.motor_of(draw), {"resistance": draws.motor_of(draw).resistance}
+    whole = [draws.logged(draw, kind, encoder=64) for kind in ("prbs", "square")]
+    fewer = [draws.only(log, "voltage", "position") for log in whole]
+    found = [identify(logs, "free", known, seed=draw) for logs in (fewer[:1], fewer, whole[:1], whole)]
+    for less, more in itertools.combinations(found, 2):
+        if (less, more) == (found[1], found[2]):
+            continue  # a log less and a column more
+        told = {one.name: one for one in less.estimates if one.status in USABLE}
+        taken = [one for one in more.estimates if one.name in told and one.status not in USABLE]
+        assert not [one for one in taken if narrower(one, told[one.name])]
+    for one in found:
+        named = {number.name: number for number in one.estimates}
+        for name in ("back_emf_constant", "inertia", "friction_torque"):
+            if named[name].status in USABLE:
+                assert named[name].low <= draws._truth(motor, named, name) <= named[name].high, named[name]
