@@ -9,14 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators.shaft import RATED_TEMPERATURE
 from codrl_mj.fields import check_names
 from codrl_mj.identify.estimate import Fit, fitted, refitted
 from codrl_mj.identify.friction import choose_friction, load_hint
 from codrl_mj.identify.log import SEGMENT, Log, moves, shifted
 from codrl_mj.identify.models import ShaftModel, WindingModel
-from codrl_mj.identify.parameters import DEFAULTS, ESTIMABLE, OF_LOSS, OF_RIG, PARAMETERS
-from codrl_mj.identify.result import Estimate, Identified, Prediction, fitted_traces, missing, motor_of, predict
+from codrl_mj.identify.parameters import DEFAULTS, ESTIMABLE, OF_LOSS, OF_RIG, OF_WINDING, PARAMETERS
+from codrl_mj.identify.result import (
+    MISUNDERSTOOD,
+    USABLE,
+    Estimate,
+    Identified,
+    Prediction,
+    fitted_traces,
+    missing,
+    motor_of,
+    predict,
+)
 from codrl_mj.identify.trust import correlations, judged
 
 INPUTS = "torque", "current", "voltage"  # what drives the shaft: the nearest to it that all logs that move have
@@ -83,11 +92,11 @@ def identify(
         shaft = _told(dataclasses.replace(shaft, known=given), parts.get("winding"))
         parts["shaft"] = refitted(parts["shaft"], shaft)
     estimates, warnings, unexplained = judged(parts, given, defaults, seed, step)
-    warnings = [*repeated, *warnings, *_contradictions(estimates, motor)]
+    warnings = [*warnings, *_contradictions(estimates, motor)]
     if "shaft" in parts and (hint := load_hint(parts["shaft"])):
         warnings.append(hint)
     volts = [log.signals[name] for log in logs for name in ("voltage", "bus") if log.has(name)]
-    return Identified(
+    found = Identified(
         logs=tuple(log.name for log in logs),
         rig=rig,
         friction=friction,
@@ -104,15 +113,62 @@ def identify(
         unexplained=unexplained,
         friction_reason=choice.reason if driven_by else "",
     )
+    if _is_better_blind(found, moving):
+        # The current must not take away what the voltage alone tells, for example at few rows in a time constant.
+        fewer = [_without_current(log) for log in logs]
+        arguments = rig, known, friction, held_out, estimated, segment, base, on_progress, seed
+        found = _joined(found, identify(fewer, *arguments))
+    return dataclasses.replace(found, warnings=(*repeated, *found.warnings))
+
+
+def _is_better_blind(found: Identified, moving: Sequence[Log]) -> bool:
+    """Return True if a shaft under the current has no constant, and might have one under the voltage."""
+    refused = any(one.name == "back_emf_constant" and one.status not in USABLE for one in found.estimates)
+    has_voltage = found.driven_by == "current" and all(log.has("voltage") for log in moving)
+    return refused and has_voltage and found.unexplained <= MISUNDERSTOOD
+
+
+def _without_current(log: Log) -> Log:
+    signals = {name: values for name, values in log.signals.items() if name != "current"}
+    return dataclasses.replace(log, signals=signals) if moves(log) else log
+
+
+def _joined(whole: Identified, blind: Identified) -> Identified:
+    """Return the shaft without the current beside the winding with it, if fewer numbers are refused that way."""
+    refused = [
+        sum(one.status not in USABLE and one.name != "inductance" for one in result.estimates)
+        for result in (whole, blind)
+    ]
+    if refused[1] >= refused[0]:
+        return whole
+    named = {one.name: one for one in (*whole.estimates, *blind.estimates)}
+    note = "the shaft is fitted under the voltage: under the current its back-EMF constant was refused"
+    return dataclasses.replace(
+        blind,
+        delays={**whole.delays, **blind.delays},
+        estimates=tuple(named[name] for name in PARAMETERS if name in named),
+        warnings=(note, *blind.warnings),
+        friction_reason=whole.friction_reason,
+        traces=(
+            *(one for one in whole.traces if one.part == "winding"),
+            *(one for one in blind.traces if one.part == "shaft"),
+        ),
+        correlations={"winding": whole.correlations["winding"], "shaft": blind.correlations["shaft"]},
+    )
 
 
 def _told(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
-    """The shaft, with the back-EMF constant for a torque constant that is not known: but for losses they are equal."""
+    """The shaft, with what it has of the winding where that is not known.
+
+    Under a current the back-EMF constant for a torque constant: but for losses they are equal; under a voltage the
+    resistance.
+    """
     numbers = shaft.known if winding is None else winding.model.all_values(winding.values)
-    constant = numbers.get("back_emf_constant", 0.0)
-    if shaft.driven_by != "current" or "torque_constant" in (*shaft.known, *shaft.estimated) or not constant > 0.0:
+    name, source = OF_WINDING.get(shaft.driven_by, ("", ""))
+    value = numbers.get(source, 0.0)
+    if name in (*shaft.known, *shaft.estimated) or not value > 0.0:
         return shaft
-    return dataclasses.replace(shaft, known={**shaft.known, "torque_constant": constant})
+    return dataclasses.replace(shaft, known={**shaft.known, name: value})
 
 
 def distinct(logs: Sequence[Log], held_out: Sequence[Log]) -> tuple[list[Log], list[Log], list[str]]:
@@ -156,25 +212,17 @@ def _content(log: Log) -> bytes:
 
 
 def _contradictions(estimates: Sequence[Estimate], motor: Any) -> list[str]:
-    """Return what the datasheet's motor says against the logs, or leaves open about them."""
+    """Return what the logs have against the datasheet's rotor, which is taken where no load's inertia was given."""
     named = {one.name: one for one in estimates}
-    told: list[str] = []
-    if motor is None:
-        return told
-    reflected = motor.rotor_inertia * motor.gear_ratio**2
-    if "rotor_inertia" not in named and "inertia" in named and reflected > named["inertia"].high:
-        told.append(
-            f"the motor's rotor_inertia = {motor.rotor_inertia:.4g} kg*m^2 is {reflected:.4g} at the output, but all "
-            f"that moves has {named['inertia'].value:.4g}: fit it by --known load_inertia=VALUE, or correct the --motor"
-        )
-    warm = motor.resistance_coefficient * (motor.ambient_temperature - RATED_TEMPERATURE)
-    if abs(warm) > 0.01 and named.get("resistance"):
-        told.append(
-            f"resistance counts as that at {RATED_TEMPERATURE:g} degC; the motor begins at ambient_temperature = "
-            f"{motor.ambient_temperature:g} degC with {1.0 + warm:.3g} times as much: if the logs are as warm as that, "
-            "divide by it"
-        )
-    return told
+    if motor is None or "rotor_inertia" in named or "inertia" not in named:
+        return []
+    reflected, whole = motor.rotor_inertia * motor.gear_ratio**2, named["inertia"]
+    if reflected <= whole.high:
+        return []
+    return [
+        f"the motor's rotor_inertia = {motor.rotor_inertia:.4g} kg*m^2 is {reflected:.4g} at the output, but all that "
+        f"moves has {whole.value:.4g}: fit it by --known load_inertia=VALUE, or correct the --motor"
+    ]
 
 
 def checked(

@@ -15,7 +15,7 @@ import numpy as np
 from codrl_mj.identify.estimate import Fit, refit
 from codrl_mj.identify.log import BLOCK, Log, halved, moves, replaced
 from codrl_mj.identify.models import ShaftModel, WindingModel
-from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS
+from codrl_mj.identify.parameters import DEFAULTS, FRICTION, OF_WINDING, PARAMETERS
 from codrl_mj.identify.result import MISUNDERSTOOD, USABLE, Estimate, Status
 
 LEAST_LOGS = 5  # from so many logs on whole logs are resampled; below, blocks of them
@@ -44,7 +44,7 @@ CAUSES = {
     "half_rate": "every second row tells another value",
     "self_test": "a fit to its own simulation does not find it again",
     "unexplained": "the current is not explained",
-    "torque_constant": "the torque constant is not known better",
+    "torque_constant": "the winding's constant that it follows from is not known better",
 }
 """What widens an interval, in words."""
 AT_BOUND = 1e-3  # nearer to a bound, in the parameter's scale, a value is at it
@@ -69,9 +69,10 @@ def judged(
     unlike: dict[str, float] = {}
     for name, fit in parts.items():
         found, known = _of_part(fit, seed, step(name)), fit.model.known
-        if "torque_constant" in known and "torque_constant" not in given:  # it is the back-EMF constant
-            constant = [one for one in estimates if one.name == "back_emf_constant"]
-            found = _with_constant(found, constant[0], known) if constant else found
+        for taken, source in OF_WINDING.values():
+            if taken in known and taken not in given:
+                constant = [one for one in estimates if one.name == source]
+                found = _with_constant(found, constant[0], known) if constant else found
         estimates += found
         warnings += _warnings(fit, unlike)
     completed, unexplained = _completed(estimates, given, defaults), max(unlike.values(), default=0.0)
@@ -160,17 +161,18 @@ def _verdict(
 
 
 def _with_constant(found: list[Estimate], constant: Estimate, known: Mapping[str, float]) -> list[Estimate]:
-    """Estimates of a shaft under a current whose torque constant was itself found: they are no better than that."""
+    """Estimates of a shaft with a constant of the winding that was itself found: they are no better than that."""
     made: list[Estimate] = []
     relative = max(constant.high - constant.value, constant.value - constant.low) / max(constant.value, 1e-12)
     anchored = "mgl" in known or "inertia" in known
     for one in found:
-        own = one.value * relative if one.name not in ("gear_efficiency", "stribeck_speed") and not anchored else 0.0
+        fixed = one.name in ("gear_efficiency", "stribeck_speed") or (anchored and one.name != "torque_constant")
+        own = 0.0 if fixed else one.value * relative
         low = max(one.value - math.hypot(one.value - one.low, own), PARAMETERS[one.name].least)
         high = min(one.value + math.hypot(one.high - one.value, own), PARAMETERS[one.name].most)
         one = dataclasses.replace(one, low=low, high=high, causes={**one.causes, "torque_constant": own})
         if one.status in ("identified", "rough") and constant.status not in USABLE:
-            why = f"the torque constant that it is in proportion to is {constant.status}"
+            why = f"the {constant.name.replace('_', ' ')} that it follows from is {constant.status}"
             one = dataclasses.replace(one, status="refused", why=why)
         made.append(one)
     return _rejudged(made)

@@ -55,3 +55,31 @@ def test_a_column_or_a_log_more_turns_no_narrower_interval_into_a_refusal(draw):
         for name in ("back_emf_constant", "inertia", "friction_torque"):
             if named[name].status in USABLE:
                 assert named[name].low <= draws._truth(motor, named, name) <= named[name].high, named[name]
+
+
+@pytest.mark.matrix
+def test_a_current_does_not_take_away_what_the_voltage_alone_tells():
+    """At 1 kHz, 2 to 3 rows in L/R, the current tells no back-EMF constant: it was refused with all that follows."""
+    motor, log = draws.motor_of(0), draws.logged(0, rate=1000.0, encoder=64)
+    known = {"resistance": motor.resistance, "viscous_friction": motor.viscous_friction, "load_inertia": 0.0}
+    fewer = identify([draws.only(log, "voltage", "position")], "free", known)
+    more = identify([log], "free", known)
+    for name in ("back_emf_constant", "torque_constant", "rotor_inertia", "coulomb_friction"):
+        assert fewer[name] == more[name]
+        assert more[name].status in USABLE
+        truth = draws._truth(motor, {}, "coulomb_friction" if name == "coulomb_friction" else name)
+        assert more[name].low <= truth <= more[name].high
+    assert {one.part for one in more.traces} == {"winding", "shaft"}
+    assert any("fitted under the voltage" in text for text in more.warnings)
+
+
+@pytest.mark.matrix
+def test_a_moving_log_without_current_does_not_take_away_what_a_locked_one_tells():
+    """The shaft under the voltage takes the resistance from the winding, and does not fit another one."""
+    motor, locked = draws.motor_of(1), draws.logged(1, "locked_prbs")
+    moving = draws.only(draws.logged(1, "square"), "voltage", "position")
+    alone, both = identify([locked]), identify([locked, moving], "free", {"load_inertia": 0.0})
+    assert alone["resistance"] == both["resistance"]
+    for name in ("resistance", "torque_constant", "rotor_inertia"):
+        assert both[name].low <= getattr(motor, name) <= both[name].high
+        assert both[name].status in USABLE
