@@ -39,8 +39,9 @@ class Identify:
 
     Voltage and current tell the winding; torque, current or voltage, and a position or velocity, tell inertia, load and
     friction. The folder gets actuator.yaml, which --actuator takes, result.json and report.html; --env.randomize
-    identified then draws within the intervals. What was not identified is refused until it is given with --known.
-    Before that: codrl-mj identify check, plan and simulate. docs/identify.md has more.
+    identified then draws within the intervals. What was not identified is refused until it is given with --known: the
+    exit status is 1 then, and there is no actuator.yaml. Before that: codrl-mj identify check, plan and simulate.
+    docs/identify.md has more.
 
     Example: codrl-mj identify swing1.csv swing2.csv --columns time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad
     --rig pendulum --known mgl=2.81 --friction auto --holdout swing3.csv --out motor
@@ -77,6 +78,7 @@ class Identify:
         from codrl_mj.drives import find_drive
         from codrl_mj.identify.identify import checked, foreseen, identify
         from codrl_mj.identify.reading import read_log
+        from codrl_mj.identify.result import ACTUATOR
 
         logs, held_out = ([read_log(path, self.columns) for path in paths] for paths in (self.logs, self.holdout))
         known = named_numbers("--known", self.known, "mgl=2.81, in SI units")
@@ -100,7 +102,10 @@ class Identify:
                 lambda what, done, total: bar.update(row, description=f"fitting: {what}", completed=done, total=total),
             )
         print_identified(found)
+        problem = found.problem()
         if self.out is not None:
+            if problem is not None and (self.out / ACTUATOR).exists():
+                print(f"removed {self.out / ACTUATOR}: it was an earlier fit's, and this one has no actuator")
             for path in found.write(self.out):
                 print(f"wrote {path}")
             page = self.out / "report.html"
@@ -111,7 +116,8 @@ class Identify:
                 print(f"wrote {page}")
             except ModuleNotFoundError as error:
                 print(f"no {page}: {error}; pages need the extra 'validate': pip install 'codrl-mj[validate]'")
-        return 0, found.as_mapping() | {"units": {one.name: one.unit for one in found.estimates}}
+        units = {one.name: one.unit for one in found.estimates}
+        return int(problem is not None), found.as_mapping() | {"units": units}
 
     def _check(self, logs: list[Any], held_out: list[Any], base: Any) -> list[Any]:
         """Print what is wrong with the logs; returns those held out that have no errors."""
@@ -159,7 +165,7 @@ def print_identified(found: Any) -> None:
         if late:
             say(f"{part}: the input is late by {late} row{'s' if abs(late) > 1 else ''}, which is allowed for")
     say(*(f"warning: {text}" for text in found.warnings), style="yellow")
-    say(found.supply_text)
+    say(found.friction_reason, found.supply_text or "", found.base_text or "")
     if problem := found.problem():
         say(f"not to be used as an actuator: {problem}", style="yellow")
 

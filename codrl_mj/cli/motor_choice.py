@@ -106,6 +106,7 @@ class Feasible:
 class Choose:
     """Rank motors for a task, the smallest that does it first, and say what is wrong with the others.
 
+    Exit status 1 if none does it.
     Motors of your own (files) or of the catalogue are named beside the task; without any the catalogue's are ranked.
     Each keeps the gear of its datasheet, gets its best one if it has none, or is judged with each of --gears. It does
     the task if motor feasible says surely, with the margin; smallest means by the most mechanical power at its supply.
@@ -198,7 +199,8 @@ class Choose:
             }
             for name, choice in told
         ]
-        return 0, {"units": _UNITS, "demand": source, "ranking": content}
+        nothing_does_it = any(found[0].lacks for found in ranked.values())
+        return int(nothing_does_it), {"units": _UNITS, "demand": source, "ranking": content}
 
 
 _UNITS = {

@@ -33,6 +33,8 @@ class Model(abc.ABC):
     driven_by: str  # signal of a log
     output: str  # signal that a simulation is compared with
     known: Mapping[str, float]  # values of parameters that are not fitted
+    defaults: Mapping[str, float] = dataclasses.field(default_factory=lambda: DEFAULTS)
+    """Values of parameters that are neither fitted nor known."""
     names: tuple[str, ...] = ()  # free parameters; none before `begun`
     scales: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(0))
     """What a change of each is measured by, > 0, shape (p,)."""
@@ -46,7 +48,7 @@ class Model(abc.ABC):
 
     def all_values(self, values: np.ndarray) -> dict[str, float]:
         """Free and known parameters by name."""
-        return {**DEFAULTS, **self.known, **dict(zip(self.names, map(float, values), strict=True))}
+        return {**self.defaults, **self.known, **dict(zip(self.names, map(float, values), strict=True))}
 
     @abc.abstractmethod
     def segments(self, logs: Sequence[Log]) -> list[Segment]:

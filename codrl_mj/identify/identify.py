@@ -1,6 +1,7 @@
 """From logs to a motor: which parts can be fitted, what is found, and how far it may be trusted."""
 
 import dataclasses
+import hashlib
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -9,11 +10,22 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.fields import check_names
-from codrl_mj.identify.estimate import Fit, fitted, refit, refitted, search
+from codrl_mj.identify.estimate import Fit, fitted, refitted
+from codrl_mj.identify.friction import choose_friction, load_hint
 from codrl_mj.identify.log import SEGMENT, Log, moves, shifted
 from codrl_mj.identify.models import ShaftModel, WindingModel
-from codrl_mj.identify.parameters import ESTIMABLE, OF_RIG, PARAMETERS
-from codrl_mj.identify.result import Identified, Prediction, fitted_traces, missing, predict
+from codrl_mj.identify.parameters import DEFAULTS, ESTIMABLE, OF_LOSS, OF_RIG, OF_WINDING, PARAMETERS
+from codrl_mj.identify.result import (
+    MISUNDERSTOOD,
+    USABLE,
+    Estimate,
+    Identified,
+    Prediction,
+    fitted_traces,
+    missing,
+    motor_of,
+    predict,
+)
 from codrl_mj.identify.trust import correlations, judged
 
 INPUTS = "torque", "current", "voltage"  # what drives the shaft: the nearest to it that all logs that move have
@@ -54,7 +66,9 @@ def identify(
     Raises:
         ValueError: unknown names, values out of bounds, or logs that tell nothing; the message says what is missing.
     """
-    given = checked(logs, rig, known or {}, friction, estimated, segment, base)
+    logs, held_out, repeated = distinct(logs, held_out)
+    given, motor = checked(logs, rig, known or {}, friction, estimated, segment, base), motor_of(base)
+    defaults = DEFAULTS | {name: getattr(motor, name) for name in OF_LOSS if motor is not None}
     rig = rig or ("pendulum" if "mgl" in given else "free")
     electrical, moving, driven_by, output = _uses(logs)
     total = STEPS_OF_A_PART * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (friction == "auto")
@@ -69,17 +83,20 @@ def identify(
         parts["winding"] = fitted(WindingModel(known=given), electrical, step("winding"))
     if driven_by:
         shaft = ShaftModel(rig=rig, friction="coulomb", driven_by=driven_by, output=output, known=given,
-                           estimated=tuple(estimated), segment=segment)  # fmt: skip
-        shaft = with_friction(_told(shaft, parts.get("winding")), moving, friction, step("friction"))
-        friction = shaft.friction
+                           defaults=defaults, estimated=tuple(estimated), segment=segment)  # fmt: skip
+        choice = choose_friction(_told(shaft, parts.get("winding")), moving, friction, step("friction"))
+        shaft, friction = choice.model, choice.model.friction
         parts["shaft"] = fitted(shaft, moving, step("shaft"))
         if electrical and driven_by != "voltage":
             parts["winding"] = refitted(parts["winding"], WindingModel(known=given, shaft=parts["shaft"]))
         shaft = _told(dataclasses.replace(shaft, known=given), parts.get("winding"))
         parts["shaft"] = refitted(parts["shaft"], shaft)
-    estimates, warnings, unexplained = judged(parts, given, seed, step)
+    estimates, warnings, unexplained = judged(parts, given, defaults, seed, step)
+    warnings = [*warnings, *_contradictions(estimates, motor)]
+    if "shaft" in parts and (hint := load_hint(parts["shaft"])):
+        warnings.append(hint)
     volts = [log.signals[name] for log in logs for name in ("voltage", "bus") if log.has(name)]
-    return Identified(
+    found = Identified(
         logs=tuple(log.name for log in logs),
         rig=rig,
         friction=friction,
@@ -94,16 +111,118 @@ def identify(
         correlations={name: correlations(parts[name]) if name in parts else {} for name in ("winding", "shaft")},
         supply=max((float(np.abs(one).max()) for one in volts), default=None),
         unexplained=unexplained,
+        friction_reason=choice.reason if driven_by else "",
+    )
+    if _is_better_blind(found, moving):
+        # The current must not take away what the voltage alone tells, for example at few rows in a time constant.
+        fewer = [_without_current(log) for log in logs]
+        arguments = rig, known, friction, held_out, estimated, segment, base, on_progress, seed
+        found = _joined(found, identify(fewer, *arguments))
+    return dataclasses.replace(found, warnings=(*repeated, *found.warnings))
+
+
+def _is_better_blind(found: Identified, moving: Sequence[Log]) -> bool:
+    """Return True if a shaft under the current has no constant, and might have one under the voltage."""
+    refused = any(one.name == "back_emf_constant" and one.status not in USABLE for one in found.estimates)
+    has_voltage = found.driven_by == "current" and all(log.has("voltage") for log in moving)
+    return refused and has_voltage and found.unexplained <= MISUNDERSTOOD
+
+
+def _without_current(log: Log) -> Log:
+    signals = {name: values for name, values in log.signals.items() if name != "current"}
+    return dataclasses.replace(log, signals=signals) if moves(log) else log
+
+
+def _joined(whole: Identified, blind: Identified) -> Identified:
+    """Return the shaft without the current beside the winding with it, if fewer numbers are refused that way."""
+    refused = [
+        sum(one.status not in USABLE and one.name != "inductance" for one in result.estimates)
+        for result in (whole, blind)
+    ]
+    if refused[1] >= refused[0]:
+        return whole
+    named = {one.name: one for one in (*whole.estimates, *blind.estimates)}
+    note = "the shaft is fitted under the voltage: under the current its back-EMF constant was refused"
+    return dataclasses.replace(
+        blind,
+        delays={**whole.delays, **blind.delays},
+        estimates=tuple(named[name] for name in PARAMETERS if name in named),
+        warnings=(note, *blind.warnings),
+        friction_reason=whole.friction_reason,
+        traces=(
+            *(one for one in whole.traces if one.part == "winding"),
+            *(one for one in blind.traces if one.part == "shaft"),
+        ),
+        correlations={"winding": whole.correlations["winding"], "shaft": blind.correlations["shaft"]},
     )
 
 
 def _told(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
-    """The shaft, with the back-EMF constant for a torque constant that is not known: but for losses they are equal."""
+    """The shaft, with what it has of the winding where that is not known.
+
+    Under a current the back-EMF constant for a torque constant: but for losses they are equal; under a voltage the
+    resistance.
+    """
     numbers = shaft.known if winding is None else winding.model.all_values(winding.values)
-    constant = numbers.get("back_emf_constant", 0.0)
-    if shaft.driven_by != "current" or "torque_constant" in (*shaft.known, *shaft.estimated) or not constant > 0.0:
+    name, source = OF_WINDING.get(shaft.driven_by, ("", ""))
+    value = numbers.get(source, 0.0)
+    if name in (*shaft.known, *shaft.estimated) or not value > 0.0:
         return shaft
-    return dataclasses.replace(shaft, known={**shaft.known, "torque_constant": constant})
+    return dataclasses.replace(shaft, known={**shaft.known, name: value})
+
+
+def distinct(logs: Sequence[Log], held_out: Sequence[Log]) -> tuple[list[Log], list[Log], list[str]]:
+    """Return the logs to fit and the logs held out, each measurement once, and a sentence for each one left out.
+
+    A measurement is recognized by its content, because copies have other names. One that is fitted and held out is
+    held out.
+    """
+    fitted: dict[bytes, Log] = {}
+    predicted: dict[bytes, Log] = {}
+    repeated = []
+    for several, kept in ((held_out, predicted), (logs, fitted)):
+        for log in several:
+            key = _content(log)
+            twin = predicted.get(key) or fitted.get(key)
+            if twin is None:
+                kept[key] = log
+                continue
+            copy = "" if twin.name == log.name else f", as {twin.name}"
+            is_predicted = kept is fitted and key in predicted
+            told = (
+                f"held out{copy}: it is only predicted, not fitted"
+                if is_predicted
+                else f"there twice{copy}: it counts once"
+            )
+            repeated.append(f"log {log.name} is {told}")
+    if logs and not fitted:
+        raise ValueError(
+            f"logs {', '.join(log.name for log in logs)}: all are held out, too, so none is left to fit; hold out "
+            "others (--holdout on the command line, held_out= in Python)"
+        )
+    return [*fitted.values()], [*predicted.values()], repeated
+
+
+def _content(log: Log) -> bytes:
+    """Return a digest of a log's signals, whatever its name and its times, which may begin anywhere."""
+    digest = hashlib.sha256()
+    for name in sorted(log.signals):
+        digest.update(name.encode() + log.signals[name].tobytes())
+    return digest.digest()
+
+
+def _contradictions(estimates: Sequence[Estimate], motor: Any) -> list[str]:
+    """Return what the logs have against the datasheet's rotor, which is taken where no load's inertia was given."""
+    named = {one.name: one for one in estimates}
+    if motor is None or "rotor_inertia" in named or "inertia" not in named:
+        return []
+    reflected, whole = motor.rotor_inertia * motor.gear_ratio**2, named["inertia"]
+    if reflected <= whole.high:
+        return []
+    return [
+        f"the motor's rotor_inertia = {motor.rotor_inertia:.4g} kg*m^2 is {reflected:.4g} at the output, but all that "
+        f"moves has {whole.value:.4g}: fit it by --known load_inertia=VALUE, or correct the --motor"
+    ]
 
 
 def checked(
@@ -116,11 +235,9 @@ def checked(
     base: Mapping[str, Any] | None = None,
 ) -> dict[str, float]:
     """What is known, the gear of the base too, if the arguments of `identify` are such as it takes."""
-    from codrl_mj.actuators import Drive, actuator_from_mapping
-
-    drive = None if base is None else actuator_from_mapping(base)
+    motor = motor_of(base)
     # of a motor with a gear that too: otherwise its numbers would be those of the output
-    ratio = drive.motor.gear_ratio if isinstance(drive, Drive) else 1.0
+    ratio = 1.0 if motor is None else motor.gear_ratio
     known = {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **(known or {})}
     electrical, moving, driven_by, output = _uses(logs)
     if not segment >= 0.05:
@@ -176,6 +293,7 @@ def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str,
         names |= constants
     if "load_inertia" in known and driven_by is not None:
         names |= {"rotor_inertia"}
+    names |= set() if driven_by is None else {"inertia"}
     return missing(names, base)
 
 
@@ -196,35 +314,3 @@ def _foretold(shaft: Fit | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
     driven_by, output = shaft.model.driven_by, shaft.model.output
     told = [log for log in logs if moves(log) and log.has(driven_by, output)]
     return tuple(predict(shaft, shifted(log, driven_by, shaft.delay)) for log in told)
-
-
-def foretold(model: ShaftModel, logs: Sequence[Log], on_step: Callable[[], None]) -> np.ndarray:
-    """Mean absolute error on each log of the fit to all others, from that to all, shape (n,)."""
-    segments = model.segments(logs)
-    model, starts = model.begun(segments)
-    whole, errors = search(model, segments, starts[:2])[0].values, []
-    for place, log in enumerate(logs):
-        found = predict(refit(model, model.segments([*logs[:place], *logs[place + 1 :]]), whole, 12), log)
-        errors.append(found.open_loop if found.closed_loop is None else found.closed_loop)
-        on_step()
-    return np.array(errors)
-
-
-def with_friction(model: ShaftModel, logs: Sequence[Log], wanted: str, on_step: Callable[[], None]) -> ShaftModel:
-    """The model with the friction that is wanted or, for `auto`, with what leaving out one log at a time speaks for.
-
-    More than viscous and Coulomb friction is kept where the errors on the logs left out fall by more, in the mean, than
-    two standard deviations of that mean. With fewer than three logs none is.
-    """
-    if wanted != "auto":
-        return dataclasses.replace(model, friction=wanted)
-    if len(logs) < 3:
-        return model
-    best, least = model, foretold(model, logs, on_step)
-    for friction in ("load", "stribeck", "both"):
-        tried = dataclasses.replace(model, friction=friction)
-        errors = foretold(tried, logs, on_step)
-        gained = least - errors
-        if gained.mean() > 2.0 * gained.std(ddof=1) / np.sqrt(len(gained)):
-            best, least = tried, errors
-    return best

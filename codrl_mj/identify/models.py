@@ -24,7 +24,7 @@ from codrl_mj.identify.log import (
     usable,
     without_spikes,
 )
-from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
+from codrl_mj.identify.parameters import ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,7 +66,7 @@ class WindingModel(Model):
         """
         moving = any(np.any(segment.speeds) for segment in segments)
         free = tuple(name for name in ELECTRICAL if name not in self.known and (moving or name != "back_emf_constant"))
-        given = {**DEFAULTS, "back_emf_constant": 0.0, **self.known}
+        given = {**self.defaults, "back_emf_constant": 0.0, **self.known}
         starts = []
         for count in (2, 8, 32):  # rows of a window
             rows = []
@@ -205,7 +205,7 @@ class ShaftModel(Model):
         firsts = []
         for window in (0.02, 0.004):
             factors, drive, speed = _shaft_regression(segments, self.rig, self.output, window)
-            firsts.append(_shaft_start(factors, drive, speed, driven_by, known))
+            firsts.append(_shaft_start(factors, drive, speed, driven_by, {**self.defaults, **known}, known))
         start, floors = firsts[0]
         scales = np.array(
             [floors[name] if name in FRICTION else max(abs(start[name]), floors.get(name, 1e-9)) for name in free]
@@ -219,10 +219,14 @@ class ShaftModel(Model):
 
 
 def _shaft_start(
-    factors: Mapping[str, float], drive: float, speed: float, driven_by: str, known: Mapping[str, float]
+    factors: Mapping[str, float],
+    drive: float,
+    speed: float,
+    driven_by: str,
+    given: Mapping[str, float],
+    known: Mapping[str, float],
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Every parameter of a shaft by the factors that its input was regressed by, and sizes that matter of some."""
-    given = {**DEFAULTS, **known}
     ratio = given["gear_ratio"]
     # torque at the output for one of the input, where that is not known
     gain, braking, resistance = given["torque_gain"], 0.0, given.get("resistance", 1.0)

@@ -19,7 +19,7 @@ from codrl_mj.fields import Checked, choice, real
 from codrl_mj.identify.estimate import Model, refit
 from codrl_mj.identify.log import Log, Segment
 from codrl_mj.identify.models import ShaftModel, WindingModel
-from codrl_mj.identify.parameters import ELECTRICAL, PARAMETERS
+from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, OF_LOSS, PARAMETERS
 from codrl_mj.identify.synthetic import EXCITATIONS, FREE, Excitation, Load, Sampler, run, sample_times, simulate
 from codrl_mj.runs.files import writing
 
@@ -98,7 +98,7 @@ def plan(
             raise ValueError(f"{name} = {value!r}: must be above 0 A; leave it out if there is no limit")
     motor, fastest = drive.motor, drive.controller.sample_rate
     rates = [rate for rate in RATES if rate <= fastest] or [fastest]
-    truth = {**vars(motor), "inertia": motor.rotor_inertia + load.inertia / motor.gear_ratio**2}
+    truth = {**vars(motor), "inertia": motor.rotor_inertia * motor.gear_ratio**2 + load.inertia}
     options = [
         _option(drive, kind, rate, duration, load, sensing or Sensing(), (limit, continuous_current), truth)
         for kind in EXCITATIONS
@@ -169,9 +169,9 @@ def _expected(truth: Mapping[str, float], load: Load, sensing: Sensing, log: Log
     known = {name: truth[name] for name in PARAMETERS if name in truth and name not in ("inertia", "rotor_inertia")}
     known |= {"mgl": load.gravity, "constant_torque": load.against}
     known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
-    shaft = ShaftModel(
-        rig="free", friction="coulomb", driven_by="current", output="position", known=known, segment=_SEGMENT
-    )
+    losses = {name: truth[name] for name in OF_LOSS}
+    shaft = ShaftModel(rig="free", friction="coulomb", driven_by="current", output="position", known=known,
+                       defaults=DEFAULTS | losses, segment=_SEGMENT)  # fmt: skip
     by_position = _errors(truth, shaft, shaft.segments([log]), 2.0 * math.pi / sensing.encoder / math.sqrt(12.0))
     constant = errors.get("back_emf_constant", 0.0)
     return errors | {name: math.hypot(error, constant) for name, error in by_position.items()}

@@ -10,7 +10,7 @@ import numpy as np
 
 from codrl_mj.identify.estimate import Fit, settled_state
 from codrl_mj.identify.log import Log, Segment, initial_state, usable
-from codrl_mj.identify.parameters import OF_MOTOR, PARAMETERS
+from codrl_mj.identify.parameters import DEFAULTS, OF_MOTOR, PARAMETERS
 from codrl_mj.runs.files import write_json, writing
 
 Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]
@@ -21,8 +21,23 @@ HORIZON = 0.5  # time [s] that is foretold at once,
 KNOWN = 0.03  # from where and how fast the shaft was in its first so many [s], five rows at least
 
 
-def missing(names: Collection[str], base: object) -> str | None:
+def motor_of(base: Mapping[str, Any] | None) -> Any:
+    """Return the `GearMotor` of a drive's mapping; None if it has none."""
+    from codrl_mj.actuators import Drive, actuator_from_mapping
+
+    drive = None if base is None else actuator_from_mapping(base)
+    return drive.motor if isinstance(drive, Drive) else None
+
+
+def missing(names: Collection[str], base: Mapping[str, Any] | None) -> str | None:
     """Which numbers of a motor are neither among these nor in a base, and what to do; None: none."""
+    motor = motor_of(base)
+    if motor is not None and motor.rotor_inertia == 0.0 and "inertia" in names and "rotor_inertia" not in names:
+        return (
+            "rotor_inertia is unknown (0) in the datasheet, and the logs tell the inertia of all that moves. Give what "
+            "is not the motor's, at the output: --known load_inertia=VALUE; or --known rotor_inertia=0 if the model "
+            "that you train in has all of it"
+        )
     needed = ("resistance", "inductance", "torque_constant", "back_emf_constant", "rotor_inertia")
     lacking = [name for name in needed if name not in names]
     if not lacking or base is not None:
@@ -179,6 +194,8 @@ class Identified:
     """Largest voltage [V] of the supply, or at the terminals, that the logs have; None: they have none."""
     unexplained: float = 0.0
     """Largest share of what moves in a log that the fit leaves unexplained, if that is more than sensors do."""
+    friction_reason: str = ""
+    """Why `friction` was chosen; empty if it was asked for."""
 
     def __getitem__(self, name: str) -> Estimate:
         """A parameter by its name."""
@@ -189,16 +206,16 @@ class Identified:
 
     def problem(self) -> str | None:
         """What stands against an actuator of these numbers, with a remedy; None: nothing."""
+        if self.unexplained > MISUNDERSTOOD:
+            return (
+                f"the fit leaves {self.unexplained:.0%} of what moves in a log unexplained, so that numbers mean "
+                "little. Correct the columns, their units and signs, or the rig: codrl-mj identify check"
+            )
         bad = [one for one in self.estimates if one.name in OF_MOTOR and one.status not in USABLE]
         alike: dict[str, list[str]] = {}
         for one in bad:
             alike.setdefault(f"{one.status}: {one.why}", []).append(one.name)
         told = "; ".join(f"{', '.join(s)} {'is' if len(s) == 1 else 'are'} {why}" for why, s in alike.items())
-        if bad and self.unexplained > MISUNDERSTOOD:
-            return (
-                f"the fit leaves {self.unexplained:.0%} of what moves in a log unexplained, so that numbers mean "
-                f"little ({told}). Correct the columns, their units and signs, or the rig: codrl-mj identify check"
-            )
         if bad:
             them = "it" if len(bad) == 1 else "them"
             return f"{told}. Give {them} with --known {' '.join(f'{one.name}=VALUE' for one in bad)}"
@@ -215,6 +232,16 @@ class Identified:
         elif self.supply is not None:
             of = f"the largest of the logs; no current limit: set controller.max_current in {ACTUATOR}"
         return f"supply {volts:.4g} V: {of}"
+
+    @property
+    def base_text(self) -> str | None:
+        """The numbers of the actuator that are the base's and not of the logs; None without a base or an actuator."""
+        motor = motor_of(self.base)
+        if motor is None or self.problem() is not None:
+            return None
+        own = {*DEFAULTS, *(one.name for one in self.estimates)}
+        told = [f"{name} = {getattr(motor, name):.4g} {PARAMETERS[name].unit}" for name in OF_MOTOR if name not in own]
+        return f"not from these logs but the motor's, by --motor: {', '.join(map(str.strip, told))}" if told else None
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """Field of a drive -> interval, of what is used and is not a point."""
@@ -241,30 +268,32 @@ class Identified:
 
     def as_mapping(self) -> dict[str, Any]:
         """As JSON-serialisable values."""
-        found = dataclasses.asdict(self) | {"problem": self.problem(), "supply_text": self.supply_text}
+        found = dataclasses.asdict(self) | {"problem": self.problem()}
+        found |= {"supply_text": self.supply_text, "base_text": self.base_text}
         del found["traces"]
         for one in (*found["fitted"], *found["held_out"]):
             del one["trace"]
         return found
 
     def write(self, folder: Path) -> list[Path]:
-        """Write actuator.yaml and result.json into a folder, whole or not at all.
+        """Write result.json and, without a problem, actuator.yaml into a folder, whole or not at all.
 
-        The actuator's file has a drive's fields and `identified`: their intervals; or that alone, with the problem.
+        The actuator's file has a drive's fields and `identified`: their intervals. With a problem, an actuator.yaml of
+        an earlier fit is removed, because it would be taken for this one's.
 
         Returns:
-            Their paths.
+            The paths of the files written.
         """
         import yaml
 
         actuator, result = folder / ACTUATOR, folder / "result.json"
-        section: dict[str, Any] = {"logs": list(self.logs)}
-        if problem := self.problem():
-            content = {"identified": section | {"problem": problem}}
-        else:
-            intervals = {name: list(ends) for name, ends in self.intervals().items()}
-            content = {**self.actuator().as_mapping(), "identified": section | {"intervals": intervals}}
+        write_json(result, self.as_mapping())
+        if self.problem():
+            actuator.unlink(missing_ok=True)
+            return [result]
+        intervals = {name: list(ends) for name, ends in self.intervals().items()}
+        section: dict[str, Any] = {"logs": list(self.logs), "intervals": intervals}
+        content = {**self.actuator().as_mapping(), "identified": section}
         with writing(actuator) as temporary:
             temporary.write_text(yaml.safe_dump(content, sort_keys=False))
-        write_json(result, self.as_mapping())
         return [actuator, result]

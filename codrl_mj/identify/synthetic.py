@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from codrl_mj.actuators import Drive
+from codrl_mj.actuators.shaft import resistance_at
 from codrl_mj.fields import Checked, check_names, real
 from codrl_mj.identify.columns import KINDS
 from codrl_mj.identify.log import Log
@@ -151,7 +152,8 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
         excitation = excitation.voltage(sample_times(drive, excitation.duration))
     commanded = np.clip(excitation, -limit, limit)
     shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
-    winding = motor.resistance, motor.inductance, motor.back_emf_constant * motor.gear_ratio
+    resistance = resistance_at(motor, motor.ambient_temperature)
+    winding = resistance, motor.inductance, motor.back_emf_constant * motor.gear_ratio
     inertia = motor.rotor_inertia * motor.gear_ratio**2 + load.inertia
     if not inertia > 0.0 and not locked:
         raise ValueError(

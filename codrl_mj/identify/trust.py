@@ -15,8 +15,8 @@ import numpy as np
 from codrl_mj.identify.estimate import Fit, refit
 from codrl_mj.identify.log import BLOCK, Log, halved, moves, replaced
 from codrl_mj.identify.models import ShaftModel, WindingModel
-from codrl_mj.identify.parameters import DEFAULTS, FRICTION, PARAMETERS
-from codrl_mj.identify.result import Estimate, Status
+from codrl_mj.identify.parameters import DEFAULTS, FRICTION, OF_WINDING, PARAMETERS
+from codrl_mj.identify.result import MISUNDERSTOOD, USABLE, Estimate, Status
 
 LEAST_LOGS = 5  # from so many logs on whole logs are resampled; below, blocks of them
 DRAWS = 500
@@ -28,14 +28,15 @@ UNKNOWN = 0.5  # a direction in which the parameters may go by so much of themse
 PART = 0.1  # share of such a direction from which a parameter belongs to it
 WIDEST = 0.3
 """An interval of more than this share of the value to either side is too wide; of the whole friction, for friction."""
-WIDEST_OF = {"resistance": 0.05, "back_emf_constant": 0.05, "inductance": 0.15}  # for what a current sensor tells
+NARROW_OF = {"resistance": 0.05, "back_emf_constant": 0.05, "torque_constant": 0.05, "inductance": 0.15}
+"""A wider interval of these makes them rough, whichever logs they are from; all else up to `WIDEST` is identified."""
 NARROWEST = 0.002
 """No interval is narrower than this share of the value to either side: nobody's sensors are better calibrated."""
 NARROWEST_OF = {"inductance": 0.02}
 """What comes of a fifth of a row's time: neither stamps nor a held back-EMF are better."""
 NARROW = 0.1
 """Friction whose interval is a larger share of itself is a rough number: what is sure is how much of all it may be."""
-BIASED = 0.5  # the self-test fails where it is off by more than this share of the widest interval
+BIASED = 0.5  # an interval is too wide because of the self-test where that is off by more than this share of the widest
 CAUSES = {
     "curvature": "the logs hardly depend on it",
     "resampling": "parts of the logs disagree",
@@ -43,7 +44,7 @@ CAUSES = {
     "half_rate": "every second row tells another value",
     "self_test": "a fit to its own simulation does not find it again",
     "unexplained": "the current is not explained",
-    "torque_constant": "the torque constant is not known better",
+    "torque_constant": "the winding's constant that it follows from is not known better",
 }
 """What widens an interval, in words."""
 AT_BOUND = 1e-3  # nearer to a bound, in the parameter's scale, a value is at it
@@ -53,20 +54,34 @@ UNLIKE = 0.02
 
 
 def judged(
-    parts: Mapping[str, Fit], given: Mapping[str, float], seed: int, step: Callable[[str], Any]
+    parts: Mapping[str, Fit],
+    given: Mapping[str, float],
+    defaults: Mapping[str, float],
+    seed: int,
+    step: Callable[[str], Any],
 ) -> tuple[list[Estimate], list[str], float]:
-    """Every number that was found, given or follows, warnings, and the largest share of a log that is not explained."""
+    """Every number that was found, given or follows, warnings, and the largest share of a log that is not explained.
+
+    Where that share is over `MISUNDERSTOOD`, it is not single numbers that are amiss: all that were found are refused.
+    """
     estimates: list[Estimate] = []
     warnings: list[str] = []
     unlike: dict[str, float] = {}
     for name, fit in parts.items():
         found, known = _of_part(fit, seed, step(name)), fit.model.known
-        if "torque_constant" in known and "torque_constant" not in given:  # it is the back-EMF constant
-            constant = [one for one in estimates if one.name == "back_emf_constant"]
-            found = _with_constant(found, constant[0], known) if constant else found
+        for taken, source in OF_WINDING.values():
+            if taken in known and taken not in given:
+                constant = [one for one in estimates if one.name == source]
+                found = _with_constant(found, constant[0], known) if constant else found
         estimates += found
         warnings += _warnings(fit, unlike)
-    return _completed(estimates, given), warnings, max(unlike.values(), default=0.0)
+    completed, unexplained = _completed(estimates, given, defaults), max(unlike.values(), default=0.0)
+    if unexplained > MISUNDERSTOOD:
+        why = f"the fit leaves {unexplained:.0%} of what moves in a log unexplained"
+        completed = [
+            one if one.status == "given" else dataclasses.replace(one, status="refused", why=why) for one in completed
+        ]
+    return completed, warnings, unexplained
 
 
 def _of_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estimate]:
@@ -96,7 +111,7 @@ def _of_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estimate]
     wide = np.max([by_cause[one] for one in ("curvature", "resampling", "logs")], axis=0)
     total = np.hypot(wide, by_cause["half_rate"]) + by_cause["self_test"] + by_cause["unexplained"]
     halves = np.hypot(total, [NARROWEST_OF.get(name, NARROWEST) for name in names] * values)
-    widest = {name: WIDEST_OF.get(name, WIDEST) if isinstance(model, WindingModel) else WIDEST for name in names}
+    widest = dict.fromkeys(names, WIDEST)
     if any(slopes) and halves[-1] <= NARROW * values[-1]:  # what one takes too little of, the other takes
         widest |= {name: 1.0 for name in names if name in FRICTION}
     made = []
@@ -131,31 +146,50 @@ def _verdict(
         return "refused", f"it ended at its bound, {value:g} {found.unit}".strip()
     if math.isinf(found.causes["resampling"]):
         return "refused", f"there are no two stretches of {BLOCK:g} s to resample: give a longer log"
-    if not found.causes["self_test"] <= BIASED * widest * size:
-        return "refused", f"the self-test finds {tested:.4g} where the fit that it simulates has {value:.4g}"
     if not half / size <= widest:
+        if not found.causes["self_test"] <= BIASED * widest * size:
+            return "refused", f"the self-test finds {tested:.4g} where the fit that it simulates has {value:.4g}"
         whole, worst = "all friction" if name in FRICTION else "it", max(found.causes, key=found.causes.__getitem__)
         why = f"its interval is {share:.3g} % of {whole} to either side, mostly because {CAUSES[worst]}"
         return "refused", why
     if name in FRICTION and not half <= NARROW * abs(value - none):
         more = ", and more of itself" if name != "friction_torque" else ""
         return "rough", f"its interval is {share:.3g} % of all friction to either side{more}"
+    if not half <= NARROW_OF.get(name, WIDEST) * size:
+        return "rough", f"its interval is {share:.3g} % of it to either side: train across it"
     return "identified", ""
 
 
 def _with_constant(found: list[Estimate], constant: Estimate, known: Mapping[str, float]) -> list[Estimate]:
-    """Estimates of a shaft under a current whose torque constant was itself found: they are no better than that."""
-    made = []
+    """Estimates of a shaft with a constant of the winding that was itself found: they are no better than that."""
+    made: list[Estimate] = []
     relative = max(constant.high - constant.value, constant.value - constant.low) / max(constant.value, 1e-12)
     anchored = "mgl" in known or "inertia" in known
     for one in found:
-        own = one.value * relative if one.name not in ("gear_efficiency", "stribeck_speed") and not anchored else 0.0
+        fixed = one.name in ("gear_efficiency", "stribeck_speed") or (anchored and one.name != "torque_constant")
+        own = 0.0 if fixed else one.value * relative
         low = max(one.value - math.hypot(one.value - one.low, own), PARAMETERS[one.name].least)
         high = min(one.value + math.hypot(one.high - one.value, own), PARAMETERS[one.name].most)
         one = dataclasses.replace(one, low=low, high=high, causes={**one.causes, "torque_constant": own})
-        if one.status in ("identified", "rough") and constant.status not in ("identified", "given"):
-            why = f"the torque constant that it is in proportion to is {constant.status}"
+        if one.status in ("identified", "rough") and constant.status not in USABLE:
+            why = f"the {constant.name.replace('_', ' ')} that it follows from is {constant.status}"
             one = dataclasses.replace(one, status="refused", why=why)
+        made.append(one)
+    return _rejudged(made)
+
+
+def _rejudged(found: list[Estimate]) -> list[Estimate]:
+    """Return estimates with the status of their widened intervals; each kind of friction is as good as all of it."""
+    shares = {one.name: (one.high - one.value) / max(abs(one.value), 1e-300) for one in found}
+    made = []
+    for one in found:
+        share = shares.get("friction_torque", 0.0) if one.name in FRICTION else shares[one.name]
+        why = f"its interval is {100.0 * share:.3g} % of it to either side, mostly because {CAUSES['torque_constant']}"
+        if one.causes["torque_constant"] > 0.0 and one.status in ("identified", "rough"):
+            if share > WIDEST:
+                one = dataclasses.replace(one, status="refused", why=why)
+            elif one.status == "identified" and one.name in FRICTION and share > NARROW:
+                one = dataclasses.replace(one, status="rough", why=why)
         made.append(one)
     return made
 
@@ -185,11 +219,14 @@ def _friction(fit: Fit) -> tuple[float, dict[str, float], dict[str, float]]:
     return friction, slopes, all_of | {"gear_efficiency": min(all_of["gear_efficiency"], 1.0)}
 
 
-def _completed(estimates: list[Estimate], given: Mapping[str, float]) -> list[Estimate]:
-    """With what was given, and what follows of both."""
+def _completed(estimates: list[Estimate], given: Mapping[str, float], defaults: Mapping[str, float]) -> list[Estimate]:
+    """With what was given, by a base too, and what follows of both."""
     named = {one.name: one for one in estimates}
     for name, value in given.items():
         named[name] = Estimate(name, value, value, value, "given")
+    for name, value in defaults.items():
+        if name in PARAMETERS and name not in named and value != DEFAULTS[name]:
+            named[name] = Estimate(name, value, value, value, "given", "the motor's, which the fit took as known")
     constants = {"torque_constant": "torque constant", "back_emf_constant": "back-EMF constant"}
     for name, other in zip(constants, reversed(constants), strict=True):
         if name not in named and other in named:
@@ -200,7 +237,7 @@ def _completed(estimates: list[Estimate], given: Mapping[str, float]) -> list[Es
         whole, load = named["inertia"], given["load_inertia"]
         value, low, high = ((one - load) / ratio**2 for one in (whole.value, whole.low, whole.high))
         status, why = whole.status, whole.why
-        if status == "identified" and not high - value <= WIDEST * value:
+        if status in USABLE and not high - value <= WIDEST * value:
             status = "refused"
             why = f"of an inertia of {whole.value:.4g} kg*m^2 in all, {load:.4g} is said to be the load's"
             why += ": too little is left"

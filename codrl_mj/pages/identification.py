@@ -64,7 +64,7 @@ def _top(found: Identified) -> Markup:
     ]
     told = (
         f"{good} of {len(found.estimates)} numbers can be relied on. Rig: {found.rig}{by}; friction: {found.friction}"
-        f"{f'; {found.supply_text}' if found.supply_text else ''}"
+        + "".join(f"; {text}" for text in (found.friction_reason, found.supply_text, found.base_text) if text)
     )
     usable = "usable as an actuator" if problem is None else "not to be used as an actuator"
     parts = [

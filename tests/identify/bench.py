@@ -65,13 +65,15 @@ def motor_log(kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0
     )
 
 
-def geared_pendulum(efficiency):
+def geared_pendulum(efficiency, seed=0):
     """A pendulum of 0.19 kg*m^2 and 3.6 N*m behind a gear of an efficiency, at 2 ms, and an encoder of 3 mrad."""
     time = np.linspace(0.0, 6.0, 12001)
-    torque = np.sum([1.5 * np.sin(2.0 * np.pi * rate * time + rate) for rate in (0.25, 0.6, 0.95, 1.4)], axis=0)
+    torque = np.sum(
+        [1.5 * np.sin(2.0 * np.pi * rate * time + (1 + seed) * rate) for rate in (0.25, 0.6, 0.95, 1.4)], axis=0
+    )
     moved = Moved(0.19, 3.6, 0.0, 0.05, 0.01, efficiency, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
     position = np.round(moving(time, torque, np.zeros(12001), 0.0, 0.0, moved)[0][::4] / 3e-3) * 3e-3
-    return Log("geared", time[::4], {"position": position, "torque": torque[::4]}, {"position": 3e-3})
+    return Log(f"geared{seed}", time[::4], {"position": position, "torque": torque[::4]}, {"position": 3e-3})
 
 
 def mujoco_pendulum(seed=0, duration=8.0, coulomb=0.15, viscous=0.01, step=3e-3, every=10, effort="torque"):

@@ -1,5 +1,6 @@
 """Fits of motors that are known, and what cannot be told of them."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from codrl_mj.identify import Log, identify, trust
 from codrl_mj.identify.estimate import Fit
+from codrl_mj.identify.identify import distinct
 from codrl_mj.identify.log import moves, replaced
 from tests.identify import bench, draws
 
@@ -120,12 +122,55 @@ def swings():
 
 
 def test_mujocos_pendulum_is_identified(swings):
-    found = identify(swings[:1], "pendulum", held_out=swings[1:])
+    one, other = swings
+    copy = dataclasses.replace(one, name="copy", time=one.time + 3.0)
+    found = identify([one, copy, other], "pendulum", friction="auto", held_out=[other])
     near(found, SWUNG, 0.05)
     near(found, {"viscous_friction": 0.01})
     assert statuses(found) == {"identified"}
     assert found.held_out[0].open_loop < 0.01
-    assert found.warnings == ()
+    assert [log.log for log in found.fitted] == ["swing0"]
+    assert found.warnings == (
+        "log copy is there twice, as swing0: it counts once",
+        "log swing1 is held out: it is only predicted, not fitted",
+    )
+    assert found.friction == "coulomb"
+    assert "needs 3 logs that move, and there is 1" in found.friction_reason
+
+
+@pytest.mark.matrix
+def test_the_friction_that_predicts_best_is_chosen_and_is_said():
+    """By three pendulums behind a gear that loses a third of the torque, and three that lose nothing."""
+    logs = [bench.geared_pendulum(0.67, seed) for seed in range(3)]
+    found = identify(logs, "pendulum", friction="auto")
+    assert found.friction == "load"
+    assert found.friction_reason.startswith("friction: load, by the mean errors on the logs left out [rad]: coulomb")
+    near(found, {"gear_efficiency": 0.67}, 0.1)
+    plain = identify([bench.mujoco_pendulum(seed, 3.0) for seed in range(3)], "pendulum", friction="auto")
+    assert plain.friction == "coulomb"
+    assert "load" in plain.friction_reason
+
+
+@pytest.mark.parametrize(
+    ("fitted", "held_out", "left"),
+    [("aba", "", ("ab", "")), ("abc", "c", ("ab", "c")), ("ab", "cc", ("ab", "c")), ("ab", "c", ("ab", "c"))],
+)
+def test_each_measurement_counts_once_whatever_its_name(fitted, held_out, left):
+    """Copies have other names, and a copy's time may begin elsewhere; one log more or less is another measurement."""
+    time = np.arange(50) * 1e-2
+    values = {name: np.random.default_rng(place).normal(size=50) for place, name in enumerate("abc")}
+
+    def logs(names):
+        return [Log(f"{name}{k}", time + k, {"current": values[name]}) for k, name in enumerate(names)]
+
+    kept, predicted, said = distinct(logs(fitted), logs(held_out))
+    assert tuple("".join(log.name[0] for log in several) for several in (kept, predicted)) == left
+    assert len(said) == len(fitted + held_out) - len("".join(left))
+
+
+def test_logs_that_are_all_held_out_are_refused(swings):
+    with pytest.raises(ValueError, match="swing0, swing1: all are held out, too"):
+        identify(swings, "pendulum", held_out=swings)
 
 
 @pytest.mark.matrix
@@ -197,7 +242,9 @@ def test_a_resistance_that_a_voltage_changing_within_the_rows_spoils_is_not_beli
     log, truth = draws.logged(draw, "locked_prbs", 1000.0), draws.motor_of(draw).resistance
     found = identify([log])["resistance"]
     assert found.value > 1.02 * truth
-    assert found.low < truth
+    assert found.low < truth < found.high
+    share = found.high / found.value - 1.0
+    assert found.status == ("identified" if share <= 0.05 else "rough" if share <= 0.3 else "refused")
 
 
 def test_a_back_emf_constant_can_be_asked_of_a_shaft_under_a_voltage():

@@ -55,11 +55,12 @@ def test_a_number_that_was_not_identified_is_refused_until_it_is_given(tmp_path,
     found = motor(resistance=Estimate("resistance", 1.2, 0.1, 9.0, status, "its interval is wide"))
     with pytest.raises(ValueError, match=f"resistance is {status}: its interval is wide. Give it with --known"):
         found.actuator()
-    file, _ = found.write(tmp_path)
-    with pytest.raises(ValueError, match=rf"actuator.yaml: identified from a, b: resistance is {status}"):
-        resolve(str(file), None, "a test")
-    with pytest.raises(ValueError, match="resistance is"):
-        identified_ranges(file)
+    motor().write(tmp_path)
+    assert found.write(tmp_path) == [tmp_path / "result.json"]
+    assert [one.name for one in tmp_path.iterdir()] == ["result.json"]  # none of the fit before
+    assert f"resistance is {status}" in json.loads((tmp_path / "result.json").read_text())["problem"]
+    with pytest.raises(FileNotFoundError):
+        resolve(str(tmp_path / "actuator.yaml"), None, "a test")
     assert motor(resistance=Estimate("resistance", 1.2, 1.2, 1.2, "given")).actuator().motor.resistance == 1.2
 
 
@@ -87,12 +88,31 @@ def test_all_that_is_refused_and_all_that_is_missing_is_named_at_once():
     bad = {name: Estimate(name, 1.0, 0.1, 9.0, "refused", "wide") for name in ("resistance", "coulomb_friction")}
     problem = motor(**bad).problem()
     assert problem.endswith("Give them with --known resistance=VALUE coulomb_friction=VALUE")
-    lost = dataclasses.replace(motor(**bad), unexplained=0.89).problem()
-    assert "leaves 89% of what moves" in lost
-    assert "--known" not in lost
+    for whole in (motor(**bad), motor()):  # also where every single number looks good
+        lost = dataclasses.replace(whole, unexplained=0.89).problem()
+        assert "leaves 89% of what moves" in lost
+        assert "--known" not in lost
     none = identified(Estimate("resistance", 1.0, 0.9, 1.1, "identified")).problem()
     assert "inductance, torque_constant, back_emf_constant, rotor_inertia: these logs say nothing of them" in none
     assert "load_inertia=VALUE, 0 for a motor alone" in none
+
+
+def test_a_rotor_inertia_that_the_datasheet_does_not_know_is_not_taken_for_zero():
+    """The logs have an inertia of all that moves: with the load's share told, or 0 if that is said, there is one."""
+    numbers = [one for one in motor().estimates if one.name != "rotor_inertia"]
+    bare = Drive().replaced({"motor.rotor_inertia": 0.0}).as_mapping()
+    assert "--known load_inertia=VALUE" in identified(*numbers, base=bare).problem()
+    with pytest.raises(ValueError, match="rotor_inertia is unknown"):
+        identified(*numbers, base=bare).actuator()
+    given = Estimate("rotor_inertia", 0.0, 0.0, 0.0, "given")
+    assert identified(*numbers, given, base=bare).actuator().motor.rotor_inertia == 0.0
+    whole = identified(*numbers, base=Drive().as_mapping())
+    assert (
+        whole.base_text == "not from these logs but the motor's, by --motor: rotor_inertia = 4e-06 kg*m^2, "
+        "viscous_friction = 0 N*m*s/rad"
+    )
+    winding = identified(numbers[0], base=bare)
+    assert winding.problem() is None
 
 
 def test_the_supply_is_that_of_the_logs_and_is_said(tmp_path):
@@ -153,5 +173,9 @@ def test_the_command_line_identifies_and_draws_within_the_intervals(tmp_path, ca
     verb = tyro.cli(train_verb(words), args=words)
     with pytest.raises(ValueError, match="identified: draws within the intervals of a file"):
         environment(verb, "pendulum", verb.actuator_name, EnvConfig("pendulum"))
+    refused = tmp_path / "refused"
+    assert main(f"{line} torque_constant=0.05 back_emf_constant=0.05 --out {refused}".split()) == 1
+    assert "not to be used as an actuator: rotor_inertia" in capsys.readouterr().out
+    assert sorted(one.name for one in refused.iterdir()) == ["report.html", "result.json"]
     assert main(f"{line} mgl".split()) == 2
     assert "must be NAME=NUMBER" in capsys.readouterr().err

@@ -112,6 +112,22 @@ def test_a_drive_of_few_samples_is_planned_at_its_rate():
     assert {one.rate for one in plan(slow, duration=4.0).options} == {0.9 * min(RATES)}
 
 
+def test_a_gear_is_planned_as_the_motor_that_it_is_at_its_output():
+    """A motor of n times the constants, n^2 the inertia and viscous, and n the Coulomb friction tells as much."""
+    ratio, one = 20.0, MOTOR
+    direct = GearMotor(
+        one.resistance, one.inductance, ratio * one.torque_constant, ratio * one.back_emf_constant,
+        ratio**2 * one.rotor_inertia, coulomb_friction=ratio * one.coulomb_friction,
+        viscous_friction=ratio**2 * one.viscous_friction,
+    )  # fmt: skip
+    errors = [
+        at_rates(1e3, kinds=["prbs"], drive=dataclasses.replace(DRIVE, motor=motor), duration=1.0).best.errors
+        for motor in (dataclasses.replace(one, gear_ratio=ratio), direct)
+    ]
+    assert errors[0] == pytest.approx(errors[1], rel=0.01)
+    assert {"inertia", "coulomb_friction"} <= errors[0].keys()
+
+
 def test_what_the_datasheet_leaves_at_zero_is_named():
     bare = dataclasses.replace(DRIVE, motor=dataclasses.replace(MOTOR, viscous_friction=0.0, coulomb_friction=0.0))
     found = at_rates(2e3, kinds=["prbs"], drive=bare, duration=1.0)
