@@ -182,6 +182,11 @@ class ActuatorModel(fields.Checked):
         return JointAdditions()
 
     @property
+    def back_emf_damping(self) -> float:
+        """Fall of its largest torque with the speed, at the joint [N*m*s/rad], which acts as a viscous friction does."""
+        return 0.0
+
+    @property
     def random(self) -> bool:
         """Whether an episode needs a key for its random numbers."""
         return any(value_at(self, path) != 0.0 for path in self.RANDOM)
