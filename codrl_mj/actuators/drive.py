@@ -204,9 +204,10 @@ class Drive(ActuatorModel):
 
     @property
     def back_emf_damping(self) -> float:
-        """As `ActuatorModel.back_emf_damping`: kT*kE/R, seen from the load."""
+        """As `ActuatorModel.back_emf_damping`: kT*kE/R, seen from the load through a gear that loses some torque."""
         motor = self.motor
-        return motor.torque_constant * motor.back_emf_constant / (motor.resistance * self.arm_radius**2)
+        braking = motor.torque_constant * motor.back_emf_constant / motor.resistance
+        return motor.gear_efficiency * braking / self.arm_radius**2
 
     @property
     def winding(self) -> tuple[float, float]:

@@ -183,7 +183,7 @@ class ActuatorModel(fields.Checked):
 
     @property
     def back_emf_damping(self) -> float:
-        """Fall of its largest torque with the speed, at the joint [N*m*s/rad], which acts as a viscous friction does."""
+        """Damping [N*m*s/rad] at the joint that its back-EMF amounts to: the slope of its torque-speed line."""
         return 0.0
 
     @property

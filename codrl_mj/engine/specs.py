@@ -13,17 +13,13 @@ import numpy as np
 from codrl_mj.actuators import ActuatorModel, JointAdditions, reference, resolve
 from codrl_mj.engine.families import load_family, user_head
 from codrl_mj.engine.reading import check_shafts
-from codrl_mj.fields import check_pattern, did_you_mean
+from codrl_mj.fields import check_joint_dynamics, check_pattern, did_you_mean
 from codrl_mj.plugin import FAMILY, NAME
 
 ON_JOINT = {mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT}
 """Transmissions of actuators that drive a joint."""
 _JOINTS = {mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE}
-NO_ACTUATORS = (
-    "the model has no actuators (MuJoCo reads none from a URDF, nor a transmission's mechanicalReduction, which is the "
-    "motor's gear_ratio). Add one per joint: <actuator><motor name='JOINT' joint='JOINT'/></actuator> in the file, or "
-    "spec.add_actuator(name='JOINT', target='JOINT', trntype=mujoco.mjtTrn.mjTRN_JOINT)"
-)
+_WRAPPING = mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER
 _SHAFTS = {*ON_JOINT, mujoco.mjtTrn.mjTRN_TENDON, mujoco.mjtTrn.mjTRN_SLIDERCRANK, mujoco.mjtTrn.mjTRN_SITE}
 _DYNAMICS = {
     mujoco.mjtDyn.mjDYN_NONE,
@@ -99,22 +95,16 @@ def motorise(
             raise ValueError(f"{pattern!r}: {error}") from None
         load_family(type(actuator))
     driven = {index: actuator for _, actuator, indices in mounted for index in indices}
-    if joint_dynamics == "replace":
-        _take_out(new, model, driven)
+    for index, actuator in driven.items() if joint_dynamics == "replace" else ():
+        _take_out(new, model, index, actuator)
     for each in mounted:
         _drive(new, model, each)
     new.nuser_actuator = -1  # as many as are needed
     if any(actuator.INERTIA for actuator in driven.values()):
         check_shafts(new.compile(), allow_unstable)
-    for text in [*_doubts(model, mounted), *(doubled(model, driven) if joint_dynamics is None else ())]:
+    for text in [*_past_motors(model, mounted), *(doubled(model, driven) if joint_dynamics is None else ())]:
         _warn(f"the model {spec.modelname!r}: {text}")
     return new
-
-
-def check_joint_dynamics(value: Any) -> None:
-    """Refuse a value of `motorise`'s `joint_dynamics` that it does not take."""
-    if value not in (None, "keep", "replace"):
-        raise ValueError(f"joint_dynamics = {value!r}: must be 'keep' or 'replace', or None to keep and be warned")
 
 
 def _call(target: mujoco.MjsActuator, index: int) -> str:
@@ -163,7 +153,12 @@ def matched_by(pattern: str, names: list[list[str]], needed: bool = True) -> lis
         if not own and not needed:
             return []
         if not own and not names:
-            raise ValueError(f"{part!r}: {NO_ACTUATORS}")
+            raise ValueError(
+                f"{part!r}: the model has no actuators (MuJoCo reads none from a URDF, nor a transmission's "
+                "mechanicalReduction, which is the motor's gear_ratio). Add one per joint: <actuator><motor "
+                "name='JOINT' joint='JOINT'/></actuator>, or spec.add_actuator(name='JOINT', target='JOINT', "
+                "trntype=mujoco.mjtTrn.mjTRN_JOINT)"
+            )
         if not own:
             known = list(dict.fromkeys(name for own in names for name in own))
             raise ValueError(
@@ -241,28 +236,25 @@ def _refusal(model: mujoco.MjModel, target: mujoco.MjsActuator, index: int, actu
         return "its site has a reference site"
     if transmission == mujoco.mjtTrn.mjTRN_TENDON and model.tendon_actfrclimited[first]:
         return "its tendon limits the force of its actuators (actuatorfrclimited), which MuJoCo does not do for plugins"
-    if transmission == mujoco.mjtTrn.mjTRN_TENDON and actuator.additions.armature and (geom := _wraps(model, first)):
-        return (
-            f"its tendon wraps around {geom}, where MuJoCo has no armature: set motor.rotor_inertia = 0, or drive the "
-            "joint by an actuator of its own"
-        )
+    if transmission == mujoco.mjtTrn.mjTRN_TENDON and actuator.additions.armature:
+        path = range(model.tendon_adr[first], model.tendon_adr[first] + model.tendon_num[first])
+        for geom in (model.wrap_objid[at] for at in path if model.wrap_type[at] in _WRAPPING):
+            return (
+                f"its tendon wraps around geom {model.geom(geom).name or geom}, where MuJoCo has no armature for its "
+                "motor's rotor: set motor.rotor_inertia = 0, or drive the joint itself"
+            )
     if model.actuator_delay[index]:
         return "its control is delayed (delay), which MuJoCo does not tell plugins"
     if actuator.MOTION and dynamics != mujoco.mjtDyn.mjDYN_NONE:
         return "its control is filtered before it becomes what a servo is asked for"
+    asked, (stiffness, damping) = actuator.commands() if actuator.MOTION else {}, model.actuator_biasprm[index, 1:3]
+    own = "position" if stiffness else "velocity" if damping else None
+    if own and asked and own not in asked:
+        return f"its control is a {own}, and its motor is asked for a {', '.join(asked)}: set loop.controls"
     if actuator.additions.friction and transmission not in (*ON_JOINT, mujoco.mjtTrn.mjTRN_TENDON):
         return "it drives neither a joint nor a tendon, which the friction that its motor brings would need"
     if model.actuator_user[index].any():
         return "it has user data, where its motor's parameters have to go"
-    return ""
-
-
-def _wraps(model: mujoco.MjModel, tendon: int) -> str:
-    """Return what to call the first geom that a tendon wraps around; empty if there is none."""
-    path = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
-    for kind, item in zip(model.wrap_type[path], model.wrap_objid[path], strict=True):
-        if mujoco.mjtWrap(kind) in (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER):
-            return f"geom {model.geom(item).name or item}"
     return ""
 
 
@@ -309,8 +301,10 @@ def _connect(spec: mujoco.MjSpec, model: mujoco.MjModel, index: int, instance: s
     target.plugin.plugin_name, target.plugin.name, target.plugin.active = NAME, instance, True
 
 
-_KINDS = {"armature": "armature", "damping": "damping", "friction": "frictionloss"}
-"""Fields of `JointAdditions` -> MuJoCo's attributes."""
+_DYNAMICS_NAMES = "armature", "damping", "frictionloss"
+"""MuJoCo's names of the entries of `JointAdditions`."""
+_NEGLIGIBLE = 0.05
+"""Share of what a motor brings below which a model's own is taken for a bearing's: it changes little."""
 
 
 def _brought(actuator: ActuatorModel, gear: float = 1.0) -> JointAdditions:
@@ -319,40 +313,41 @@ def _brought(actuator: ActuatorModel, gear: float = 1.0) -> JointAdditions:
     return JointAdditions(gear**2 * armature, gear**2 * (damping + actuator.back_emf_damping), abs(gear) * friction)
 
 
-def _dynamics_at(model: mujoco.MjModel, index: int) -> dict[str, tuple[JointAdditions, float]]:
-    """Return a model's own damping, armature and friction at an actuator and what it drives, and the gear to there."""
-    driven, gear = model.actuator_trnid[index, 0], float(model.actuator_gear[model.actuator_outadr[index], 0])
-    own = JointAdditions(model.actuator_armature[index], model.actuator_damping[index])
-    found = {f"actuator {model.actuator(index).name or index}": (own, 1.0)}
-    if model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_TENDON:
-        kind, place, prefix = f"tendon {model.tendon(driven).name}", driven, "tendon_"
-    elif mujoco.mjtTrn(model.actuator_trntype[index]) in ON_JOINT:
-        kind, place, prefix = f"joint {model.joint(driven).name}", model.jnt_dofadr[driven], "dof_"
-    else:
-        return found
-    values = JointAdditions(*(getattr(model, prefix + name)[place] for name in _KINDS.values()))
-    return {kind: (values, gear), **found}
-
-
-def _twice(own: float, brought: float) -> bool:
-    """Return True if both a model and its motor have something; XML keeps six digits of a sum."""
-    return brought > 0.0 and own > 1e-5 * brought
+def _take_out(spec: mujoco.MjSpec, model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> None:
+    """Take out of a spec the armature, damping and friction of which a motor brings its own."""
+    target, transmission = spec.actuators[index], mujoco.mjtTrn(model.actuator_trntype[index])
+    elements = [target]
+    if transmission in (*ON_JOINT, mujoco.mjtTrn.mjTRN_TENDON):
+        elements.append((spec.joint if transmission in ON_JOINT else spec.tendon)(target.target))
+    for element in elements:
+        for name, brought in zip(_DYNAMICS_NAMES, _brought(actuator), strict=True):
+            if brought and hasattr(element, name):
+                setattr(element, name, [0.0] * 3 if name == "damping" else 0.0)
 
 
 def doubled(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> list[str]:
-    """Describe the damping, armature and friction that may be a motor's already, of a model without its motors.
+    """Describe the damping, armature and friction of a model that may be a motor's already.
 
     Args:
         model: the model without what its motors add.
-        motors: actuator of the model, by index -> motor.
+        motors: index of an actuator -> motor.
     """
     found: dict[str, str] = {}
     for index, motor in motors.items():
-        for place, (own, gear) in _dynamics_at(model, index).items():
-            brought = _brought(motor, gear)
-            if any(map(_twice, own, brought)):
-                rows = zip(_KINDS.values(), own, brought, strict=True)
-                numbers = [f"{name} {value:.3g} (its motor brings {its:.3g})" for name, value, its in rows if value > 0]
+        driven, gear = model.actuator_trnid[index, 0], float(model.actuator_gear[model.actuator_outadr[index], 0])
+        own = model.actuator_armature[index], model.actuator_damping[index], 0.0
+        places = {f"actuator {model.actuator(index).name or index}": (own, 1.0)}
+        if mujoco.mjtTrn(model.actuator_trntype[index]) in ON_JOINT:
+            dof = model.jnt_dofadr[driven]
+            own = model.dof_armature[dof], model.dof_damping[dof], model.dof_frictionloss[dof]
+            places[f"joint {model.joint(driven).name}"] = own, gear
+        elif model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_TENDON:
+            own = model.tendon_armature[driven], model.tendon_damping[driven], model.tendon_frictionloss[driven]
+            places[f"tendon {model.tendon(driven).name}"] = own, gear
+        for place, (values, ratio) in places.items():
+            rows = list(zip(_DYNAMICS_NAMES, values, _brought(motor, ratio), strict=True))
+            if any(value > _NEGLIGIBLE * its > 0.0 for _, value, its in rows):
+                numbers = [f"{name} {value:.3g} (the motor's is {its:.3g})" for name, value, its in rows if value > 0.0]
                 found[place] = f"{place} has {', '.join(numbers)}"
     remedy = (
         "If these numbers are the motor's own, they count twice: joint_dynamics='replace' (--env.joint-dynamics "
@@ -361,60 +356,47 @@ def doubled(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> list[
     return [f"{'; '.join(found.values())}. {remedy}"] if found else []
 
 
-def _take_out(spec: mujoco.MjSpec, model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> None:
-    """Take out of a spec what it has of damping, armature and friction at motors that bring the same."""
-    for index, motor in motors.items():
-        target = spec.actuators[index]
-        on_joint = mujoco.mjtTrn(model.actuator_trntype[index]) in ON_JOINT
-        elements = {"actuator": target, "joint": spec.joint(target.target) if on_joint else spec.tendon(target.target)}
-        for place, (own, _) in _dynamics_at(model, index).items():
-            element = elements["actuator" if place.startswith("actuator ") else "joint"]
-            for name, value, brought in zip(_KINDS.values(), own, _brought(motor), strict=True):
-                if _twice(value, brought):
-                    setattr(element, name, [0.0] * 3 if name == "damping" else 0.0)
-
-
-def _doubts(model: mujoco.MjModel, mounted: Sequence[Mounted]) -> list[str]:
-    """Describe what of a model goes past its motors, and what they do not share."""
-    called = {index: model.actuator(index).name or str(index) for index in range(model.nactuator)}
+def _past_motors(model: mujoco.MjModel, mounted: Sequence[Mounted]) -> list[str]:
+    """Describe what moves the joints of motors past these, and what motors do not share."""
+    called = [model.actuator(index).name or str(index) for index in range(model.nactuator)]
+    joints = [
+        int(driven) if mujoco.mjtTrn(kind) in ON_JOINT else None
+        for kind, driven in zip(model.actuator_trntype, model.actuator_trnid[:, 0], strict=True)
+    ]
     behind = {index for each in mounted for index in each.indices}
     found = []
-    for _, _, (index, *_) in mounted:
-        driven = model.actuator_trnid[index, 0]
-        if mujoco.mjtTrn(model.actuator_trntype[index]) not in ON_JOINT:
-            continue
-        joint = model.joint(driven).name
-        if model.jnt_actgravcomp[driven] and model.body_gravcomp.any():
-            found.append(f"joint {joint}: its gravity compensation (actuatorgravcomp) does not pass through its motor")
-        for other in set(range(model.nactuator)) - behind:
-            if mujoco.mjtTrn(model.actuator_trntype[other]) in ON_JOINT and model.actuator_trnid[other, 0] == driven:
-                found.append(
-                    f"actuator {called[other]} drives joint {joint} past the motor of {called[index]}: write "
-                    f"'{called[index]} & {called[other]}' for one motor behind both, or give it 'ideal'"
-                )
-    sagging = [called[each.indices[0]] for each in mounted if _supply_resistance(each.actuator)]
+    for first, joint in [(each.indices[0], joints[each.indices[0]]) for each in mounted]:
+        beside = [called[index] for index, other in enumerate(joints) if other == joint and index not in behind]
+        if joint is not None and beside:
+            found.append(
+                f"actuator {beside[0]} drives the joint of {called[first]} past its motor: '{called[first]} & "
+                f"{beside[0]}' puts one motor behind both; 'ideal' leaves it as it is, without this warning"
+            )
+        if joint is not None and model.jnt_actgravcomp[joint] and model.body_gravcomp.any():
+            found.append(
+                f"joint {model.joint(joint).name}: actuatorgravcomp: its gravity compensation passes through no motor; "
+                f"take it out of the model, and ask actuator {called[first]} for it"
+            )
+    supplies = {called[each.indices[0]]: getattr(each.actuator, "supply", None) for each in mounted}
+    sagging = [name for name, supply in supplies.items() if getattr(supply, "resistance", 0.0)]
     if len(sagging) > 1:
         found.append(
-            f"supply.resistance: each of {', '.join(sagging)} has a supply of its own, which the others' currents do "
-            "not make sag; motors on one battery get less voltage than that"
+            f"supply.resistance: each of the motors {', '.join(sagging)} has a supply of its own: on one battery the "
+            "current of each would lower the voltage of all"
         )
     return found
 
 
-def _supply_resistance(actuator: ActuatorModel) -> float:
-    return getattr(getattr(actuator, "supply", None), "resistance", 0.0)
-
-
 _WARNED: set[str] = set()
-"""Texts of the warnings that this process has shown."""
-_INSIDE = {"codrl_mj", "gymnasium", "dm_control", "contextlib"}
+"""Warnings that this process has shown."""
+_BETWEEN = {"codrl_mj", "gymnasium", "dm_control", "contextlib"}
 """Packages between a user's line and a model that is built for it."""
 
 
 def _warn(text: str) -> None:
     """Warn once a process, at the user's line: environments build the same model again and again."""
     frame, level = sys._getframe(), 1
-    while frame.f_back is not None and str(frame.f_globals.get("__name__")).partition(".")[0] in _INSIDE:
+    while frame.f_back is not None and frame.f_globals["__name__"].partition(".")[0] in _BETWEEN:
         frame, level = frame.f_back, level + 1
     if text not in _WARNED:
         warnings.warn(text, MotorWarning, stacklevel=level)
