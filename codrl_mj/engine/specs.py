@@ -238,7 +238,7 @@ def _refusal(model: mujoco.MjModel, target: mujoco.MjsActuator, index: int, actu
         return "its tendon limits the force of its actuators (actuatorfrclimited), which MuJoCo does not do for plugins"
     if transmission == mujoco.mjtTrn.mjTRN_TENDON and actuator.additions.armature:
         path = range(model.tendon_adr[first], model.tendon_adr[first] + model.tendon_num[first])
-        for geom in (model.wrap_objid[at] for at in path if model.wrap_type[at] in _WRAPPING):
+        for geom in (model.wrap_objid[at] for at in path if mujoco.mjtWrap(model.wrap_type[at]) in _WRAPPING):
             return (
                 f"its tendon wraps around geom {model.geom(geom).name or geom}, where MuJoCo has no armature for its "
                 "motor's rotor: set motor.rotor_inertia = 0, or drive the joint itself"
@@ -341,7 +341,7 @@ def doubled(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> list[
             dof = model.jnt_dofadr[driven]
             own = model.dof_armature[dof], model.dof_damping[dof], model.dof_frictionloss[dof]
             places[f"joint {model.joint(driven).name}"] = own, gear
-        elif model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_TENDON:
+        elif mujoco.mjtTrn(model.actuator_trntype[index]) == mujoco.mjtTrn.mjTRN_TENDON:
             own = model.tendon_armature[driven], model.tendon_damping[driven], model.tendon_frictionloss[driven]
             places[f"tendon {model.tendon(driven).name}"] = own, gear
         for place, (values, ratio) in places.items():
