@@ -162,9 +162,9 @@ class Leg(gymnasium.Env):
     metadata = {"render_modes": []}  # noqa: RUF012
     render_mode = None
 
-    def __init__(self):
+    def __init__(self, knee=KNEE):
         """Build the model."""
-        self.model = mujoco.MjModel.from_xml_string(_LEG.format("Euler", PAIR.format("", "") + KNEE))
+        self.model = mujoco.MjModel.from_xml_string(_LEG.format("Euler", PAIR.format("", "") + knee))
         self.data, self.dt = mujoco.MjData(self.model), 0.02
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,))
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
@@ -217,6 +217,20 @@ def test_both_commands_are_late_and_loads_act_once():
 def test_currents_are_no_command_of_two():
     with pytest.raises(ValueError, match="hip_p: is no plain motor of its own"):
         codrl_mj.make(Leg, {"hip_p & hip_v": MAXON}, action="current", disable_env_checker=True)
+
+
+@pytest.mark.parametrize(("limit", "fits"), [(1.0, False), (1000.0, True)])
+def test_a_force_range_that_would_cut_a_voltage_is_refused(limit, fits):
+    """24 V stand for the torque at standstill, 24/R*kT*100: of 24 V 1.4 V would arrive."""
+    knee = f'<motor name="knee" joint="knee" forcelimited="true" forcerange="-{limit} {limit}"/>'
+    options = {"action": "voltage", "knee": knee, "disable_env_checker": True}
+    if fits:
+        env = codrl_mj.make(Leg, {"knee": MAXON}, **options)
+        env.reset(seed=0)
+        assert env.step(np.array([0, 0, 24.0], dtype=np.float32))[-1]["voltage"] == pytest.approx(24.0)
+    else:
+        with pytest.raises(ValueError, match=f"knee: forcerange = {limit:g}: would cut commands of up to 24 V"):
+            codrl_mj.make(Leg, {"knee": MAXON}, **options)
 
 
 def test_what_was_chosen_for_it_is_for_both():
