@@ -207,13 +207,14 @@ def _refusal_together(
             f"{' & '.join(names) if all(names) else 'NAME & NAME'!r}; give each a pattern of its own if several motors "
             "are meant"
         )
-    outputs = model.actuator_outadr[list(indices)]
+    each, outputs = list(indices), model.actuator_outadr[list(indices)]
+    same = {"transmission": model.actuator_trntype[each], "group": model.actuator_group[each]}
+    same["gear"] = model.actuator_gear[outputs]
     if actuator.MOTION:
         return f"{both}, and a {type(actuator).__name__} is asked for one motion, not for the sum of several forces"
-    for field, values in (("gear", model.actuator_gear[outputs]), ("group", model.actuator_group[list(indices)])):
-        if (values != values[0]).any():
-            return f"{both}, whose {field} differs: one motor has one"
-    if model.actuator_forcelimited[list(indices)].all():
+    for field in (name for name, values in same.items() if (values != values[0]).any()):
+        return f"{both}, whose {field} differs: one motor has one"
+    if model.actuator_forcelimited[each].all():
         return f"{both}, each with a forcerange, which would limit the motor as well: limit the joint, actuatorfrcrange"
     return ""
 
@@ -396,7 +397,7 @@ _BETWEEN = {"codrl_mj", "gymnasium", "dm_control", "contextlib"}
 def _warn(text: str) -> None:
     """Warn once a process, at the user's line: environments build the same model again and again."""
     frame, level = sys._getframe(), 1
-    while frame.f_back is not None and frame.f_globals["__name__"].partition(".")[0] in _BETWEEN:
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).partition(".")[0] in _BETWEEN:
         frame, level = frame.f_back, level + 1
     if text not in _WARNED:
         warnings.warn(text, MotorWarning, stacklevel=level)

@@ -18,10 +18,14 @@ class Building:
     """The actuators for models yet to be built, and what was met of these."""
 
     def __init__(
-        self, actuators: Mapping[str, ActuatorModel], allow_unstable: bool = False, joint_dynamics: str | None = None
+        self,
+        actuators: Mapping[str, ActuatorModel],
+        allow_unstable: bool = False,
+        joint_dynamics: str | None = None,
+        action: str | None = None,
     ) -> None:
-        """Take patterns and their actuators; a pattern may match nothing in some of the models."""
-        self.actuators = actuators
+        """Take patterns and their actuators, and the action if it is known; a pattern may match nothing in a model."""
+        self.actuators, self._action = actuators, action
         self._how = allow_unstable, joint_dynamics
         self._met: dict[str, list[list[str]]] = {}
 
@@ -62,6 +66,13 @@ class Building:
         }
         if not wanted:
             return plain
+        for pattern, actuator in wanted.items() if self._action == "force" else ():
+            plainly = plain.actuator_biastype[matched_by(pattern, names)] == int(mujoco.mjtBias.mjBIAS_NONE)
+            if actuator.MOTION and plainly.any():
+                raise ValueError(
+                    f"action = 'force': {pattern!r}: the environment asks its actuators for forces, and a "
+                    f"{type(actuator).__name__} is asked for motions; must be {' or '.join(actuator.commands())}"
+                )
         with warnings.catch_warnings():  # MuJoCo's of the model, which building it without motors has shown
             ours = r"codrl_mj\.(engine\.specs|foreign\.building)"
             warnings.filterwarnings("ignore", category=UserWarning, module=ours)

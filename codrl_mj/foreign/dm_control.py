@@ -31,7 +31,7 @@ class MotorisedEnvironment(dm_env.Environment):
     ) -> None:
         """Build it."""
         self._settings = settings
-        self._building = Building(settings.simulated, settings.allow_unstable, settings.joint_dynamics)
+        self._building = Building(settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action)
         with self._building.motorising():
             self._environment = build()
         self._building.check()

@@ -114,7 +114,7 @@ class Motorised:
     def __call__(self, **options: Any) -> gymnasium.Env:
         """Make it."""
         settings = self.settings
-        building = Building(settings.simulated, settings.allow_unstable, settings.joint_dynamics)
+        building = Building(settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action)
         with building.motorising():
             env = self.creator(**options)
         building.check(self.env_id)

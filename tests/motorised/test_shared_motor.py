@@ -198,6 +198,14 @@ def test_an_environment_has_one_motor_for_it():
     assert info["desired_force"].shape == (2,)
 
 
+def test_an_evaluation_that_changes_others_leaves_it_whole(monkeypatch):
+    monkeypatch.setitem(gymnasium.registry, "Leg-v0", gymnasium.envs.registration.EnvSpec("Leg-v0", Leg))
+    config = codrl_mj.EnvConfig("Leg-v0", ACTUATORS, max_episode_steps=10)
+    lag = Lag(time_constant=0.01)
+    assert config.world.overlaid(config, {"knee": "ideal"}) == {"hip_p & hip_v": lag, "knee": "ideal"}
+    assert codrl_mj.EnvConfig.from_mapping(config.as_mapping()) == config
+
+
 def test_both_commands_are_late_and_loads_act_once():
     env = _make(disturbances={"command_delay": 0.02})
     env.reset(seed=1)
