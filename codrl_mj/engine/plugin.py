@@ -109,6 +109,16 @@ def _engine_force(model: int, data: int, actuator: int, length: float, velocity:
     return force
 
 
+@internal(inline="always")
+def _asked_force(model: int, data: int, motor: int, length: float, velocity: float) -> float:
+    """Return the sum of the forces of all actuators that share a motor: they have one shaft and one gear."""
+    force = _engine_force(model, data, motor, length, velocity)
+    for other in range(MODEL.nactuator(model)):
+        if other != motor and MODEL.actuator_plugin(model)[other] == MODEL.actuator_plugin(model)[motor]:
+            force += _engine_force(model, data, other, length, velocity)
+    return force
+
+
 _ATTRIBUTE = ctypes.create_string_buffer(FAMILY.encode())
 _attribute_at = symbol("codrl_mj_attribute", ctypes.addressof(_ATTRIBUTE))
 _configuration_of = library().mj_getPluginConfig
@@ -180,11 +190,7 @@ def compiled_entries() -> dict[str, Any]:
                 if motion:
                     asked = command(model, data, actuator) * gear
                 else:
-                    force = _engine_force(model, data, actuator, length, velocity)
-                    for other in range(MODEL.nactuator(model)):
-                        if other != actuator and MODEL.actuator_plugin(model)[other] == instance:
-                            # one shaft and one gear, so one length and one velocity
-                            force += _engine_force(model, data, other, length, velocity)
+                    force = _asked_force(model, data, actuator, length, velocity)
                     asked = force * arm
                 load = inertia_at(model, data, out, gear) if size_of(number, INERTIA) else math.inf
                 advance_slot(
