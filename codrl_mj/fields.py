@@ -186,6 +186,12 @@ def check_pattern(pattern: str) -> None:
         ) from None
 
 
+def check_joint_dynamics(value: Any) -> None:
+    """Refuse what `joint_dynamics` of `codrl_mj.motorise` cannot be."""
+    if value not in (None, "keep", "replace"):
+        raise ValueError(f"joint_dynamics = {value!r}: must be keep or replace; None keeps, and warns")
+
+
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """A question with the nearest known names and a space, for the message about an unknown one; or nothing."""
     near = _nearest(name, known)

@@ -243,6 +243,12 @@ class Actuator(ActuatorModel):
         return self.motor.arm_radius
 
     @property
+    def back_emf_damping(self) -> float:
+        """As `ActuatorModel.back_emf_damping`: kT*kE/R, seen from the load."""
+        motor = self.motor
+        return motor.torque_constant * motor.back_emf_constant / (motor.resistance * motor.arm_radius**2)
+
+    @property
     def winding(self) -> tuple[float, float]:
         """Resistance [ohm] and inductance [H]."""
         return self.motor.resistance, self.motor.inductance

@@ -203,6 +203,13 @@ class Drive(ActuatorModel):
         )
 
     @property
+    def back_emf_damping(self) -> float:
+        """As `ActuatorModel.back_emf_damping`: kT*kE/R, seen from the load through a gear that loses some torque."""
+        motor = self.motor
+        braking = motor.torque_constant * motor.back_emf_constant / motor.resistance
+        return motor.gear_efficiency * braking / self.arm_radius**2
+
+    @property
     def winding(self) -> tuple[float, float]:
         """Resistance [ohm] and inductance [H]."""
         return self.motor.resistance, self.motor.inductance

@@ -182,6 +182,11 @@ class ActuatorModel(fields.Checked):
         return JointAdditions()
 
     @property
+    def back_emf_damping(self) -> float:
+        """Damping [N*m*s/rad] at the joint that its back-EMF amounts to: the slope of its torque-speed line."""
+        return 0.0
+
+    @property
     def random(self) -> bool:
         """Whether an episode needs a key for its random numbers."""
         return any(value_at(self, path) != 0.0 for path in self.RANDOM)

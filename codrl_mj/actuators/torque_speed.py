@@ -56,3 +56,8 @@ class TorqueSpeed(ActuatorModel):
     """Speed [rad/s] at which full voltage makes no torque, > 0."""
     max_torque: float = real(math.inf, above=0.0, unit="N*m", infinite=True)
     """Largest torque [N*m] of the drive, > 0; often well below the stall torque. `inf`: the stall torque."""
+
+    @property
+    def back_emf_damping(self) -> float:
+        """As `ActuatorModel.back_emf_damping`: the slope of the line."""
+        return self.stall_torque / self.no_load_speed

@@ -59,8 +59,8 @@ Actuators = Annotated[
     tyro.conf.arg(
         metavar="PATTERN=NAME",
         help="What single motors go through, over --actuator: names as there, for the motors whose names, or whose "
-        "joints', the regular expression matches from beginning to end. Or a YAML file of patterns and actuators, such "
-        "as codrl-mj motor choose writes.",
+        "joints', the regular expression matches from beginning to end; patterns joined by & put one motor behind "
+        "several actuators of a joint. Or a YAML file of patterns and actuators, such as codrl-mj motor choose writes.",
     ),
 ]
 FAMILY = "actuator.family"

@@ -72,7 +72,7 @@ def actuators_of(choices: Mapping[str, tuple[Candidate, Demand]]) -> dict[str, A
     found = {}
     for name, (choice, demand) in choices.items():
         drive = labelled(choice.behind(demand.model_gear), Path(choice.name).stem)
-        found[re.escape(name) if name else ".*"] = named_mapping(drive)
+        found[" & ".join(map(re.escape, name.split(" & "))) if name else ".*"] = named_mapping(drive)
     return found
 
 

@@ -5,6 +5,7 @@ from codrl_mj.engine.families import load_family
 from codrl_mj.engine.hill import HILL_NAMES
 from codrl_mj.engine.layout import LayoutError
 from codrl_mj.engine.reading import Readout, clear_motors, motors, signals
+from codrl_mj.engine.specs import MotorWarning
 
 __all__ = [
     "motors",
@@ -15,6 +16,7 @@ __all__ = [
     "HILL_NAMES",
     "CallbackInUseError",
     "LayoutError",
+    "MotorWarning",
     "install",
     "installed",
     "uninstall",

@@ -1,8 +1,10 @@
 """What MuJoCo's actuator plugin of ours runs, compiled to C functions by numba: the door for models of anybody's.
 
 The actuator keeps whatever it has (gear, gain, bias, dynamics, ranges): the force that the engine would have produced
-by them is the desired one. As at the other door all parameters are the model's and all state is the data's, here in
-`plugin_state`. The plugin is registered, and these functions get into it, by `codrl_mj.plugin`.
+by them is the desired one. Several actuators of one joint may share an instance of the plugin: the motor is asked for
+the sum of their forces, the actuator with its parameters delivers it, and the others deliver none. As at the other door
+all parameters are the model's and all state is the data's, here in `plugin_state`. The plugin is registered, and these
+functions get into it, by `codrl_mj.plugin`.
 """
 
 import ctypes
@@ -49,6 +51,7 @@ REASONS = (
     "its configuration and its actuator's user data name different families",
     "its actuator's user data have fewer numbers than the family has parameters",
     "it was compiled when the family had another number of states or signals",
+    "several of its actuators have a motor's user data, and one only can",
 )
 
 
@@ -106,6 +109,16 @@ def _engine_force(model: int, data: int, actuator: int, length: float, velocity:
     return force
 
 
+@internal(inline="always")
+def _asked_force(model: int, data: int, motor: int, length: float, velocity: float) -> float:
+    """Return the sum of the forces of all actuators that share a motor: they have one shaft and one gear."""
+    force = _engine_force(model, data, motor, length, velocity)
+    for other in range(MODEL.nactuator(model)):
+        if other != motor and MODEL.actuator_plugin(model)[other] == MODEL.actuator_plugin(model)[motor]:
+            force += _engine_force(model, data, other, length, velocity)
+    return force
+
+
 _ATTRIBUTE = ctypes.create_string_buffer(FAMILY.encode())
 _attribute_at = symbol("codrl_mj_attribute", ctypes.addressof(_ATTRIBUTE))
 _configuration_of = library().mj_getPluginConfig
@@ -118,14 +131,25 @@ _configured = external("mj_plugin_configuration", _configuration_of, types.uintp
 """The same for compiled code."""
 
 
+@internal(inline="always")
+def _is_motor(model: int, actuator: int, instance: int) -> bool:
+    """Return True if an actuator of an instance has the motor's parameters."""
+    if MODEL.actuator_plugin(model)[actuator] != instance or MODEL.nuser_actuator(model) < PLUGIN_HEAD:
+        return False
+    user = f64(user_of(model, actuator))
+    return user[0] == _FIRST and user[1] == _SECOND
+
+
 @njit(nogil=True, error_model="numpy")
 def _verdict(model: int, instance: int) -> int:
     """Index into `REASONS`: what is wrong with an instance."""
+    count = 0
     for actuator in range(MODEL.nactuator(model)):
-        if MODEL.actuator_plugin(model)[actuator] != instance:
+        if not _is_motor(model, actuator, instance):
             continue
+        count += 1
         width, user = MODEL.nuser_actuator(model), f64(user_of(model, actuator))
-        if width < PLUGIN_HEAD or user[0] != _FIRST or user[1] != _SECOND or not user[HEAD] > 0.0:
+        if not user[HEAD] > 0.0:
             return 1
         if not is_compiled(user[2]):
             return 2
@@ -136,7 +160,7 @@ def _verdict(model: int, instance: int) -> int:
             return 4
         if MODEL.plugin_statenum(model)[instance] != size_of(number, WHOLE) + EXTRA_STATES:
             return 5
-    return 0
+    return 1 if count == 0 else 0 if count == 1 else 6
 
 
 @functools.cache
@@ -149,7 +173,7 @@ def compiled_entries() -> dict[str, Any]:
         slot = _slot_of(model, data, instance)
         own = f64(slot)
         for actuator in range(MODEL.nactuator(model)):
-            if MODEL.actuator_plugin(model)[actuator] != instance or is_disabled(model, actuator):
+            if not _is_motor(model, actuator, instance) or is_disabled(model, actuator):
                 continue
             user, out = user_of(model, actuator), MODEL.actuator_outadr(model)[actuator]
             number, arm = int(f64(user)[2]), f64(user)[HEAD]
@@ -166,7 +190,7 @@ def compiled_entries() -> dict[str, Any]:
                 if motion:
                     asked = command(model, data, actuator) * gear
                 else:
-                    force = _engine_force(model, data, actuator, length, velocity)
+                    force = _asked_force(model, data, actuator, length, velocity)
                     asked = force * arm
                 load = inertia_at(model, data, out, gear) if size_of(number, INERTIA) else math.inf
                 advance_slot(
@@ -179,7 +203,7 @@ def compiled_entries() -> dict[str, Any]:
     @cfunc(types.void(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
     def advance(model: int, data: int, instance: int) -> None:
         for actuator in range(MODEL.nactuator(model)):
-            if MODEL.actuator_plugin(model)[actuator] == instance:
+            if _is_motor(model, actuator, instance):
                 number, slot = int(f64(user_of(model, actuator))[2]), _slot_of(model, data, instance)
                 commit_slot(number, slot, DATA.time(data))
                 f64(slot)[size_of(number, WHOLE) + 1] = 0.0

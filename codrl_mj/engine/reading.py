@@ -45,13 +45,22 @@ def motors(model: mujoco.MjModel) -> dict[int, ActuatorModel]:
     for index in range(model.nactuator):
         user, instance = model.actuator_user[index], model.actuator_plugin[index]
         ours = instance >= 0 and model.plugin[instance] == slot
-        if not ours and (len(user) < HEAD or tuple(user[:2]) != SIGNATURE):
+        signed = len(user) >= HEAD and tuple(user[:2]) == SIGNATURE
+        if not ours and not signed:
             continue
+        if not signed and any(tuple(model.actuator_user[one][:2]) == SIGNATURE for one in sharing(model, index)):
+            continue  # its force is asked of the motor of another actuator
         try:
             found[index] = _motor_at(model, index, slot)
         except ValueError as error:
             raise ValueError(f"{model.actuator(index).name or f'actuator {index}'}: {error}") from None
     return found
+
+
+def sharing(model: mujoco.MjModel, index: int) -> list[int]:
+    """Return the indices of the actuators that share a motor with an actuator, itself among them."""
+    instance = model.actuator_plugin[index]
+    return [index] if instance < 0 else np.flatnonzero(model.actuator_plugin == instance).tolist()
 
 
 def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:

@@ -9,6 +9,7 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Drive, Ideal, Servo
 from codrl_mj.disturbances import OFF, Disturbances, check_delay
+from codrl_mj.engine.reading import sharing
 from codrl_mj.engine.specs import ON_JOINT
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
@@ -195,12 +196,15 @@ class ControlCommands:
             raise ValueError("disturbances: the environment has no dt, the duration of its steps [s]; give it one")
         check_delay(disturbances, step_duration, None)
         self._data, self._pulses = data, disturbances.random
-        self._controls = places = model.actuator_ctrladr[indices]
+        every = [one for index in indices for one in sharing(model, index)]
+        self._controls = places = model.actuator_ctrladr[every]
         limited = model.actuator_ctrllimited[places].astype(bool)
         largest = np.where(limited, np.abs(model.actuator_ctrlrange[places]).max(axis=1), np.inf)
-        self._gains = np.array([_plain_gain(model, index) or 1.0 for index in indices])
+        self._gains = np.array([_plain_gain(model, index) or 1.0 for index in every])
         self._disturber = Disturber(disturbances, step_duration, largest * np.abs(self._gains), 1)
+        # loads are on joints, one for each motor; commands, one for each of its actuators
         self._dofs = [_dof(model, index) for index in indices] if self._pulses else []
+        self._loaded = [every.index(index) for index in indices]
 
     def _command(self, model: mujoco.MjModel, meant: Mapping[int, Command]) -> None:
         """Take units and limits of commands."""
@@ -212,8 +216,8 @@ class ControlCommands:
             name, arm = model.actuator(index).name or f"actuator {index}", command.actuator.arm_radius
             if gain is None:
                 raise ValueError(
-                    f"{name}: is no plain motor, whose force is its control times a gain: use action='force', the "
-                    "environment's own"
+                    f"{name}: is no plain motor of its own, whose force is its control times a gain: use "
+                    "action='force', the environment's own"
                 )
             torque, limit = command.torque_per_unit, command.limit
             self._scales[control] = scale = torque * arm if command.actuator.MOTION else torque / (arm * gain)
@@ -224,6 +228,14 @@ class ControlCommands:
                     f"{name}: a command [{command.unit}] needs a limit, and neither the motor nor the environment's "
                     "control has one: give the motor's controller one"
                 )
+            reach = limit * abs(scale * gain)
+            if model.actuator_forcelimited[index] and not command.actuator.MOTION:
+                least = np.abs(model.actuator_forcerange[index]).min()
+                if reach > least * (1.0 + 1e-6):
+                    raise ValueError(
+                        f"{name}: forcerange = {least:g}: would cut commands of up to {limit:g} {command.unit}, which "
+                        f"stand for {reach:g} there: take the range out of the model, or use action='force'"
+                    )
             low[control], high[control] = -limit, limit
             model.actuator_ctrllimited[control] = True
             model.actuator_ctrlrange[control] = -limit * abs(scale), limit * abs(scale)
@@ -254,7 +266,7 @@ class ControlCommands:
         arrived[self._controls] = commands / self._gains
         if self._pulses:
             self._data.qfrc_applied[self._dofs] = 0.0
-            np.add.at(self._data.qfrc_applied, self._dofs, loads)
+            np.add.at(self._data.qfrc_applied, self._dofs, loads[self._loaded])
         return arrived
 
 
@@ -273,4 +285,4 @@ def _plain_gain(model: mujoco.MjModel, index: int) -> float | None:
     kinds = (model.actuator_gaintype[index], model.actuator_biastype[index], model.actuator_dyntype[index])
     plain = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE)
     gain = float(model.actuator_gainprm[index, 0])
-    return gain if kinds == plain and gain != 0.0 else None
+    return gain if kinds == plain and gain != 0.0 and len(sharing(model, index)) == 1 else None

@@ -15,7 +15,7 @@ from codrl_mj.actuators import ActuatorModel, mapping_of, names_together
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve
 from codrl_mj.envs.distributions import Distribution, paths_of
 from codrl_mj.envs.worlds import World, find_world
-from codrl_mj.fields import check_names
+from codrl_mj.fields import check_joint_dynamics, check_names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +60,9 @@ class EnvConfig:
     """Imperfections of the commands' way, and load pulses; each is off at 0."""
     joint: Joint = PLAIN
     """What is added to the actuated joints."""
+    joint_dynamics: str | None = None
+    """In an environment of others, damping, armature and frictionloss that its model has where motors bring the same:
+    `keep` adds both, `replace` takes the model's out, for they are the motors' own; None keeps them and warns."""
     randomize: tuple[str, ...] | None = None
     """What to draw at every reset, as FIELD=DISTRIBUTION, such as 'motor.inductance=uniform(0.05, 0.2)'; distributions
     are uniform(LOW, HIGH), loguniform(LOW, HIGH) and choice(VALUE, ...). Fields are the actuator's, in an environment
@@ -88,6 +91,7 @@ class EnvConfig:
         for name in ("observe_actuator", "allow_unstable"):
             if not isinstance(kept[name], bool):
                 raise ValueError(f"{name} = {kept[name]!r}: must be true or false")
+        check_joint_dynamics(kept["joint_dynamics"])
         limit = kept["max_episode_steps"]
         if limit is not None and (isinstance(limit, bool) or not isinstance(limit, int) or limit < 1):
             raise ValueError(f"max_episode_steps = {limit!r}: must be an integer >= 1")
@@ -181,8 +185,10 @@ class EnvConfig:
 
     def as_mapping(self) -> dict[str, Any]:
         """The configuration as JSON-serialisable values; `from_mapping` reads it."""
+        # names of runs are hashes of this, and of those that do not have the field have to stay
+        recent = {"joint_dynamics"} if self.joint_dynamics is None else {*()}
         return {
-            **{field.name: getattr(self, field.name) for field in dataclasses.fields(self)},
+            **{one.name: getattr(self, one.name) for one in dataclasses.fields(self) if one.name not in recent},
             "actuator": _described(self.actuator),
             "disturbances": dataclasses.asdict(self.disturbances),
             "joint": dataclasses.asdict(self.joint),

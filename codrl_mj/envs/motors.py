@@ -13,7 +13,7 @@ from codrl_mj.actuators import ActuatorModel, Command, Family, Inputs, parameter
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.engine.families import HEAD, signals_at
-from codrl_mj.engine.reading import Readout, bring_to_rest, slots
+from codrl_mj.engine.reading import Readout, bring_to_rest, sharing, slots
 from codrl_mj.engine.specs import matched_by, names_of
 from codrl_mj.envs.commands import ControlCommands, command_of
 from codrl_mj.envs.distributions import paths_of
@@ -40,6 +40,8 @@ class MotorSettings:
     """Of commands, and load pulses."""
     allow_unstable: bool = False
     """As for `codrl_mj.motorise`."""
+    joint_dynamics: str | None = None
+    """Likewise."""
 
     @functools.cached_property
     def commands(self) -> dict[str, Command]:
@@ -158,7 +160,8 @@ class Motors:
 def motor_names(model: mujoco.MjModel, motors: Iterable[int]) -> tuple[str, ...]:
     """What motors are called: as their actuators, or else as what these drive; or else by their indices."""
     every = [own[0] if own else "" for own in names_of(model)]
-    return tuple(every[index] if every.count(every[index]) == 1 and every[index] else str(index) for index in motors)
+    own = [name if name and every.count(name) == 1 else str(index) for index, name in enumerate(every)]
+    return tuple(" & ".join(own[each] for each in sharing(model, index)) for index in motors)
 
 
 def sensor_names(motors: Mapping[str, Family]) -> tuple[str, ...]:

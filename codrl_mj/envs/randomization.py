@@ -17,6 +17,7 @@ from codrl_mj.actuators import (
     parameter_paths,
     unchecked,
 )
+from codrl_mj.engine.reading import sharing
 from codrl_mj.engine.specs import matched_by, names_of
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
@@ -259,7 +260,7 @@ def _matched(
     """Path -> which of the motors, in their order, it is drawn of, checked; none if it is the model's."""
     indices, simulated, varied = list(motors), list(motors.values()), variable(model) if distributions else ()
     names, rubbing = names_of(model), [mounts_of(model, index)[2] is not None for index in motors]
-    called = [names[index] for index in indices]
+    called = [[name for one in sharing(model, index) for name in names[one]] for index in indices]
     matched: dict[str, list[int]] = {}
     for path, distribution in distributions.items():
         pattern, field = split_path(path)

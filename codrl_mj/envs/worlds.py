@@ -50,7 +50,7 @@ class World(abc.ABC):
 
     name: str
     """What messages call it."""
-    fields: tuple[str, ...] = COMMON
+    fields: tuple[str, ...] = (*COMMON, "joint_dynamics")
     """Fields of an `EnvConfig` that it has; others have to be left at their defaults."""
     time_limit: int | None = None
     """The longest episode [environment steps]; None for any."""
@@ -121,7 +121,7 @@ class World(abc.ABC):
         """
         try:
             kept = json.loads(json.dumps(dict(given or {})))
-            if wrong := {"render_mode", *COMMON} & kept.keys():
+            if wrong := {"render_mode", *self.fields} & kept.keys():
                 raise ValueError(f"{wrong.pop()!r} is no argument of the environment's")
         except (TypeError, ValueError) as error:
             raise ValueError(
@@ -173,15 +173,17 @@ class World(abc.ABC):
 
     def overlaid(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
         """Pattern -> what drives these motors: `patterns`, and what a configuration has for others, motor by motor."""
+        from codrl_mj.engine.reading import sharing
         from codrl_mj.engine.specs import matched_by, names_of
 
         if all(one == IDEAL for one in config.actuators):
             return dict(patterns)
         with contextlib.closing(config.make()) as env:
-            names = names_of(env.unwrapped.model)
+            model = env.unwrapped.model
+            names = names_of(model)
         taken = {index for pattern in patterns for index in matched_by(pattern, names)}
         left = {
-            re.escape(names[index][0]): actuator
+            " & ".join(re.escape(names[one][0]) for one in sharing(model, index) if one not in taken): actuator
             for pattern, actuator in config.driven.items()
             for index in matched_by(pattern, names)
             if index not in taken

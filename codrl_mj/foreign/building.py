@@ -17,10 +17,16 @@ from codrl_mj.tasks import TASKS
 class Building:
     """The actuators for models yet to be built, and what was met of these."""
 
-    def __init__(self, actuators: Mapping[str, ActuatorModel], allow_unstable: bool = False) -> None:
-        """Take patterns and their actuators; a pattern may match nothing in some of the models."""
-        self.actuators = actuators
-        self._allow_unstable = allow_unstable
+    def __init__(
+        self,
+        actuators: Mapping[str, ActuatorModel],
+        allow_unstable: bool = False,
+        joint_dynamics: str | None = None,
+        action: str | None = None,
+    ) -> None:
+        """Take patterns and their actuators, and the action if it is known; a pattern may match nothing in a model."""
+        self.actuators, self._action = actuators, action
+        self._how = allow_unstable, joint_dynamics
         self._met: dict[str, list[list[str]]] = {}
 
     @contextlib.contextmanager
@@ -60,10 +66,17 @@ class Building:
         }
         if not wanted:
             return plain
+        for pattern, actuator in wanted.items() if self._action == "force" else ():
+            plainly = plain.actuator_biastype[matched_by(pattern, names)] == int(mujoco.mjtBias.mjBIAS_NONE)
+            if actuator.MOTION and plainly.any():
+                raise ValueError(
+                    f"action = 'force': {pattern!r}: the environment asks its actuators for forces, and a "
+                    f"{type(actuator).__name__} is asked for motions; must be {' or '.join(actuator.commands())}"
+                )
         with warnings.catch_warnings():  # MuJoCo's of the model, which building it without motors has shown
             ours = r"codrl_mj\.(engine\.specs|foreign\.building)"
             warnings.filterwarnings("ignore", category=UserWarning, module=ours)
-            return motorise(spec(), wanted, self._allow_unstable).compile()
+            return motorise(spec(), wanted, *self._how).compile()
 
     def check(self, env_id: str = "") -> None:
         """Refuse patterns that matched nothing, and an environment, of Gymnasium's if it has an id, without a model."""
@@ -82,7 +95,9 @@ class Building:
 
 
 @contextlib.contextmanager
-def motorised(actuators: Mapping[str, Any], allow_unstable: bool = False) -> Iterator[None]:
+def motorised(
+    actuators: Mapping[Any, Any], allow_unstable: bool = False, joint_dynamics: str | None = None
+) -> Iterator[None]:
     """Put motors into any environment that is built inside: Gymnasium's, dm_control's, anybody's.
 
     Models that this thread builds by `mujoco.MjModel.from_xml_path` or `from_xml_string` in the block go through
@@ -95,11 +110,12 @@ def motorised(actuators: Mapping[str, Any], allow_unstable: bool = False) -> Ite
     Args:
         actuators: as for `codrl_mj.motorise`; a pattern has to match something in one of the models at least.
         allow_unstable: likewise.
+        joint_dynamics: likewise.
 
     Raises:
         ValueError: see `codrl_mj.motorise`; or, at the end, no model was built inside, or a pattern matched nothing.
     """
-    building = Building(resolve_patterns(actuators, "another's environment"), allow_unstable)
+    building = Building(resolve_patterns(actuators, "another's environment"), allow_unstable, joint_dynamics)
     with building.motorising():
         yield
     building.check()

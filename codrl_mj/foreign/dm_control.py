@@ -32,7 +32,7 @@ class MotorisedEnvironment(dm_env.Environment):
     ) -> None:
         """Build it."""
         self._settings = settings
-        self._building = Building(settings.simulated, settings.allow_unstable)
+        self._building = Building(settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action)
         with self._building.motorising():
             self._environment = build()
         self._building.check()
@@ -145,12 +145,13 @@ class MotorisedEnvironment(dm_env.Environment):
 
 def make_dm_control(
     environment: str | Callable[..., dm_env.Environment],
-    actuators: Mapping[str, Any],
+    actuators: Mapping[Any, Any],
     *,
     action: str = "force",
     randomize: Mapping[str, Any] | None = None,
     disturbances: Any = None,
     allow_unstable: bool = False,
+    joint_dynamics: str | None = None,
     noise_seed: int | None = None,
     **options: Any,
 ) -> MotorisedEnvironment:
@@ -168,6 +169,7 @@ def make_dm_control(
             every reset.
         disturbances: see there; actions have to be the model's controls.
         allow_unstable: see there.
+        joint_dynamics: see there.
         noise_seed: of the noise of the motors' sensors, of draws and of load pulses.
         **options: of `dm_control.suite.load`, or of the function.
 
@@ -178,9 +180,8 @@ def make_dm_control(
     """
     check_dm_control()
     resolved = resolve_patterns(actuators, "an environment of dm_control")
-    settings = MotorSettings(
-        resolved, action, randomize=randomize, disturbances=resolve(disturbances, OFF), allow_unstable=allow_unstable
-    )
+    disturbed = resolve(disturbances, OFF)
+    settings = MotorSettings(resolved, action, False, randomize, disturbed, allow_unstable, joint_dynamics)
     if not isinstance(environment, str):
         return MotorisedEnvironment(lambda: environment(**options), settings, noise_seed)
     domain, _, task = environment.partition("/")

@@ -34,13 +34,14 @@ from codrl_mj.physics.streams import words_of
 
 def make(
     env_id: str | Callable[..., Any],
-    actuators: Mapping[str, Any],
+    actuators: Mapping[Any, Any],
     *,
     action: str = "force",
     observe_actuator: bool = False,
     randomize: Mapping[str, Any] | None = None,
     disturbances: Any = None,
     allow_unstable: bool = False,
+    joint_dynamics: str | None = None,
     **options: Any,
 ) -> "MotorisedEnv":
     """An environment of Gymnasium's, or of anybody's who registers with it, with motors behind its actuators.
@@ -63,6 +64,7 @@ def make(
             `codrl_mj.Disturbances`. Of a plain motor in its force [N or N*m] before the gear, of others in what their
             control stands for.
         allow_unstable: as for `codrl_mj.motorise`.
+        joint_dynamics: likewise.
         **options: of `gymnasium.make` and the environment, such as `render_mode` and `max_episode_steps`.
 
     Raises:
@@ -86,6 +88,7 @@ def make(
         randomize,
         resolve(disturbances, OFF),
         allow_unstable,
+        joint_dynamics,
     )
     spec, makes = copy.copy(entry), entry.entry_point
     spec.entry_point = Motorised(load_env_creator(makes) if isinstance(makes, str) else makes, settings, env_id)
@@ -110,7 +113,8 @@ class Motorised:
 
     def __call__(self, **options: Any) -> gymnasium.Env:
         """Make it."""
-        building = Building(self.settings.simulated, self.settings.allow_unstable)
+        settings = self.settings
+        building = Building(settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action)
         with building.motorising():
             env = self.creator(**options)
         building.check(self.env_id)

@@ -32,9 +32,11 @@ from codrl_mj.actuators import (
 from codrl_mj.engine import load_family
 from codrl_mj.engine.doors import shaft_inertia
 from codrl_mj.engine.families import SLOT, Slot, slot_size
-from codrl_mj.engine.reading import slots
+from codrl_mj.engine.reading import sharing, slots
+from codrl_mj.engine.specs import doubled
 from codrl_mj.physics import Plant, install_callbacks, motors
 from codrl_mj.physics.mjcf import task_model
+from codrl_mj.physics.variation import without_motors
 from codrl_mj.tasks import find_task, resolve_actuators
 from codrl_mj.validation.compare import STAND_IN, actuators_of
 from codrl_mj.validation.execution import UNIT, commands, differing
@@ -145,8 +147,11 @@ def motor_checks(model: mujoco.MjModel, quick: bool) -> Iterator[Check | Skipped
     """The motors of a model whose callbacks are installed: stable, in step with Python, and each loop alone."""
     named = {at: model.actuator(at).name or f"actuator {at}" for at in range(model.nactuator)}
     ours = motors(model)
-    if foreign := [model.actuator(at).name or str(at) for at in named if at not in ours]:
+    driven = {one for at in ours for one in sharing(model, at)}
+    if foreign := [model.actuator(at).name or str(at) for at in named if at not in driven]:
         yield Skipped(f"actuators {', '.join(foreign)}", "not motors of codrl_mj, which leaves them alone")
+    for text in doubled(without_motors(model, ours), ours):
+        yield Skipped("whether a motor is counted twice", f"this cannot be seen in a compiled model: {text}")
     running = {}
     for at, actuator in ours.items():
         group = int(model.actuator_group[at])

@@ -297,6 +297,13 @@ def test_a_servo_of_ours_is_asked_for_positions():
     assert abs(info["error"] - 0.5) < 0.2 * 0.5 + abs(model.actuator_gear[0, 0] * data.qpos[0])
 
 
+def test_forces_of_an_environment_are_no_motions_of_a_servo():
+    """Else 1 N would be taken for 1 m."""
+    message = "action = 'force': '.*': the environment asks its actuators for forces, and a Servo .* must be position"
+    with pytest.raises(ValueError, match=message):
+        codrl_mj.make("InvertedPendulum-v5", {".*": Servo()}, allow_unstable=True)
+
+
 def test_a_servo_of_the_models_stays_one():
     """What it asks for, kp*(target - q) - kv*w, is the desired torque."""
     env = codrl_mj.make(ARM_ID, {"servo": TorqueSpeed(stall_torque=5.0, no_load_speed=10.0, max_torque=5.0)})

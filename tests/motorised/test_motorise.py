@@ -101,7 +101,7 @@ SITE = '<general name="push" site="here" gear="1 0 0 0 0 0"/>'
         ((SITE,), {"push": RUBBING}, "it drives neither a joint nor a tendon, which the friction"),
         (THREE, {"hip": "lag"}, "'hip': no actuator has such a name, nor drives anything that has"),
         (THREE, {"hip_rihgt": "lag"}, r"did you mean 'hip_right'\? there are left, hip_left, hip_right, "),
-        ((), {".*": "lag"}, "there are none"),
+        ((), {".*": "lag"}, "the model has no actuators.*mechanicalReduction.*Add one per joint"),
         (THREE, {"left": "lag", "hip_.*": "ideal"}, r"actuator left of hip_left: both 'left' and 'hip_.*' match it"),
         (PAIR, {".*": "lag"}, re.escape(TWICE)),
         (THREE, {"*": "lag"}, r"'\*': must be a regular expression \(nothing to repeat"),
@@ -181,7 +181,7 @@ def test_inertia_and_friction_are_added_to_the_joint_through_the_gear(integrator
     by_hand.joint("upper").armature += 9 * 0.004
     by_hand.joint("upper").damping[0] += 9 * 2 * 0.004
     by_hand.joint("upper").frictionloss += 3 * 3 * 0.004
-    added = codrl_mj.motorise(spec(), {"one": Worn(rotor=0.004)})
+    added = codrl_mj.motorise(spec(), {"one": Worn(rotor=0.004)}, joint_dynamics="keep")
     expected = codrl_mj.motorise(by_hand, {"one": Worn()})
     inputs = controls(200, 2)
     np.testing.assert_allclose(trajectory(added.compile(), inputs), trajectory(expected.compile(), inputs), atol=1e-11)
@@ -208,3 +208,56 @@ def test_motorised_models_are_attached_to_others():
     both, one = trajectory(model, np.tile(inputs, 2)), trajectory(alone, inputs)
     np.testing.assert_allclose(both[:, :2], one[:, :2], rtol=0, atol=1e-12)
     np.testing.assert_allclose(both[:, 2:4], one[:, :2], rtol=0, atol=1e-12)
+
+
+CABLE = """
+<mujoco>
+  <worldbody><site name="spool" pos="-.05 0 .02"/>
+    <body><joint name="knuckle" axis="0 1 0"/><geom name="pulley" type="cylinder" size=".01 .01" euler="90 0 0"/>
+      <geom type="capsule" fromto="0 0 0 .05 0 0" size=".006"/><site name="pull" pos=".03 0 .008"/>
+      <site name="side" pos="0 0 .02"/></body></worldbody>
+  <tendon><spatial name="rope"><site site="spool"/>{}<site site="pull"/></spatial></tendon>
+  <actuator><motor name="flexor" tendon="rope"/></actuator>
+</mujoco>
+"""
+PULLEY = '<geom geom="pulley" sidesite="side"/>'
+
+
+def test_a_rotor_has_no_place_on_a_tendon_around_a_geom():
+    around, straight = (mujoco.MjSpec.from_string(CABLE.format(via)) for via in (PULLEY, ""))
+    message = "actuator flexor of rope: cannot be motorised: its tendon wraps around geom pulley, where MuJoCo has no"
+    with pytest.raises(ValueError, match=message):
+        codrl_mj.motorise(around, {"flexor": Worn(rotor=0.1)})
+    codrl_mj.motorise(around, {"flexor": Worn()}).compile()
+    assert codrl_mj.motorise(straight, {"flexor": Worn(rotor=0.1)}).compile().actuator_armature[0] == 0.1
+    around.actuators[0].armature = 0.1
+    with pytest.raises(ValueError, match="geom wrapping"):  # why: MuJoCo says this of any armature there
+        around.compile()
+
+
+def test_a_urdf_s_joint_gets_a_motor_as_the_message_says():
+    urdf = """<robot name="r"><link name="base"/><link name="arm"><inertial><mass value="1"/><origin xyz="0.1 0 0"/>
+<inertia ixx=".001" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="shoulder"
+type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="5"
+velocity="3"/></joint></robot>"""
+    spec = mujoco.MjSpec.from_string(urdf)
+    with pytest.raises(ValueError, match="'shoulder': the model has no actuators") as refused:
+        codrl_mj.motorise(spec, {"shoulder": "lag"})
+    remedy = re.search(r"spec\.add_actuator\(.*\)", str(refused.value)).group().replace("'JOINT'", "'shoulder'")
+    eval(remedy, {"spec": spec, "mujoco": mujoco})
+    model = codrl_mj.motorise(spec, {"shoulder": "ideal"}).compile()
+    data = mujoco.MjData(model)
+    data.ctrl[0] = 0.5
+    mujoco.mj_forward(model, data)
+    assert data.qfrc_actuator[0] == 0.5
+
+
+@pytest.mark.parametrize(("kind", "controls"), [("position", "velocity"), ("velocity", "position")])
+def test_a_servo_reads_a_control_as_the_model_means_it(kind, controls):
+    """Else 0.5 rad/s would be taken for 0.5 rad, or the other way round."""
+    spec = _spec(f'<{kind} name="it" joint="hip_left"/>')
+    servo = {"family": "servo", "controller": {"sample_rate": 10e3}, "loop": {"controls": controls}}
+    with pytest.raises(ValueError, match=f"its control is a {kind}, and its motor is asked for a {controls}"):
+        codrl_mj.motorise(spec, {"it": servo}, allow_unstable=True)
+    servo["loop"]["controls"] = kind
+    codrl_mj.motorise(spec, {"it": servo}, allow_unstable=True)
