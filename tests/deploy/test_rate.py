@@ -22,6 +22,7 @@ class Repeating(gym.Wrapper):
     """Each action for several steps, as many as the list says in turn."""
 
     def __init__(self, env, repeats):
+        """Wrap an environment."""
         super().__init__(env)
         self.repeats, self.count = repeats, 0
 
@@ -36,13 +37,14 @@ class OfDmControl(gym.Env):
     """An environment of dm_control's behind Gymnasium's interface."""
 
     def __init__(self, domain, task):
+        """Load it."""
         self.inner = suite.load(domain, task, task_kwargs={"random": 0})
         self.model, self.data = self.inner.physics.model.ptr, self.inner.physics.data.ptr
         spec = self.inner.action_spec()
         self.action_space = spaces.Box(spec.minimum, spec.maximum, dtype=np.float64)
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.model.nq,), np.float64)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed=None, options=None):  # noqa: ARG002
         super().reset(seed=seed)
         self.inner.reset()
         return self.data.qpos.copy(), {}
