@@ -72,7 +72,7 @@ class Export:
         print_table(f"{contract.task}, {subject.agent}, {contract.rate:g} Hz", ("", "name", "unit", "range"), rows)
         weights = network_of(subject.policy).size
         if contract.controller["loop"] is None and contract.actuators:
-            why = f"this policy commands {env.action}s" if env.action != "force" else "the motors differ, or have none"
+            why = f"this policy commands a {env.action}" if env.action != "force" else "the motors differ, or have none"
             print(f"no current loop: {why}")
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
         names = env.task, *(family_name(type(one)) for one in env.actuators)
@@ -166,7 +166,7 @@ class Test:
             ("episodes within 1 %", f"{done.alike} of {self.episodes}"),
             ("frames: sent, refused, without an answer", f"{done.frames}, {done.refused}, {done.unanswered}"),
             ("observations beyond the limits", f"{done.stopped}"),
-            ("samples of the current loop", f"{done.samples or 'none: the simulation closes it'}"),
+            ("samples of the current loop", f"{done.samples or 'none'}"),
             ("frames and samples a second", f"{done.rate:.0f}"),
             ("instructions of a policy step, a sample", taken),
         ]

@@ -248,20 +248,18 @@ class Board(contextlib.AbstractContextManager["Board"]):
 
     def _with_bridge(self) -> EnvConfig:
         """Return the environment with a bridge of `pwm_bits` behind a policy that commands the voltages itself."""
-        motor, disturbances = self.env.actuators[0], self.env.disturbances
+        motor, disturbances, link = self.env.actuators[0], self.env.disturbances, self.link
         refusals = {
             "the simulation closes the current loop: leave --no-loop out": self.contract.controller["loop"] is not None,
             "the C neither closes a current loop nor commands a voltage": self.env.action != "voltage",
-            "the policy commands voltages, and the C measures no current": self.link.current_bits > 0,
+            "the policy commands voltages, and the C measures no current": link.current_bits > 0,
             "the motors differ": any(one != motor for one in self.env.actuators),
             "the environment has a disturbances.command_quantum already": disturbances.command_quantum > 0.0,
         }
-        if reason := next((text for text, is_so in refusals.items() if is_so), ""):
-            raise ValueError(
-                f"current_bits = {self.link.current_bits}, pwm_bits = {self.link.pwm_bits}: must be 0: {reason}"
-            )
+        for reason in (text for text, applies in refusals.items() if applies):
+            raise ValueError(f"current_bits = {link.current_bits}, pwm_bits = {link.pwm_bits}: must be 0: {reason}")
         command = motor.commands()["voltage"]
-        step = 2.0 * float(command.limit or 0.0) / 2**self.link.pwm_bits
+        step = 2.0 * float(command.limit or 0.0) / 2**link.pwm_bits
         quantum = step * command.torque_per_unit / command.actuator.arm_radius
         return dataclasses.replace(self.env, disturbances=dataclasses.replace(disturbances, command_quantum=quantum))
 

@@ -123,13 +123,13 @@ class Network:
         statistics = 0 if self.normalization is None else 2 * len(self.normalization.mean)
         return statistics + sum(layer.weight.size + layer.bias.size for layer in self.layers)
 
-    def first_step(self, index: int) -> dict[str, float]:
+    def first_step(self, index: int) -> dict[str, float | None]:
         """Return what is done to an entry of the observation before the first layer, as a contract has it."""
         factor, norm = float(self.factors[index]), self.normalization
         if norm is None:
             return {"scale": factor, "offset": 0.0}
         mean, deviation = float(norm.mean[index]), float(norm.deviation[index])
-        told = {"mean": mean, "variance": deviation**2, "clip": norm.clip}
+        told = {"mean": mean, "variance": deviation**2, "clip": norm.clip if np.isfinite(norm.clip) else None}
         return {"scale": factor / deviation, "offset": -factor * mean / deviation, **told}
 
 

@@ -51,7 +51,7 @@ class Tiles:
         weights = node("Gather", self.table, node("Add", within, first), axis=0)
         return str(node("ArgMax", node("ReduceSum", weights, np.array([1]), keepdims=0), axis=1, keepdims=0))
 
-    def first_step(self, index: int) -> dict[str, float]:
+    def first_step(self, index: int) -> dict[str, float | None]:
         """As of a `Network`."""
         return {"scale": float(self.factors[index]), "offset": 0.0}
 

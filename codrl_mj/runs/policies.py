@@ -194,7 +194,7 @@ def _check_whole(path: Path, model: Any) -> None:
     # Only VecNormalize gives PPO and A2C original observations; algorithms with a replay buffer always keep some.
     if is_on_policy and model._last_original_obs is not None:
         reason = "its last observations were normalized"
-    elif isinstance(space, spaces.Box) and not _is_within(seen, space):
+    elif isinstance(seen, np.ndarray) and ((seen < space.low - 1e-4) | (seen > space.high + 1e-4)).any():
         reason = "its last observations lie outside of its observation space, as normalized ones do"
     elif beside:
         reason = f"{', '.join(map(str, sorted(beside)[:3]))} may have its statistics"
@@ -205,39 +205,35 @@ def _check_whole(path: Path, model: Any) -> None:
         warnings.warn(f"{path} does not say whether it was trained behind VecNormalize: if so, {remedy}", stacklevel=3)
 
 
-def _is_within(observations: Any, space: spaces.Box) -> bool:
-    """Return whether observations, if there are any, are within a space but for rounding."""
-    return observations is None or bool(
-        ((observations >= space.low - 1e-4) & (observations <= space.high + 1e-4)).all()
-    )
-
-
 def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
-    """Refuse an environment with other observations or actions than those of a policy's training.
+    """Refuse an environment with other observations or actions than those of a policy's training, if it tells them.
 
-    Args:
-        policy: as `load_policy` and `load_sb3_zip` return it; others may have no spaces to compare.
-        env: what it is to act in.
-        exact: whether actions of other bounds are refused; else there is a warning.
-
-    Raises:
-        ValueError: a space differs; the message has both, and the settings that decide on it.
+    Unless `exact`, actions that differ in their bounds alone are warned of.
     """
     with contextlib.closing(env.make()) as made:
-        pairs = {
-            name: (getattr(policy, name, None), getattr(made, name)) for name in ("observation_space", "action_space")
-        }
-    for name, (trained, present) in pairs.items():
-        if trained is None or _is_same(trained, present):
+        present = {name: getattr(made, name) for name in ("observation_space", "action_space")}
+    for name, space in present.items():
+        if (trained := getattr(policy, name, None)) is None or _is_same(trained, space):
             continue
-        text = f"{name}: the policy was trained with {trained}, {env.task} as it is set has {present}"
-        if isinstance(trained, spaces.Box) and isinstance(present, spaces.Box) and len(trained.shape) == 1:
-            frames, rest = divmod(trained.shape[0], max(1, *present.shape))
-            text += f" ({frames} stacked frames, VecFrameStack, are not supported)" * (frames > 1 and rest == 0)
+        text = f"{name}: the policy was trained with {trained}, {env.task} as it is set has {space}"
+        if frames := _stacked(trained, space):
+            raise ValueError(f"{text}: {frames} stacked frames (VecFrameStack) are not supported: train with one")
         text += ": set what it was trained with, by --env.action, --env.observe-actuator, --actuator, --env.options"
-        if exact or name != "action_space" or not _is_same(trained, present, bounds=False):
+        if exact or name != "action_space" or not _is_same(trained, space, bounds=False):
             raise ValueError(text)
         warnings.warn(text, stacklevel=2)
+
+
+def _stacked(trained: Any, space: Any) -> int:
+    """Return how many observations of a space are stacked in one of the training; 0 if they are not."""
+    if not (isinstance(trained, spaces.Box) and isinstance(space, spaces.Box) and len(trained.shape) == 1):
+        return 0
+    count = trained.shape[0] // max(1, *space.shape)
+    return (
+        count
+        if count > 1 and _is_same(trained, spaces.Box(np.tile(space.low, count), np.tile(space.high, count)))
+        else 0
+    )
 
 
 def _is_same(one: Any, other: Any, bounds: bool = True) -> bool:

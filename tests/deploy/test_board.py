@@ -465,13 +465,7 @@ def test_a_program_that_ends_is_an_error(folder, tmp_path, capsys):
 def test_what_cannot_be_run_is_said(folder, tmp_path, monkeypatch, capsys):
     for line, says in {
         ("test", str(folder), "--lost", "1.5"): "Link.lost = 1.5: must be a finite number >= 0 and <= 1",
-        (
-            "test",
-            str(folder),
-            "--no-loop",
-            "--pwm-bits",
-            "8",
-        ): "the simulation closes the current loop: leave --no-loop",
+        ("test", str(folder), "--no-loop", "--pwm-bits", "8"): "the simulation closes the current loop: leave",
         ("test", str(folder), "--target", "avr"): "avr",
         ("test", str(tmp_path)): "contract.json",
     }.items():

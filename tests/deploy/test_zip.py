@@ -238,13 +238,14 @@ def test_volts_are_not_exported_as_torques(volts, tmp_path, capsys):
     assert "Box(-12.0, 12.0, (1,), float32)" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
     assert main(["export", path, *ZIP, "--env.action", "voltage", "--actuator", motor, "--out", "out"]) == 0
-    assert "no current loop: this policy commands voltages" in capsys.readouterr().out
+    assert "no current loop: this policy commands a voltage" in capsys.readouterr().out
     (acts,) = Contract.read(tmp_path / "out").actions
     assert (acts["unit"], acts["least"], acts["most"]) == ("V", -12.0, 12.0)
     with pytest.raises(ValueError, match=r"Box\(-12\.0, 12\.0.*has Box\(-2\.0, 2\.0"):
         export(load_sb3_zip(volts / "policy.zip", "ppo", True), EnvConfig("pendulum"), "ppo", tmp_path / "other")
 
 
+@pytest.mark.filterwarnings("default::UserWarning")
 def test_another_motor_in_an_evaluation_is_warned_of(volts, capsys):
     line = ["evaluate", str(volts / "policy.zip"), *ZIP, "--episodes", "1", "--env.action", "voltage"]
     assert main([*line, "--actuator", "paper", "--actuator.controller.max-voltage", "6"]) == 0
@@ -259,7 +260,7 @@ def test_other_observations_are_refused(tmp_path, capsys):
     envs = codrl_mj.make_sb3_vec_env(TASK_IDS["pendulum"], 1, actuator="paper", observe_actuator=True)
     model_of("ppo", envs).save(tmp_path / "current.zip")
     assert main(["export", "stacked.zip", *ZIP]) == 2
-    assert "(4 stacked frames, VecFrameStack, are not supported)" in capsys.readouterr().err
+    assert "4 stacked frames (VecFrameStack) are not supported" in capsys.readouterr().err
     assert main(["export", "current.zip", *ZIP]) == 2
     assert "observation_space: the policy was trained with" in capsys.readouterr().err
     line = ["export", "current.zip", *ZIP, "--episodes", "1", "--actuator", "paper", "--env.observe-actuator"]
