@@ -228,12 +228,10 @@ def _stacked(trained: Any, space: Any) -> int:
     """Return how many observations of a space are stacked in one of the training; 0 if they are not."""
     if not (isinstance(trained, spaces.Box) and isinstance(space, spaces.Box) and len(trained.shape) == 1):
         return 0
-    count = trained.shape[0] // max(1, *space.shape)
-    return (
-        count
-        if count > 1 and _is_same(trained, spaces.Box(np.tile(space.low, count), np.tile(space.high, count)))
-        else 0
-    )
+    count, rest = divmod(trained.shape[0], max(1, *space.shape))
+    # VecFrameStack repeats each bound, others repeat them all: their order is not compared.
+    repeated = np.sort(np.repeat(space.high, count)), np.sort(trained.high)
+    return count if count > 1 and not rest and np.allclose(*repeated, rtol=1e-5) else 0
 
 
 def _is_same(one: Any, other: Any, bounds: bool = True) -> bool:

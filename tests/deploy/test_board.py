@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -20,6 +21,7 @@ from codrl_mj.deploy import board as boards
 from codrl_mj.deploy.board import TARGETS, missing_tools
 from codrl_mj.deploy.wire import Wire
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.tasks import TASKS
 from tests.deploy.test_export import trained
 from tests.deploy.test_run import with_sensors
 from tests.matrix import but
@@ -173,17 +175,26 @@ def test_without_a_loop_and_a_voltage_there_is_no_bridge(tmp_path):
         board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=8))
 
 
-def test_a_contract_that_names_a_module_takes_trust(tmp_path, monkeypatch, capsys):
+def forget():
+    """Let the example's module and its task be as in a new process."""
+    sys.modules.pop("ball_and_beam", None)
+    if "ball_and_beam" in TASKS:
+        gym.registry.pop(TASKS.pop("ball_and_beam").env_id)
+
+
+def test_a_contract_that_names_a_module_takes_trust(tmp_path, monkeypatch, capsys, request):
     example = Path(__file__).parents[2] / "examples/own_robot"
     shutil.copytree(example, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
+    request.addfinalizer(forget)
+    forget()
     monkeypatch.setattr(sys, "path", [one for one in sys.path if one])
     with monkeypatch.context() as patched:
         patched.syspath_prepend(tmp_path)
         env = EnvConfig("ball_and_beam:TASK", max_episode_steps=20)
         export(trained("ball_and_beam:TASK", "ppo")[0], env, "ppo", tmp_path / "out", 1)
     for line in (["board", "test", "out", "--log", "a.csv"], ["identify", "compare", "out", "a.csv"]):
-        monkeypatch.delitem(sys.modules, "ball_and_beam", raising=False)
+        forget()
         monkeypatch.setattr(sys, "path", [one for one in sys.path if one != str(tmp_path)])
         options = ["--episodes", "1"] if line[0] == "board" else []
         assert main([*line, *options]) == 2
