@@ -260,7 +260,7 @@ def test_other_observations_are_refused(tmp_path, capsys):
     envs = codrl_mj.make_sb3_vec_env(TASK_IDS["pendulum"], 1, actuator="paper", observe_actuator=True)
     model_of("ppo", envs).save(tmp_path / "current.zip")
     assert main(["export", "stacked.zip", *ZIP]) == 2
-    assert "4 stacked frames (VecFrameStack) are not supported" in capsys.readouterr().err
+    assert "(4 times as many: stacked frames, as of VecFrameStack, are not supported)" in capsys.readouterr().err
     assert main(["export", "current.zip", *ZIP]) == 2
     assert "observation_space: the policy was trained with" in capsys.readouterr().err
     line = ["export", "current.zip", *ZIP, "--episodes", "1", "--actuator", "paper", "--env.observe-actuator"]
