@@ -153,6 +153,8 @@ def read_yaml(path: Path) -> Any:
 
 
 _TRUSTED = contextvars.ContextVar("trusted", default=True)
+FILES_TRUSTED = contextvars.ContextVar("files_trusted", default=True)
+"""Whether actuator files may name modules; the command line sets it to its `--trust`."""
 
 
 @contextlib.contextmanager
@@ -163,6 +165,11 @@ def trusting(trust: bool) -> Iterator[None]:
         yield
     finally:
         _TRUSTED.reset(token)
+
+
+def trusting_files() -> contextlib.AbstractContextManager[None]:
+    """While the block runs, let `module:NAME` of an actuator file import modules only if files are trusted."""
+    return trusting(_TRUSTED.get() and FILES_TRUSTED.get())
 
 
 def load_module(text: str) -> Any:

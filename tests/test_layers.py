@@ -41,7 +41,7 @@ ALLOWED = {
     "runs": set(),
     "runs.files": set(),
     "runs.summaries": {"actuators", "envs.worlds", "fields", "runs.files", "runs", "tasks"},
-    "runs.policies": {"actuators", "agents", "runs.files", "runs"},
+    "runs.policies": {"actuators", "agents", "envs.config", "runs.files", "runs"},
     "evaluation.measures": set(),
     "evaluation": {
         *("actuators", "envs", "envs.config", "envs.worlds", "evaluation.measures", "physics", "runs.files"),
@@ -77,7 +77,7 @@ ALLOWED = {
     },
     "cli": {
         *("actuators", "agents", "catalogue", "disturbances", "envs.config", "envs.worlds", "evaluation"),
-        *("deploy", "evaluation.measures", "fields", "films", "kept"),
+        *("deploy", "evaluation.measures", "fields", "films", "kept", "own_code"),
         *(
             "foreign",
             "identify",

@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -10,8 +11,11 @@ import pytest
 
 import codrl_mj
 from codrl_mj.actuators import resolve
+from codrl_mj.cli import find_verb, main
+from codrl_mj.cli.environments import environment
 from codrl_mj.engine import load_family
 from codrl_mj.engine.families import compiled_observe
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.foreign import environments
 from codrl_mj.own_code import read_yaml
 from codrl_mj.physics.compiled_task import compiled_constrain, compiled_outcomes
@@ -195,3 +199,25 @@ def test_what_is_no_yaml_file_is_refused_with_its_line(tmp_path):
         file.write_bytes(content)
         with pytest.raises(ValueError, match=message):
             read_yaml(file)
+
+
+def test_an_actuator_file_names_modules_only_with_trust(tmp_path, monkeypatch, capsys):
+    """A file comes from elsewhere more often than the words of a command line."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def made(verb):
+        return int(environment(verb, "cartpole", verb.actuator_name, EnvConfig("cartpole")) is None)
+
+    monkeypatch.setattr(find_verb("evaluate"), "run", made)
+    Path("of_theirs.py").write_text("open('executed', 'w').close()\nfrom codrl_mj.actuators import Lag as Theirs\n")
+    Path("theirs.yaml").write_text("family: of_theirs:Theirs\n")
+    Path("all.yaml").write_text("'.*': {family: 'of_theirs:Theirs'}\n")
+    for flags in (["--actuator", "theirs.yaml"], ["--actuators", ".*=theirs.yaml"], ["--actuators", "all.yaml"]):
+        line = ["evaluate", "run", "--task", "cartpole", *flags]
+        assert main(line) == 2
+        assert "'of_theirs:Theirs': needs the module of_theirs" in capsys.readouterr().err
+        assert not Path("executed").exists()
+        assert main([*line, "--trust"]) == 0
+        Path("executed").unlink()
+        sys.modules.pop("of_theirs")

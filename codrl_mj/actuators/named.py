@@ -14,7 +14,7 @@ from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name
 from codrl_mj.actuators.servo import Servo
-from codrl_mj.own_code import look_up, read_yaml
+from codrl_mj.own_code import look_up, read_yaml, trusting_files
 
 NAMED: dict[str, tuple[str, Callable[[Actuator], ActuatorModel]]] = {
     "ideal": ("force = desired force: no motor at all", lambda _: IDEAL),
@@ -232,7 +232,8 @@ def _from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
         other = Path(str(fields.get("name")))
         if other.suffix in _FILES and Path(str(_read(other)[0].get("name"))).suffix in _FILES:
             raise ValueError(f"name = {fields['name']!r}: must be an actuator's name, or a file that names no other")
-        made = resolve(fields, paper, whose)
+        with trusting_files():
+            made = resolve(fields, paper, whose)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
     stem = path.stem if path.stem not in ("actuator", "actuators") else path.absolute().parent.name

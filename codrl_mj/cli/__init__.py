@@ -1,6 +1,7 @@
 """The command line: parses, calls the package, prints. Nothing imports it."""
 
 import contextlib
+import contextvars
 import dataclasses
 import importlib
 import io
@@ -23,6 +24,7 @@ import mujoco
 import codrl_mj
 from codrl_mj.cli.extras import missing_module_message
 from codrl_mj.cli.parsing import parse, understood
+from codrl_mj.own_code import FILES_TRUSTED
 from codrl_mj.runs.files import check_file, check_page, check_writable
 
 SAYS: dict[str, tuple[str, str]] = {
@@ -112,11 +114,13 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     with warnings.catch_warnings(), _engine_warnings():
         warnings.showwarning = _show_warning
-        return _run([word for word in given if word != "--traceback"], "--traceback" in given)
+        words = [word for word in given if word != "--traceback"]
+        return contextvars.copy_context().run(_run, words, "--traceback" in given)
 
 
 def _run(arguments: list[str], traced: bool) -> int:
     try:
+        FILES_TRUSTED.set("--trust" in arguments)
         words = understood(arguments)
         name = next((one for one in (" ".join(words[:2]), *words[:1]) if one in VERBS), None)
         if name is None:

@@ -7,8 +7,12 @@ from typing import Annotated, Any
 
 import tyro
 
+from codrl_mj.actuators import family_name
+from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, environment, with_environment
 from codrl_mj.cli.parsing import AsJson, Trust, named_numbers
-from codrl_mj.cli.subject import Source
+from codrl_mj.cli.subject import Source, Subject
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.fields import differing
 
 Exported = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="What export wrote.")]
 """Type of a verb's folder."""
@@ -26,9 +30,14 @@ class Export:
 
     run_folder: Annotated[
         tyro.conf.Positional[Path],
-        tyro.conf.arg(metavar="RUN", help="Run folder, or a folder with a policy alone (see --task)."),
+        tyro.conf.arg(
+            metavar="RUN",
+            help="Run folder; or a folder with a policy alone, or a Stable-Baselines3 zip, which take --task and what "
+            "else they were trained with, such as --env.action voltage.",
+        ),
     ]
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
+    actuator_name: ActuatorName = AS_TRAINED
     out: Path = Path("exported")
     """Folder to write; it must not exist, or be empty."""
     episodes: int = 5
@@ -43,15 +52,18 @@ class Export:
     board: str | None = None
     """What it is to fit: arduino-uno, arduino-due, nucleo-f446re, raspberry-pi-pico or teensy-4.1."""
 
-    def run(self) -> int:
+    for_line = classmethod(with_environment)
+
+    def run(self: Any) -> int:
         """Write the folder, and say what is in it."""
         from codrl_mj.cli.terminal import print_table
         from codrl_mj.deploy import export, network_of
 
         subject = self.source.load(self.run_folder)
+        env = self._environment(subject)
         limits = named_numbers("--limit", self.limit, "arm_velocity=30")
         given = self.out, self.episodes, self.seed, self.float64, self.board, limits
-        contract = export(subject.policy, subject.env, subject.agent, *given)
+        contract = export(subject.policy, env, subject.agent, *given)
         rows = [
             (side, one["name"], one.get("unit") or "?", _bounds(one))
             for side, several in (("observation", contract.observations), ("action", contract.actions))
@@ -60,10 +72,27 @@ class Export:
         print_table(f"{contract.task}, {subject.agent}, {contract.rate:g} Hz", ("", "name", "unit", "range"), rows)
         weights = network_of(subject.policy).size
         if contract.controller["loop"] is None and contract.actuators:
-            print("no current loop: the motors differ, have none, or are commanded otherwise")
+            why = f"this policy commands a {env.action}" if env.action != "force" else "the motors differ, or have none"
+            print(f"no current loop: {why}")
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
-        print(f"{written}; try: codrl-mj board test {self.out}")
+        names = env.task, *(family_name(type(one)) for one in env.actuators)
+        print(f"{written}; try: codrl-mj board test {self.out}{' --trust' * any(':' in name for name in names)}")
         return 0
+
+    def _environment(self: Any, subject: Subject) -> EnvConfig:
+        """Return the environment of the training: a run says it itself, of a zip the flags do."""
+        from codrl_mj.training.folder import load_config
+
+        known = subject.env if subject.run is None else load_config(subject.run, self.source.trust).evaluation_env
+        env = environment(self, subject.env.task, self.actuator_name, known)
+        if subject.run is None:
+            return env
+        if other := differing(known.as_mapping(), env.as_mapping()):
+            raise ValueError(
+                f"{', '.join(other)}: {subject.run} says what it was trained in, and that is exported: leave the flags "
+                "of the environment out; evaluate and board test take another --actuator"
+            )
+        return subject.env
 
 
 def _bounds(entry: dict[str, Any]) -> str:
@@ -110,6 +139,7 @@ class Test:
     """Film of the first episode with the board as the controller: .mp4 or .gif."""
     log: Path | None = None
     """CSV file for what the board saw and did in the first episode; `board check` reads it."""
+    trust: Trust = False
 
     def run(self) -> int:
         """Run the episodes and print a table."""
@@ -127,7 +157,7 @@ class Test:
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task(f"on {self.target}", total=self.episodes)
             given = self.folder, self.target, self.episodes, self.seed, link, self.loop, self.actuator
-            done = board_test(*given, on_episode=lambda ended: bar.update(row, completed=ended))
+            done = board_test(*given, lambda ended: bar.update(row, completed=ended), self.trust)
         board, python = done.returns.mean(axis=0)
         taken = "not counted here" if done.instructions is None else "{} and {}".format(*done.instructions)
         rows = [
@@ -136,7 +166,7 @@ class Test:
             ("episodes within 1 %", f"{done.alike} of {self.episodes}"),
             ("frames: sent, refused, without an answer", f"{done.frames}, {done.refused}, {done.unanswered}"),
             ("observations beyond the limits", f"{done.stopped}"),
-            ("samples of the current loop", f"{done.samples or 'none: the simulation closes it'}"),
+            ("samples of the current loop", f"{done.samples or 'none'}"),
             ("frames and samples a second", f"{done.rate:.0f}"),
             ("instructions of a policy step, a sample", taken),
         ]
@@ -147,7 +177,7 @@ class Test:
         if self.film is not None:
             from codrl_mj.films.film import film, record
 
-            with Board(self.folder, self.target, link, self.seed, self.loop, self.actuator) as driving:
+            with Board(self.folder, self.target, link, self.seed, self.loop, self.actuator, self.trust) as driving:
                 env = driving.rig
                 panel = record(driving, env, self.seed, 640, 480)
             title = f"{env.task} by its C on {self.target}: return {panel.episode.total:.0f}"
@@ -258,14 +288,13 @@ class CompareLog:
         from codrl_mj.cli.terminal import print_table
         from codrl_mj.deploy import Contract, compare
         from codrl_mj.deploy.contract import FILE
-        from codrl_mj.envs.config import EnvConfig
         from codrl_mj.training.folder import load_config
 
         if self.out is not None and self.out.suffix != ".png":
             raise ValueError(f"--out {self.out}: the suffix must be .png")
         exported = (self.run_folder / FILE).is_file()
         env = (
-            EnvConfig.from_mapping(Contract.read(self.run_folder).assumed)
+            Contract.read(self.run_folder).environment(self.trust)
             if exported
             else load_config(self.run_folder, self.trust).env
         )

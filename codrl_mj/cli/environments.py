@@ -15,7 +15,7 @@ from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, Supply, actuato
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.worlds import find_world, is_world
 from codrl_mj.fields import field_docs, parts
-from codrl_mj.own_code import read_yaml
+from codrl_mj.own_code import read_yaml, trusting_files
 from codrl_mj.runs import CONFIG
 
 
@@ -182,7 +182,8 @@ def _patterns(items: Sequence[str]) -> dict[str, Any]:
                 content = read_yaml(Path(item))
                 if not isinstance(content, Mapping):
                     raise ValueError("must be a mapping of patterns to actuators")
-                found |= resolve_patterns(content, f"the file {item}")
+                with trusting_files():
+                    found |= resolve_patterns(content, f"the file {item}")
             except ValueError as error:
                 raise ValueError(f"--actuators {item}: {error}") from None
         else:

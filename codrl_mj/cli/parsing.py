@@ -27,8 +27,8 @@ AsJson = Annotated[
 Trust = Annotated[
     bool,
     tyro.conf.arg(
-        help="Import the modules that a run folder names as its task, agent or actuator if these are somebody's own, "
-        "which executes them."
+        help="Import the modules that a run folder, a contract or an actuator's file names as task, agent or actuator "
+        "if these are somebody's own, which executes them."
     ),
 ]
 """Type of a verb's field that lets it import what a run folder names."""

@@ -30,6 +30,11 @@ class Subject:
 
     def check_interface(self, env: EnvConfig) -> None:
         """Refuse an environment in which the policy would command or observe something else than in its training."""
+        if self.run is None:
+            from codrl_mj.runs.policies import check_spaces
+
+            # The bounds of forces are the task's; those of other commands may be another motor's on purpose.
+            check_spaces(self.policy, env, exact=env.action == "force")
         for name, trained in self.env.policy_fields.items() if self.run is not None else ():
             if (value := env.policy_fields[name]) != trained:
                 flag = f"--env.{name.replace('_', '-')}"
@@ -54,6 +59,14 @@ class Source:
     agent: Annotated[
         str | None, tyro.conf.arg(help="Algorithm of a Stable-Baselines3 zip, such as ppo; the file does not say.")
     ] = None
+    normalize: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="FILE.pkl",
+            help="Statistics that VecNormalize.save wrote, if a Stable-Baselines3 zip was trained behind it (see "
+            "--trust); none if it was not.",
+        ),
+    ] = None
     trust: Annotated[
         bool,
         tyro.conf.arg(
@@ -68,6 +81,8 @@ class Source:
         from codrl_mj.runs.policies import load_policy, load_sb3_zip
         from codrl_mj.training.folder import BEST, load_config
 
+        if self.normalize is not None and path.suffix != ".zip":
+            raise ValueError(f"--normalize {self.normalize}: {path} is no zip of Stable-Baselines3: leave it out")
         alone = path.suffix == ".zip" or ((path / "policy.json").exists() and not (path / CONFIG).exists())
         if not alone:
             config = load_config(path, self.trust)
@@ -91,7 +106,7 @@ class Source:
         elif self.agent is None and self.trust:
             raise ValueError(f"{path} does not say which algorithm made it: name it with --agent, such as --agent ppo")
         else:
-            policy = load_sb3_zip(path, self.agent or "", self.trust)
+            policy = load_sb3_zip(path, self.agent or "", self.trust, self.normalize)
         return Subject(policy, EnvConfig(self.task), self.agent or type(policy).__name__)
 
 

@@ -85,7 +85,8 @@ class Link(Checked):
     current_bits: int = integer(0, least=0)
     """Bits of the converter that measures the current, over the drive's range both ways. 0: exact."""
     pwm_bits: int = integer(0, least=0)
-    """Bits of the bridge's voltages, over the supply both ways. 0: exact."""
+    """Bits of the bridge's voltages, which a current loop or the policy itself commands, over the supply both ways. 0:
+    exact."""
 
     def encoded(self, contract: Contract, observation: np.ndarray) -> np.ndarray:
         """An observation (k,) as encoders with so many counts say it."""
@@ -117,6 +118,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         seed: int = 0,
         loop: bool = True,
         actuator: Any = None,
+        trust: bool = False,
     ) -> None:
         """Compile the C and start it.
 
@@ -127,11 +129,13 @@ class Board(contextlib.AbstractContextManager["Board"]):
             seed: of what is lost, damaged and late.
             loop: whether the C closes the current loop too, where it has one; else the simulation does.
             actuator: what the simulation has for motors, by name, file or object; None: those of the training.
+            trust: whether to import the modules that the contract names as task or actuator, which executes them.
 
         Raises:
             FileNotFoundError: the folder has no contract or no C.
-            ValueError: the target or actuator is unknown, the actuator is of another family than the C's loop, or bits
-                are given where the C closes no loop, or has no limit for them.
+            ValueError: the target or actuator is unknown, the actuator is of another family than the C's loop, the
+                contract names a module and `trust` is false, or bits are given where the C neither closes a loop nor
+                commands a voltage, or has no limit for them.
             RuntimeError: a tool is missing (the message installs it), or the C does not compile.
         """
         if install := missing_tools(target):
@@ -141,7 +145,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         self.frames, self.refused, self.stopped, self.unanswered = 0, 0, 0, 0
         self._safe = self._last = np.array(self.contract.late["command"])
         self.loop = self.contract.controller["loop"] if loop else None
-        self.env = EnvConfig.from_mapping(self.contract.assumed)
+        self.env = self.contract.environment(trust)
         trained = type(self.env.actuators[0])
         if actuator is not None:
             self.env = dataclasses.replace(self.env, actuator=dict.fromkeys(self.env.driven, actuator), randomize=None)
@@ -228,18 +232,36 @@ class Board(contextlib.AbstractContextManager["Board"]):
         return command
 
     def _converters(self) -> tuple[float, float]:
-        """Steps of the measured current [A] and of the voltage [V]."""
+        """Steps of the measured current [A] and of the voltage [V] of a loop that the C closes."""
         bits = self.link.current_bits, self.link.pwm_bits
         if not any(bits):
             return 0.0, 0.0
         if self.loop is None:
-            raise ValueError(f"current_bits = {bits[0]}, pwm_bits = {bits[1]}: must be 0: the C closes no current loop")
+            self.rig = self._with_bridge()
+            return 0.0, 0.0
         voltage = self.loop["voltage"]
         if voltage is None:
             raise ValueError("current_bits, pwm_bits: must be 0 where the drive's voltage has no limit")
         (resistance, _) = self.env.actuators[0].winding or (1.0, 0.0)
         ranges = self.loop["most"] or voltage / resistance, voltage
         return tuple(2.0 * most / 2**bit if bit else 0.0 for most, bit in zip(ranges, bits, strict=True))  # type: ignore[return-value]
+
+    def _with_bridge(self) -> EnvConfig:
+        """Return the environment with a bridge of `pwm_bits` behind a policy that commands the voltages itself."""
+        motor, disturbances, link = self.env.actuators[0], self.env.disturbances, self.link
+        refusals = {
+            "the simulation closes the current loop: leave --no-loop out": self.contract.controller["loop"] is not None,
+            "the C neither closes a current loop nor commands a voltage": self.env.action != "voltage",
+            "the policy commands voltages, and the C measures no current": link.current_bits > 0,
+            "the motors differ": any(one != motor for one in self.env.actuators),
+            "the environment has a disturbances.command_quantum already": disturbances.command_quantum > 0.0,
+        }
+        for reason in (text for text, applies in refusals.items() if applies):
+            raise ValueError(f"current_bits = {link.current_bits}, pwm_bits = {link.pwm_bits}: must be 0: {reason}")
+        command = motor.commands()["voltage"]
+        step = 2.0 * float(command.limit or 0.0) / 2**link.pwm_bits
+        quantum = step * command.torque_per_unit / command.actuator.arm_radius
+        return dataclasses.replace(self.env, disturbances=dataclasses.replace(disturbances, command_quantum=quantum))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,6 +310,7 @@ def board_test(
     loop: bool = True,
     actuator: Any = None,
     on_episode: Callable[[int], None] = lambda _: None,
+    trust: bool = False,
 ) -> BoardTest:
     """Run the exported C as the controller of the simulation, and the exported ONNX model beside it.
 
@@ -300,13 +323,14 @@ def board_test(
         loop: whether the C closes the current loop too, where it has one.
         actuator: as for `Board`.
         on_episode: called with how many are finished on the board.
+        trust: as for `Board`.
 
     Raises:
         FileNotFoundError: the folder has no contract or no C.
         ValueError: an argument is out of bounds.
         RuntimeError: a tool is missing (the message installs it), or the C does not compile.
     """
-    with Board(folder, target, link, seed, loop, actuator) as board:
+    with Board(folder, target, link, seed, loop, actuator, trust) as board:
         env = board.env
         began = time.perf_counter()
         on_board = board.episodes(episodes, seed, on_episode)

@@ -5,6 +5,7 @@ rate. So all of it is written down, and a reader refuses what differs.
 """
 
 import contextlib
+import copy
 import dataclasses
 import hashlib
 import importlib.metadata
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import mapping_of
+from codrl_mj.actuators import mapping_of, trusting
 from codrl_mj.deploy.loops import current_loop
 from codrl_mj.deploy.network import network_of
 from codrl_mj.envs.config import EnvConfig
@@ -34,6 +35,27 @@ CLOSE = 1e-5
 LATE = 1.5
 """Periods after which a command that has not come is late."""
 _PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "stable-baselines3", "torch")
+
+
+def _step_duration(env: Any) -> float:
+    """Return the simulated time [s] between two actions: a task's own, else measured: a `dt` knows no wrappers."""
+    recorder, actions, durations = env.get_wrapper_attr("recorder"), copy.deepcopy(env.action_space), list[float]()
+    if recorder is env.unwrapped:
+        return float(recorder.step_duration)
+    actions.seed(0)
+    env.reset(seed=0)
+    for _ in range(5):
+        *_, terminated, truncated, _ = env.step(actions.sample())
+        if not durations or not (terminated or truncated):  # the last step of an episode may be cut short
+            durations.append(recorder.step_duration)
+        if terminated or truncated:
+            break
+    if min(durations) <= 0.0 or not np.allclose(durations, durations[0], rtol=1e-6, atol=0.0):
+        raise ValueError(
+            f"rate: the environment's first steps take {durations} s: must be equal and above 0, as a controller has "
+            "one rate"
+        )
+    return durations[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +77,7 @@ class Interface:
     def between(cls, env: EnvConfig) -> "Interface":
         """That of an environment."""
         with contextlib.closing(env.make()) as made:
-            rate = 1.0 / made.get_wrapper_attr("recorder").step_duration
+            rate = 1.0 / _step_duration(made)
         return cls(env.task, rate, *env.world.interface(env))
 
     @property
@@ -161,7 +183,7 @@ class Contract(Interface):
         chosen = seen[np.unique(np.linspace(0, len(seen) - 1, GOLDEN).astype(int))]
         between = Interface.between(env)
         for place, entry in enumerate(between.observations):
-            entry |= {"scale": float(network.factors[place]), "offset": 0.0}
+            entry |= network.first_step(place)
             entry["seen"] = [float(seen[:, place].min()), float(seen[:, place].max())]
         acted = policy.predict(chosen, deterministic=True)[0]
         largest = max(1.0, float(np.abs(between.commands(acted)).max()))
@@ -196,6 +218,11 @@ class Contract(Interface):
         if missing := [name for name in entries if name not in content]:
             raise ValueError(f"{path}: has no {', '.join(missing)}: export it anew")
         return cls(**{name: content[name] for name in entries})
+
+    def environment(self, trust: bool = False) -> EnvConfig:
+        """Return the environment of the training; modules that it names are imported with `trust`, or refused."""
+        with trusting(trust):
+            return EnvConfig.from_mapping(self.assumed)
 
     def write(self, folder: Path) -> None:
         """Write `contract.json` into a folder, whole or not at all, with a digest of itself."""

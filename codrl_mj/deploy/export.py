@@ -13,7 +13,7 @@ from codrl_mj.deploy.network import Network, network_of
 from codrl_mj.deploy.tiles import Tiles
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.files import writing_folder
-from codrl_mj.runs.policies import Policy
+from codrl_mj.runs.policies import Policy, check_spaces
 
 ONNX, TABLE = "policy.onnx", "table.csv"
 OPSET = 17
@@ -102,6 +102,7 @@ def export(
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"--out {out}: it exists, and is no empty folder: name another, or delete it")
+    check_spaces(policy, env)
     network = network_of(policy)
     if board is not None:
         check_board(board, network, double)

@@ -5,13 +5,13 @@ Imports nothing heavy: torch's tensors come in, numpy's arrays stay.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.deploy.tiles import Tiles
-from codrl_mj.runs.policies import Policy
+from codrl_mj.runs.policies import NormalizedPolicy, Policy
 
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "Tanh": np.tanh,
@@ -33,13 +33,24 @@ class Layer:
     """One of `ACTIVATIONS`."""
 
 
+class Normalization(NamedTuple):
+    """Observation statistics of `VecNormalize`: (x - mean)/deviation, clipped to +-`clip`, in double."""
+
+    mean: np.ndarray
+    """Shape (k,), float64."""
+    deviation: np.ndarray
+    """Standard deviation, its epsilon included, shape (k,), float64."""
+    clip: float
+    """Largest normalized value."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Network:
     """A policy that takes its most likely action: an observation (k,) to an action.
 
-    The observation is multiplied by `factors`, goes through the layers, and what they give is multiplied by `gains`.
-    Of a box it is then brought between `low` and `high`: clipped or, `squashed`, by (y + 1)/2 of the way. Without
-    bounds the action is the index of the largest.
+    The observation is normalized if the training's was, multiplied by `factors`, goes through the layers, and what they
+    give is multiplied by `gains`. Of a box it is then brought between `low` and `high`: clipped or, `squashed`, by
+    (y + 1)/2 of the way. Without bounds the action is the index of the largest.
     """
 
     factors: np.ndarray
@@ -54,10 +65,17 @@ class Network:
     """Largest action, likewise."""
     squashed: bool
     """Whether the layers end in -1 to 1, which stand for `low` and `high`."""
+    normalization: Normalization | None = None
+    """Statistics of the observations; None where they are taken as they come."""
 
     def graph(self, node: Any) -> str:
         """The name of what an ONNX graph gives that computes it, by `node(kind, *inputs, **attributes)`."""
-        values = node("Mul", "observation", self.factors)
+        values = "observation"
+        if (norm := self.normalization) is not None:
+            values = node("Div", node("Sub", node("Cast", values, to=11), norm.mean), norm.deviation)  # 11: double
+            values = node("Min", node("Max", values, np.full(1, -norm.clip)), np.full(1, norm.clip))
+            values = node("Cast", values, to=1)
+        values = node("Mul", values, self.factors)
         for layer in self.layers:
             values = node("Gemm", values, layer.weight, layer.bias, transB=1)
             if layer.activation != "Identity":
@@ -72,7 +90,10 @@ class Network:
 
     def __call__(self, observations: np.ndarray, kind: Any = np.float32) -> np.ndarray:
         """Actions (N, m), or their indices (N,), of observations (N, k), computed in numbers of a `kind`."""
-        values = observations.astype(kind) * self.factors.astype(kind)
+        values = observations
+        if (norm := self.normalization) is not None:
+            values = np.clip((values - norm.mean) / norm.deviation, -norm.clip, norm.clip)
+        values = values.astype(kind) * self.factors.astype(kind)
         for layer in self.layers:
             values = ACTIVATIONS[layer.activation](values @ layer.weight.astype(kind).T + layer.bias.astype(kind))
         values = values * self.gains.astype(kind)
@@ -98,8 +119,18 @@ class Network:
 
     @property
     def size(self) -> int:
-        """How many weights and biases there are."""
-        return sum(layer.weight.size + layer.bias.size for layer in self.layers)
+        """How many weights, biases and statistics there are."""
+        statistics = 0 if self.normalization is None else 2 * len(self.normalization.mean)
+        return statistics + sum(layer.weight.size + layer.bias.size for layer in self.layers)
+
+    def first_step(self, index: int) -> dict[str, float | None]:
+        """Return what is done to an entry of the observation before the first layer, as a contract has it."""
+        factor, norm = float(self.factors[index]), self.normalization
+        if norm is None:
+            return {"scale": factor, "offset": 0.0}
+        mean, deviation = float(norm.mean[index]), float(norm.deviation[index])
+        told = {"mean": mean, "variance": deviation**2, "clip": norm.clip if np.isfinite(norm.clip) else None}
+        return {"scale": factor / deviation, "offset": -factor * mean / deviation, **told}
 
 
 def network_of(policy: Policy) -> Network | Tiles:
@@ -111,6 +142,15 @@ def network_of(policy: Policy) -> Network | Tiles:
     Raises:
         ValueError: it is none of these, or has parts that are no factors and dense layers.
     """
+    if isinstance(policy, NormalizedPolicy):
+        network, rms = network_of(policy.policy), policy.statistics
+        if not rms.norm_obs or isinstance(network, Tiles):
+            return network
+        deviation = np.sqrt(rms.obs_rms.var + rms.epsilon)
+        return dataclasses.replace(
+            network, normalization=Normalization(rms.obs_rms.mean, deviation, float(rms.clip_obs))
+        )
+
     from codrl_mj.agents.sarsa_algorithm import TileCodingPolicy
 
     if isinstance(policy, TileCodingPolicy):

@@ -51,6 +51,10 @@ class Tiles:
         weights = node("Gather", self.table, node("Add", within, first), axis=0)
         return str(node("ArgMax", node("ReduceSum", weights, np.array([1]), keepdims=0), axis=1, keepdims=0))
 
+    def first_step(self, index: int) -> dict[str, float | None]:
+        """As of a `Network`."""
+        return {"scale": float(self.factors[index]), "offset": 0.0}
+
     def as_csv(self, names: Sequence[str]) -> str:
         """The table: a row a tile, with its tiling, its place along each axis and the weight of each action.
 

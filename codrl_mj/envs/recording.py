@@ -15,14 +15,14 @@ class StepWatch:
     What it has is what an `ActuatedEnv` has by the same names, states and speeds being the model's.
     """
 
-    def __init__(self, motors: Motors, command: str) -> None:
-        """Look at their simulation, in which the agent gives a command."""
+    def __init__(self, motors: Motors, command: str, step_duration: float | None = None) -> None:
+        """Look at their simulation, in which the agent gives a command; steps take that long [s], if it is known."""
         self._motors, self._data, model = motors, motors.data, motors.data.model
         self._rows: list[np.ndarray] = []
         self._outputs = model.actuator_outadr[list(motors.present)]
         self._moments = np.empty((model.nout, model.nv))
-        self.step_duration = float(model.opt.timestep)
-        """Environment step [s], known once a step was taken."""
+        self.step_duration = float(step_duration or model.opt.timestep)
+        """Duration of the last environment step [s]; before the first the environment's `dt`, or else the model's."""
         self.signal_names, self.trace_names = tuple(motors.signals()), (*motors.readout.names, "speed")
         self.command, self.motor_names = command, motors.names
 
@@ -52,7 +52,7 @@ class StepWatch:
 
     def step(self, env: Any, action: Any) -> Any:
         """Take a step of the environment, and record what it does in it; not in two threads at once."""
-        self._rows, plain, began = [], mujoco.mj_step, self._data.time
+        self._rows, plain, second_half, began = [], mujoco.mj_step, mujoco.mj_step2, self._data.time
 
         def each(model: mujoco.MjModel, data: mujoco.MjData, nstep: int = 1) -> None:
             if data is not self._data:
@@ -62,11 +62,17 @@ class StepWatch:
                 plain(model, data)
                 self._row()
 
-        mujoco.mj_step = each  # type: ignore[assignment]
+        def halves(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+            second_half(model, data)
+            if data is self._data:
+                self._row()
+
+        # dm_control's physics takes the first of its integration steps by mj_step2 and mj_step1.
+        mujoco.mj_step, mujoco.mj_step2 = each, halves  # type: ignore[assignment]
         try:
             outcome = env.step(action)
         finally:
-            mujoco.mj_step = plain
+            mujoco.mj_step, mujoco.mj_step2 = plain, second_half
         if self._rows:
             self.step_duration = len(self._rows) * float(self._data.model.opt.timestep)
         else:

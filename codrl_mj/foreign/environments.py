@@ -203,7 +203,9 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
     @property
     def recorder(self) -> StepWatch:
         """Reads the environment between its steps; from now on every integration step is looked at."""
-        self._watch = self._watch or StepWatch(self._motors, self._settings.action)
+        if self._watch is None:
+            dt = getattr(self.unwrapped, "dt", None)
+            self._watch = StepWatch(self._motors, self._settings.action, dt if isinstance(dt, float) else None)
         return self._watch
 
     @property

@@ -4,7 +4,10 @@
 and says so.
 """
 
+import contextlib
 import hashlib
+import pickle
+import warnings
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,6 +16,7 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import trusting
 from codrl_mj.agents import AgentConfig, agent_from_mapping
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs import DESCRIPTION, DIGEST, WEIGHTS
 from codrl_mj.runs.files import check_digest, read_json, sealed, write_json, writing
 
@@ -112,10 +116,25 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
     return policy
 
 
-def load_sb3_zip(path: Path, agent: str, trust: bool) -> Any:
-    """The policy of a model that Stable-Baselines3 saved, of an algorithm such as `ppo`: the file does not say which.
+class NormalizedPolicy:
+    """A policy behind the observation statistics of Stable-Baselines3's `VecNormalize`."""
 
-    It is not opened without `trust` that whoever made it may execute code on this machine, which loading it allows.
+    def __init__(self, policy: Any, statistics: Any) -> None:
+        """Combine a policy with the `VecNormalize` through which it was trained."""
+        self.policy, self.statistics = policy, statistics
+        self.observation_space, self.action_space = policy.observation_space, policy.action_space
+
+    def predict(self, observation: np.ndarray, *, deterministic: bool = False) -> tuple[np.ndarray, Any]:
+        """Return the policy's actions for raw observations."""
+        return self.policy.predict(self.statistics.normalize_obs(observation), deterministic=deterministic)
+
+
+def load_sb3_zip(path: Path, agent: str, trust: bool, normalize: Path | str | None = None) -> Any:
+    """Load the policy of a model that Stable-Baselines3 saved, by an algorithm, such as `ppo`, that it does not name.
+
+    Neither file is opened without `trust` that whoever made it may execute code on this machine, which loading allows.
+    `normalize` is the file that `VecNormalize.save` wrote, if the model was trained behind it, else `"none"`. None
+    refuses a zip that seems to have been.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no model at {path}")
@@ -131,8 +150,84 @@ def load_sb3_zip(path: Path, agent: str, trust: bool) -> Any:
     if not isinstance(kind, type) or not issubclass(kind, BaseAlgorithm):
         raise ValueError(f"agent = {agent!r}: Stable-Baselines3 has no such agent; name the one that made {path}")
     try:
-        policy = kind.load(path, device="cpu").policy  # type: ignore[attr-defined]
+        model = kind.load(path, device="cpu")  # type: ignore[attr-defined]
     except Exception as error:  # whatever the file's objects raise
         raise ValueError(f"{path} is not a model of {agent}: {error!r}") from None
-    policy.set_training_mode(False)
-    return policy
+    model.policy.set_training_mode(False)
+    if normalize is None:
+        _check_whole(path, model)
+    if normalize in (None, "none"):
+        return model.policy
+    return NormalizedPolicy(model.policy, _load_statistics(Path(str(normalize)), model.observation_space))
+
+
+def _load_statistics(path: Path, space: spaces.Space[Any]) -> Any:
+    """Unpickle a `VecNormalize` for observations of a space; only for a caller that trusts the file."""
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    try:
+        statistics = pickle.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"--normalize {path}: no such file; name what VecNormalize.save wrote, or none"
+        ) from None
+    except Exception as error:  # whatever the file's objects raise
+        raise ValueError(f"--normalize {path}: must be a file that VecNormalize.save wrote: {error!r}") from None
+    if not isinstance(statistics, VecNormalize):
+        kind = type(statistics).__name__
+        raise ValueError(f"--normalize {path}: holds a {kind}: must be a file that VecNormalize.save wrote")
+    mean: Any = getattr(statistics.obs_rms, "mean", None) if statistics.norm_obs else np.zeros(space.shape or ())
+    if np.shape(mean) != space.shape:
+        raise ValueError(
+            f"--normalize {path}: is for {statistics.observation_space}, the policy observes {space}: name the file "
+            "that was saved with the policy"
+        )
+    return statistics
+
+
+def _check_whole(path: Path, model: Any) -> None:
+    """Refuse a model that seems to have been trained behind `VecNormalize`, and warn where nothing can be told."""
+    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+    beside, reason = [*path.parent.glob("*.pkl"), *path.parent.glob("*/vecnormalize.pkl")], ""
+    seen, space, is_on_policy = model._last_obs, model.observation_space, isinstance(model, OnPolicyAlgorithm)
+    # Only VecNormalize gives PPO and A2C original observations; algorithms with a replay buffer always keep some.
+    if is_on_policy and model._last_original_obs is not None:
+        reason = "its last observations were normalized"
+    elif isinstance(seen, np.ndarray) and ((seen < space.low - 1e-4) | (seen > space.high + 1e-4)).any():
+        reason = "its last observations lie outside of its observation space, as normalized ones do"
+    elif beside:
+        reason = f"{', '.join(map(str, sorted(beside)[:3]))} may have its statistics"
+    remedy = "name what VecNormalize.save wrote with --normalize FILE.pkl, or say --normalize none"
+    if reason:
+        raise ValueError(f"{path} may be half of a policy that was trained behind VecNormalize: {reason}: {remedy}")
+    if model.num_timesteps and not (is_on_policy and seen is not None):
+        warnings.warn(f"{path} does not say whether it was trained behind VecNormalize: if so, {remedy}", stacklevel=3)
+
+
+def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
+    """Refuse an environment with other observations or actions than those of a policy's training, if it tells them.
+
+    Unless `exact`, actions that differ in their bounds alone are warned of.
+    """
+    with contextlib.closing(env.make()) as made:
+        present = {name: getattr(made, name) for name in ("observation_space", "action_space")}
+    for name, space in present.items():
+        if (trained := getattr(policy, name, None)) is None or _is_same(trained, space):
+            continue
+        text = f"{name}: the policy was trained with {trained}, {env.task} as it is set has {space}"
+        frames = np.prod(trained.shape or (1,)) / np.prod(space.shape or (1,))
+        if name == "observation_space" and frames > 1 and frames % 1 == 0:
+            text += f" ({frames:g} times as many: stacked frames, as of VecFrameStack, are not supported)"
+        text += ": set what it was trained with, by --env.action, --env.observe-actuator, --actuator, --env.options"
+        if exact or name != "action_space" or not _is_same(trained, space, bounds=False):
+            raise ValueError(text)
+        warnings.warn(text, stacklevel=2)
+
+
+def _is_same(one: Any, other: Any, bounds: bool = True) -> bool:
+    """Return whether two spaces have the same elements, but for rounding to float32."""
+    if not (isinstance(one, spaces.Box) and isinstance(other, spaces.Box)):
+        return bool(one == other)
+    ends = ((one.low, other.low), (one.high, other.high)) if bounds else ()
+    return one.shape == other.shape and all(np.allclose(*pair, rtol=1e-5) for pair in ends)

@@ -139,7 +139,7 @@ def test_a_foreign_file_in_the_run_folder_is_named(capsys, trained, verb, file, 
 
 def test_a_policy_for_another_task_is_refused(capsys, trained):
     policy_alone(trained)
-    assert "observation shape" in refused(capsys, "evaluate alone --task pendulum")
+    assert "observation_space: the policy was trained with" in refused(capsys, "evaluate alone --task pendulum")
 
 
 def stopped(*_, **__):

@@ -6,17 +6,22 @@ import os
 import shutil
 import struct
 import subprocess
+import sys
+from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor, Servo, ServoLoop
+from codrl_mj.agents import DQNConfig, SACConfig
 from codrl_mj.cli import main
 from codrl_mj.deploy import Board, Contract, Link, OnnxPolicy, board_test, check_log, export, instructions
 from codrl_mj.deploy import board as boards
 from codrl_mj.deploy.board import TARGETS, missing_tools
 from codrl_mj.deploy.wire import Wire
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.tasks import TASKS
 from tests.deploy.test_export import trained
 from tests.deploy.test_run import with_sensors
 from tests.matrix import but
@@ -136,6 +141,69 @@ def test_converters_come_between(folder):
     steps = done.on_board[0].signals["voltage"] / (2.0 * 24.0 / 2**6)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
     assert not np.allclose(done.in_python[0].signals["voltage"] % 0.75, 0.0)
+
+
+LIMITED = {"name": "paper", "controller": {"max_voltage": 12.0}}
+VOLTS = {
+    "pendulum": (EnvConfig("pendulum", LIMITED, action="voltage"), SACConfig(hidden=(8,))),
+    "cartpole": (EnvConfig("cartpole", LIMITED, action="voltage", levels=(-5, -1.3, 0.7, 5)), DQNConfig(hidden=(8,))),
+}
+
+
+@pytest.mark.parametrize("task", VOLTS)
+def test_a_bridge_comes_behind_a_policy_that_commands_voltages(tmp_path, task):
+    env, agent = VOLTS[task]
+    with env.make() as made:
+        policy = agent.make_policy(made.observation_space, made.action_space)
+    export(policy, env, agent.name, tmp_path / "out", 1)
+    step = 2.0 * 12.0 / 2**5
+    done = board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=5))
+    exact, coarse = (side[0].signals["voltage"] / step for side in (done.in_python, done.on_board))
+    np.testing.assert_allclose(coarse, np.round(coarse), atol=1e-9)
+    assert not np.allclose(exact, np.round(exact), atol=1e-3)
+    # What the policy commanded is logged as it is: `board check` finds it again.
+    contract = Contract.read(tmp_path / "out")
+    commanded = contract.commands(done.on_board[0].action).ravel() / step
+    np.testing.assert_allclose(coarse, np.round(commanded), atol=1e-6)
+    with pytest.raises(ValueError, match="the policy commands voltages, and the C measures no current"):
+        board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=8, current_bits=8))
+
+
+def test_without_a_loop_and_a_voltage_there_is_no_bridge(tmp_path):
+    export(trained("pendulum", "ddpg")[0], EnvConfig("pendulum", "lag"), "ddpg", tmp_path / "out", 1)
+    with pytest.raises(ValueError, match="must be 0: the C neither closes a current loop nor commands a voltage"):
+        board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=8))
+
+
+def forget():
+    """Let the example's module and its task be as in a new process."""
+    sys.modules.pop("ball_and_beam", None)
+    if "ball_and_beam" in TASKS:
+        gym.registry.pop(TASKS.pop("ball_and_beam").env_id)
+
+
+def test_a_contract_that_names_a_module_takes_trust(tmp_path, monkeypatch, capsys, request):
+    example = Path(__file__).parents[2] / "examples/own_robot"
+    shutil.copytree(example, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    request.addfinalizer(forget)
+    forget()
+    monkeypatch.setattr(sys, "path", [one for one in sys.path if one])
+    with monkeypatch.context() as patched:
+        patched.syspath_prepend(tmp_path)
+        env = EnvConfig("ball_and_beam:TASK", max_episode_steps=20)
+        export(trained("ball_and_beam:TASK", "ppo")[0], env, "ppo", tmp_path / "out", 1)
+    for line in (["board", "test", "out", "--log", "a.csv"], ["identify", "compare", "out", "a.csv"]):
+        forget()
+        monkeypatch.setattr(sys, "path", [one for one in sys.path if one != str(tmp_path)])
+        options = ["--episodes", "1"] if line[0] == "board" else []
+        assert main([*line, *options]) == 2
+        assert "'ball_and_beam:TASK': needs the module ball_and_beam" in capsys.readouterr().err
+        assert "ball_and_beam" not in sys.modules
+        assert main([*line, *options, "--trust"]) == 0
+    with pytest.raises(ValueError, match="trust=True"):
+        board_test(tmp_path / "out", episodes=1)
+    assert board_test(tmp_path / "out", episodes=1, trust=True).alike == 1
 
 
 @of_furuta
@@ -408,7 +476,7 @@ def test_a_program_that_ends_is_an_error(folder, tmp_path, capsys):
 def test_what_cannot_be_run_is_said(folder, tmp_path, monkeypatch, capsys):
     for line, says in {
         ("test", str(folder), "--lost", "1.5"): "Link.lost = 1.5: must be a finite number >= 0 and <= 1",
-        ("test", str(folder), "--no-loop", "--pwm-bits", "8"): "pwm_bits = 8: must be 0: the C closes no current loop",
+        ("test", str(folder), "--no-loop", "--pwm-bits", "8"): "the simulation closes the current loop: leave",
         ("test", str(folder), "--target", "avr"): "avr",
         ("test", str(tmp_path)): "contract.json",
     }.items():

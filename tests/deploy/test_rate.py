@@ -1,0 +1,138 @@
+"""The exported rate is that at which the environment takes actions, whatever its model's integration step is."""
+
+import functools
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from dm_control import suite
+from gymnasium import spaces
+
+import codrl_mj
+from codrl_mj.agents import SACConfig
+from codrl_mj.deploy import Interface, export
+from codrl_mj.envs.config import EnvConfig
+from codrl_mj.tasks import TASKS
+from tests.foreign.models import V5, BareEnv
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning")
+
+
+class Repeating(gym.Wrapper):
+    """Each action for several steps, as many as the list says in turn."""
+
+    def __init__(self, env, repeats):
+        """Wrap an environment."""
+        super().__init__(env)
+        self.repeats, self.count = repeats, 0
+
+    def step(self, action):
+        for _ in range(self.repeats[self.count % len(self.repeats)]):
+            outcome = self.env.step(action)
+        self.count += 1
+        return outcome
+
+
+class OfDmControl(gym.Env):
+    """An environment of dm_control's behind Gymnasium's interface."""
+
+    def __init__(self, domain, task):
+        """Load it."""
+        self.inner = suite.load(domain, task, task_kwargs={"random": 0})
+        self.model, self.data = self.inner.physics.model.ptr, self.inner.physics.data.ptr
+        spec = self.inner.action_spec()
+        self.action_space = spaces.Box(spec.minimum, spec.maximum, dtype=np.float64)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (self.model.nq,), np.float64)
+
+    def reset(self, *, seed=None, options=None):  # noqa: ARG002
+        super().reset(seed=seed)
+        self.inner.reset()
+        return self.data.qpos.copy(), {}
+
+    def step(self, action):
+        step = self.inner.step(action)
+        return self.data.qpos.copy(), step.reward, False, False, {}
+
+
+def repeated(*repeats):
+    return Repeating(BareEnv(), repeats)
+
+
+@pytest.fixture
+def registered(request):
+    """The id of an environment that a function makes."""
+    gym.register("RateOfMine-v0", request.param, max_episode_steps=50)
+    yield "RateOfMine-v0"
+    gym.registry.pop("RateOfMine-v0")
+
+
+@pytest.mark.parametrize("env_id", V5)
+def test_of_gymnasiums_environments(env_id):
+    with gym.make(env_id) as env:
+        assert Interface.between(EnvConfig(env_id)).rate == pytest.approx(1.0 / env.unwrapped.dt, rel=1e-9)
+
+
+def test_of_another_frame_skip():
+    with gym.make("Hopper-v5", frame_skip=8) as env:
+        assert env.unwrapped.dt == pytest.approx(0.016)
+        rate = Interface.between(EnvConfig("Hopper-v5", options={"frame_skip": 8})).rate
+    assert rate == pytest.approx(62.5, rel=1e-9)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_of_tasks(task):
+    assert Interface.between(EnvConfig(task)).rate == pytest.approx(1.0 / TASKS[task].step_duration, rel=1e-12)
+
+
+def test_of_a_world_and_of_a_task_of_ones_own():
+    assert Interface.between(EnvConfig("tests.envs.rig:RIG")).rate == pytest.approx(50.0)  # 10 steps of 2 ms
+    assert Interface.between(EnvConfig("tests.own_project.arm:TASK")).rate == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize(
+    ("registered", "rate"),
+    [(BareEnv, 100.0), (functools.partial(repeated, 4), 25.0)],  # without a dt; with a wrapper inside
+    indirect=["registered"],
+)
+def test_of_functions_that_make_environments(registered, rate):
+    assert Interface.between(EnvConfig(registered)).rate == pytest.approx(rate, rel=1e-9)
+
+
+@pytest.mark.parametrize("registered", [functools.partial(repeated, 2, 3)], indirect=True)
+def test_steps_of_no_one_duration_are_refused(registered):
+    with pytest.raises(ValueError, match=r"first steps take \[0\.02, 0\.03.*must be equal"):
+        Interface.between(EnvConfig(registered))
+
+
+@pytest.mark.parametrize("name", ["cartpole/swingup", "pendulum/swingup", "reacher/easy", "finger/spin", "walker/walk"])
+def test_of_dm_controls_environments(name):
+    """Their physics takes one integration step in halves."""
+    domain, task = name.split("/")
+    inner = suite.load(domain, task)
+    env = codrl_mj.make(functools.partial(OfDmControl, domain, task), {".*": "ideal"}, disable_env_checker=True)
+    recorder = env.recorder
+    env.reset(seed=0)
+    env.step(np.zeros(env.action_space.shape))
+    assert recorder.step_duration == pytest.approx(inner.control_timestep(), rel=1e-9)
+    assert len(recorder.trace) == round(inner.control_timestep() / inner.physics.timestep())
+    ours = codrl_mj.make_dm_control(name, {".*": "ideal"})
+    assert ours.control_timestep() == inner.control_timestep()
+
+
+def test_a_recorder_knows_the_duration_before_the_first_step():
+    """A live view has the ends of its settings, and its pace, from there."""
+    env = codrl_mj.make("HalfCheetah-v5", {".*": "ideal"})
+    assert env.recorder.step_duration == pytest.approx(0.05)
+    env.close()
+
+
+def test_of_contract_and_c(tmp_path):
+    env = EnvConfig("InvertedPendulum-v5", max_episode_steps=100)
+    with env.make() as made:
+        policy = SACConfig(hidden=(8,)).make_policy(made.observation_space, made.action_space)
+    contract = export(policy, env, "sac", tmp_path / "out", 1)
+    assert contract.rate == pytest.approx(25.0)  # 2 steps of 0.02 s
+    assert contract.late["after"] == pytest.approx(0.06)
+    header = (tmp_path / "out/controller.h").read_text()
+    assert "#define CONTROLLER_POLICY_RATE 25.0f" in header
+    assert "#define WIRE_LATE_AFTER 60000u" in (tmp_path / "out/wire.h").read_text()
