@@ -145,7 +145,8 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
     amperes, volts, torque, power, loss = 0.0, 0.0, 0.0, 0.0, 0.0
     at_volts, at_amperes, too_warm = 0.0, 0.0, 0.0
     for _ in range(count):
-        if waiting <= 0.0:
+        # A servo that is faster than the mechanical step is sampled `count` times within it.
+        if waiting <= 0.0 or count > 1:
             asked, grown = demand(parameters, period * every, target, rate, position, speed, integral)
             waiting = float(every)
         else:

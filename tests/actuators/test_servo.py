@@ -72,6 +72,21 @@ def test_a_position_loop_is_the_linear_system_that_it_looks_like(timestep, rate)
     assert positions[-1] == pytest.approx(0.3, abs=1e-3)
 
 
+@pytest.mark.parametrize("integral", [0.0, 20.0])
+@pytest.mark.parametrize(("timestep", "rate"), [(0.05, 1000.0), (0.01, 2000.0), (0.004, 250.0)])
+def test_a_servo_is_sampled_at_its_own_rate_within_a_long_step(timestep, rate, integral):
+    """The recursion of a PI velocity loop on an inertia, sample by sample, against one or a few long steps."""
+    one = servo(controls="velocity", velocity_gain=1.5, velocity_integral_gain=integral, servo_rate=rate)
+    one = dataclasses.replace(one, controller=SampledLoop(100e3))
+    _, speeds = turned(one, [2.0] * 4, timestep)
+    speed, torque, expected = 0.0, 0.0, []
+    for _ in range(round(4 * timestep * rate)):
+        error = 2.0 - speed
+        speed, torque = speed + (1.5 * error + torque) / TOTAL / rate, torque + 1.5 * integral * error / rate
+        expected.append(speed)
+    np.testing.assert_allclose(speeds, expected[round(timestep * rate) - 1 :: round(timestep * rate)], rtol=0.01)
+
+
 @pytest.mark.parametrize("saved", [False, True])
 def test_what_the_model_s_own_servo_was_is_gone(saved):
     """That is `<position kp="3" kv="30">`, under an integrator that would use its derivative too; and in its XML."""
