@@ -13,7 +13,7 @@ import numpy as np
 
 from codrl_mj.actuators import drive, shaft, stability
 from codrl_mj.actuators.drive import ARM, Drive
-from codrl_mj.actuators.model import Command, Inputs, UnstableError
+from codrl_mj.actuators.model import Command, Inputs
 from codrl_mj.actuators.shaft import Means, Shaft
 from codrl_mj.fields import Checked, choice, real
 
@@ -230,22 +230,18 @@ class Servo(Drive):
         )
         return np.where(fitting, super().instability(numbers, timestep), np.inf)
 
-    def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
-        """Refuse outer loops that are unstable on what they move, besides what `Drive.check_shaft` refuses.
+    def steps_per_sample(self, timestep: float) -> int:
+        """As `ActuatorModel.steps_per_sample`."""
+        return max(int(1.0 / (timestep * self.loop.servo_rate) + 0.5), 1)
 
-        Raises:
-            UnstableError: with the number and a remedy.
-        """
-        super().check_shaft(timestep, inertia, held)
-        radius = _outer_radius(self, timestep, inertia, held or math.isinf(self.motor.load_inertia))
-        if not radius < 1.0:
-            loop, at_joint = self.loop, inertia * self.motor.gear_ratio**2
-            raise UnstableError(
-                f"loop.velocity_gain = {loop.velocity_gain:g}: the outer loops are unstable: spectral radius "
-                f"{radius:.4g} over a sample, must be < 1. It moves {at_joint:.3g} kg*m^2: for a bandwidth f the gain "
-                f"is 2*pi*f times that, f well below servo_rate = {loop.servo_rate:g} Hz, and position_gain = "
-                f"{loop.position_gain:g} well below 2*pi*f; or pass allow_unstable=True"
-            )
+    def loop_remedy(self, inertia: float) -> str:
+        """As `ActuatorModel.loop_remedy`."""
+        loop, at_joint = self.loop, inertia * self.motor.gear_ratio**2
+        return (
+            f"It moves {at_joint:.3g} kg*m^2: for a bandwidth f loop.velocity_gain = {loop.velocity_gain:g} is 2*pi*f "
+            f"times that, f well below servo_rate = {loop.servo_rate:g} Hz, and position_gain = "
+            f"{loop.position_gain:g} well below 2*pi*f."
+        )
 
 
 def _fits(servo_rate: float, sample_rate: float, timestep: float) -> bool:
@@ -253,22 +249,3 @@ def _fits(servo_rate: float, sample_rate: float, timestep: float) -> bool:
     in_step = timestep * servo_rate
     multiples = max(in_step, 1.0 / in_step), sample_rate / max(servo_rate, 1.0 / timestep)
     return all(abs(one - round(one)) <= 1e-6 * one and one >= 0.5 for one in multiples)
-
-
-def _outer_radius(servo: Servo, timestep: float, inertia: float, held: bool) -> float:
-    """Spectral radius of the outer loops on a free inertia, over one of their samples, at the rotor."""
-    loop = servo.loop
-    period = max(1.0 / loop.servo_rate, timestep if held else 0.0)  # held, they see the speed as the step began
-    gain = loop.velocity_gain / servo.motor.gear_ratio**2
-    reacts = gain * np.array([-loop.position_gain if loop.controls == "position" else 0.0, -1.0])  # to angle and speed
-    adds = loop.velocity_integral_gain * period
-    speed, angle = period / inertia, 0.5 * period**2 / inertia  # of a torque
-    matrix = np.array(
-        [
-            [1.0 + angle * reacts[0], period + angle * reacts[1], angle],
-            [speed * reacts[0], 1.0 + speed * reacts[1], speed],
-            [adds * reacts[0], adds * reacts[1], 1.0],
-        ]
-    )
-    part = np.ix_(*[np.flatnonzero([loop.controls == "position", True, adds > 0.0])] * 2)
-    return float(np.abs(np.linalg.eigvals(matrix[part])).max())

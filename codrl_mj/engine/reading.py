@@ -14,10 +14,11 @@ from codrl_mj.actuators import (
     family_number,
     parameters_type,
     reference,
+    stability,
 )
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.engine.doors import shaft_inertia
-from codrl_mj.engine.families import HEAD, SIGNATURE, loaded_families, signals_at, slot_size
+from codrl_mj.engine.families import HEAD, SIGNATURE, compiled_advance, loaded_families, signals_at, slot_size
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEAD, REASONS
 from codrl_mj.plugin import FAMILY, NAME, registered
 
@@ -151,23 +152,75 @@ def check_shafts(
     allow_unstable: bool = False,
     held: bool = False,
     actuators: Mapping[int, ActuatorModel] | None = None,
-) -> None:
-    """Refuse motors that what they move makes unstable; where they are `held`, they are not told what that is."""
-    asking = {index: one for index, one in (actuators or motors(model)).items() if one.INERTIA}
+    explicit: bool = False,
+) -> float:
+    """Refuse actuators that are unstable with the joints that they move, at the model's step and initial position.
+
+    Gravity, springs, contacts, limits and the model's own servos are left out of the check.
+
+    Args:
+        model: a compiled model.
+        allow_unstable: whether to return instead.
+        held: whether actuators are not told the inertia, so that they hold the speed over a step.
+        actuators: the actuators by their indices; the model's own if None.
+        explicit: whether positions are moved by the old speeds.
+
+    Returns:
+        The spectral radius of all loops over positions and speeds together; 0 if there are none.
+
+    Raises:
+        UnstableError: with the number and a remedy.
+    """
+    asking = {index: one for index, one in (actuators or motors(model)).items() if one.INERTIA or one.MOTION}
     if not asking:
-        return
+        return 0.0
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
-    shafts = [(model.actuator_trntype[index], *model.actuator_trnid[index]) for index in asking]
+    shafts, inertias = [(model.actuator_trntype[index], *model.actuator_trnid[index]) for index in asking], []
     for (index, actuator), shaft in zip(asking.items(), shafts, strict=True):
         arm = 1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius  # the callback's is in the gear
-        inertia = shaft_inertia(model, data, model.actuator_outadr[index], 1.0 / arm)
+        inertias.append(shaft_inertia(model, data, model.actuator_outadr[index], 1.0 / arm))
         try:
             several = shafts.count(shaft)
-            actuator.check_shaft(model.opt.timestep, inertia / several, several > 1 or held)
+            actuator.check_shaft(model.opt.timestep, inertias[-1] / several, several > 1 or held)
         except UnstableError as error:
             if not allow_unstable:
-                raise ValueError(f"{model.actuator(index).name or f'actuator {index}'}: {error}") from None
+                raise UnstableError(f"{_named(model, index)}: {error}") from None
+    loops = stability.JointLoops(
+        _mechanics(model, data, asking, explicit),
+        [_named(model, index) for index in asking],
+        list(asking.values()),
+        [one.advance if held else compiled_advance(type(one)) for one in asking.values()],
+        inertias,
+        held,
+    )
+    return loops.radius(model.opt.timestep) if allow_unstable else loops.check(model.opt.timestep)
+
+
+def _named(model: mujoco.MjModel, index: int) -> str:
+    """Return an actuator's name for messages."""
+    return model.actuator(index).name or f"actuator {index}"
+
+
+def _mechanics(
+    model: mujoco.MjModel, data: mujoco.MjData, actuators: Mapping[int, ActuatorModel], explicit: bool
+) -> stability.Mechanics:
+    """Return the linearized mechanics of a model at a position, with the shafts of some actuators."""
+    inertia, row = np.empty((model.nv, model.nv)), np.empty(model.nv)
+    for freedom, unit in enumerate(np.eye(model.nv)):
+        mujoco.mj_mulM(model, data, row, unit)
+        inertia[freedom] = row
+    every = np.zeros((len(data.moment_rownnz), model.nv))
+    mujoco.mju_sparse2dense(every, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    moments = [
+        every[model.actuator_outadr[index]] / (1.0 if model.actuator_plugin[index] < 0 else one.arm_radius)
+        for index, one in actuators.items()
+    ]
+    is_rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    by_euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    undamped = bool(by_euler and model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    integrator = "rk4" if is_rk4 else "euler" if explicit else "semi-implicit"
+    return stability.Mechanics(inertia, model.dof_damping.copy(), np.array(moments), integrator, undamped)
 
 
 class Readout:

@@ -57,8 +57,9 @@ class Setup:
         if not self.randomization.draws_actuator:  # else every draw is checked
             for one in plant.actuators:
                 one.check_at(plant.timestep, unstable)
-        if any(one.INERTIA for one in plant.actuators):
-            check_shafts(task_model(plant), unstable, held=self.config.physics == "analytic")
+        if any(one.INERTIA or one.MOTION for one in plant.actuators):
+            held, explicit = self.config.physics == "analytic", plant.integrator == "euler"
+            check_shafts(task_model(plant), unstable, held, explicit=explicit)
 
     @functools.cached_property
     def commands(self) -> TaskCommands:
@@ -71,7 +72,8 @@ class Setup:
         integrator, commands = self.task.integrator(self.config.integrator), self.commands
         disturbances, joint = self.config.disturbances, self.config.joint
         return Plant(
-            self.task, commands.simulated, self.inner_steps, integrator, commands.max_forces, disturbances, joint
+            self.task, commands.simulated, self.inner_steps, integrator, commands.max_forces, disturbances, joint,
+            commands.holds,
         )
 
     @functools.cached_property
