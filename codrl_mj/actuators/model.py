@@ -218,7 +218,7 @@ class ActuatorModel(fields.Checked):
         """
 
     def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
-        """Refuse what cannot be simulated on a shaft that moves so much; called for families with `INERTIA` or `MOTION`.
+        """Refuse what cannot be simulated on a shaft that moves so much; called where `closes_loops`.
 
         Args:
             timestep: mechanical step [s].
@@ -229,6 +229,11 @@ class ActuatorModel(fields.Checked):
         Raises:
             UnstableError: it is unstable there; the reason, with its number, and a remedy.
         """
+
+    @property
+    def closes_loops(self) -> bool:
+        """Whether it may close a loop over its shaft's position or speed, to be checked with what it moves."""
+        return self.INERTIA or self.MOTION or type(self) not in BUILT_IN
 
     def steps_per_sample(self, timestep: float) -> int:
         """Return the number of mechanical steps [s] after which its samples repeat."""

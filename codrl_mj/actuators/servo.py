@@ -6,6 +6,7 @@ a current. P and PD in one, u = kp*(q* - q) - kd*w, are `velocity_gain` kd, `pos
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -229,6 +230,18 @@ class Servo(Drive):
             [_fits(*each, timestep) for each in zip(columns.servo_rate, columns.sample_rate, strict=True)]
         )
         return np.where(fitting, super().instability(numbers, timestep), np.inf)
+
+    def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
+        """As `Drive.check_shaft`; and warn of a position loop that is faster than the engine moves the joint."""
+        super().check_shaft(timestep, inertia, held)
+        loop, count = self.loop, round(timestep * self.loop.servo_rate)
+        if loop.controls == "position" and count > 1 and timestep * loop.position_gain > 1.0:
+            warnings.warn(
+                f"loop.position_gain = {loop.position_gain:g}: the servo would be at its target within a step of "
+                f"{timestep:g} s, and the engine moves the joint by one speed in that: it comes later than it should. "
+                f"Shorten the step to {1.0 / loop.position_gain:.3g} s",
+                stacklevel=2,
+            )
 
     def steps_per_sample(self, timestep: float) -> int:
         """As `ActuatorModel.steps_per_sample`."""

@@ -1,4 +1,4 @@
-"""Stability of the discrete closed loops: of controller and winding, and of actuators with the joints that they move."""
+"""Stability of discrete closed loops: of controller and winding, and of actuators with the joints that they move."""
 
 import dataclasses
 import math
@@ -125,63 +125,63 @@ def check_stable(actuator: Any, timestep: float) -> None:
     )
 
 
-class Mechanics(NamedTuple):
-    """Joints and shafts, linearized at rest without gravity, springs and contacts, and how they are integrated."""
+class Joints(NamedTuple):
+    """Joints and shafts at rest, linearized without gravity, springs, contacts and limits.
+
+    `inertia` (v, v) and `damping` (v,) are of the degrees of freedom, `moments` (n, v) the speeds of shafts for theirs.
+    The `integrator` is `euler`, which moves positions by the old speeds, `semi-implicit` or `rk4`; unless by RK4,
+    `explicit_damping` damps the old speeds.
+    """
 
     inertia: np.ndarray
-    """Inertia matrix of the degrees of freedom, shape (v, v)."""
     damping: np.ndarray
-    """Viscous friction of the degrees of freedom, shape (v,)."""
     moments: np.ndarray
-    """Speeds of the shafts for speeds of the degrees of freedom, shape (n, v)."""
     integrator: str
-    """`euler`, where positions are moved by the old speeds, `semi-implicit`, or `rk4`."""
     explicit_damping: bool
-    """Whether it is the old speeds that are damped, unless by `rk4`."""
 
     def transition(self, timestep: float) -> np.ndarray:
         """Return speeds and shafts' positions after a step, for speeds, positions and held torques: (v + n, v + 2n)."""
-        freedoms, shafts = len(self.inertia), len(self.moments)
-        speeds, torques = slice(freedoms), slice(freedoms + shafts, None)
-        drag, rate = np.diag(self.damping), np.zeros((freedoms + 2 * shafts,) * 2)
-        after = np.eye(len(rate))
+        shafts, freedoms = self.moments.shape
+        speeds, positions = slice(freedoms), slice(freedoms, freedoms + shafts)
+        after, drag = np.eye(freedoms + 2 * shafts), np.diag(self.damping)
         if self.integrator == "rk4":
-            rate[speeds, speeds] = -np.linalg.solve(self.inertia, drag)
-            rate[speeds, torques] = np.linalg.solve(self.inertia, self.moments.T)
-            rate[freedoms : freedoms + shafts, speeds] = self.moments
+            rate = np.zeros_like(after)
+            rate[speeds] = np.linalg.solve(self.inertia, np.hstack([-drag, 0.0 * self.moments.T, self.moments.T]))
+            rate[positions, speeds] = self.moments
             for order in (4, 3, 2, 1):  # Of a linear system RK4 is the Taylor series of order 4.
                 after = np.eye(len(rate)) + timestep / order * rate @ after
         else:
             implicit, explicit = (0.0, timestep) if self.explicit_damping else (timestep, 0.0)
-            solved = np.linalg.inv(self.inertia + implicit * drag)
-            after[speeds, speeds] = solved @ (self.inertia - explicit * drag)
-            after[speeds, torques] = timestep * solved @ self.moments.T
-            moving = np.eye(len(rate))[speeds] if self.integrator == "euler" else after[speeds]
-            after[freedoms : freedoms + shafts] += timestep * self.moments @ moving
-        return after[: freedoms + shafts]
+            pushes = np.hstack([self.inertia - explicit * drag, 0.0 * self.moments.T, timestep * self.moments.T])
+            after[speeds] = np.linalg.solve(self.inertia + implicit * drag, pushes)
+            moving = np.eye(len(after))[speeds] if self.integrator == "euler" else after[speeds]
+            after[positions] += timestep * self.moments @ moving
+        return after[: positions.stop]
 
 
-PERTURBATION = -1e-6
+CHANGE = -1e-6
 """Added to each state in turn. It is negative so that counters and times stay on the side where a sample is due."""
 FREE = {"stribeck_friction": 0.0, "gear_efficiency": 1.0, "deadband": 0.0}
-"""Parameters of families that have them -> values without friction and dead zone."""
-MAX_PERIOD = 60
-"""Largest number of steps after which loops of several rates are taken to repeat."""
+"""Parameters of families that have them -> values without friction and dead zone, which hide small motions."""
 
 
-def linearize(actuator: Any, advance: Callable[..., Any], timestep: float, inertia: float) -> np.ndarray:
+def linearize(
+    actuator: Any, advance: Callable[..., Any], timestep: float, inertia: float, change: float = CHANGE
+) -> np.ndarray:
     """Linearize an actuator's `advance` at rest, for each mechanical step until its samples repeat.
 
     Args:
-        actuator: the actuator; its friction and dead zone, which hide a loop that is small, are left out.
-        advance: the family's, or its compiled form.
+        actuator: the actuator.
+        advance: its family's `advance`, compiled or not.
         timestep: mechanical step [s].
         inertia: inertia [kg*m^2] that it is told; `inf` where it is told none.
+        change: what is added to each state in turn.
 
     Returns:
         Shape (steps, s + 1, s + 2): the new states and the torque, for the states, the position and the speed.
     """
-    family, period = type(actuator), actuator.steps_per_sample(timestep)
+    family: Any = type(actuator)
+    period = actuator.steps_per_sample(timestep)
     parameters, count = parameters_type(family)(*actuator.numbers), len(family.State._fields)
     parameters = parameters._replace(**{name: FREE[name] for name in FREE.keys() & {*parameters._fields}})
     maps, state = [], np.zeros(count)
@@ -197,116 +197,35 @@ def linearize(actuator: Any, advance: Callable[..., Any], timestep: float, inert
         time, point = step * timestep, np.append(state, [0.0, 0.0])
         rest = advanced(point, time)
         if step >= period:
-            changed = [advanced(point + row, time) - rest for row in PERTURBATION * np.eye(count + 2)]
-            maps.append(np.stack(changed, axis=1) / PERTURBATION)
+            changed = [advanced(point + row, time) - rest for row in change * np.eye(count + 2)]
+            maps.append(np.stack(changed, axis=1) / change)
         state = rest[:count]
     return np.array(maps)
 
 
-def loop_radius(mechanics: Mechanics, loops: Sequence[np.ndarray], timestep: float) -> float:
-    """Return the spectral radius of actuators together with the joints that they move, until their samples repeat.
+def loop_radius(joints: Joints, loops: Sequence[np.ndarray], timestep: float) -> float:
+    """Return the spectral radius of actuators and joints together, over the steps after which their samples repeat.
 
     Args:
-        mechanics: of the joints; a shaft for each actuator.
+        joints: the joints, with a shaft for each actuator.
         loops: the actuators, as `linearize` returns them.
         timestep: mechanical step [s].
-
-    Returns:
-        Below 1 if the loops are stable; 1 if nothing holds a joint.
     """
-    transition, moments, product = mechanics.transition(timestep), mechanics.moments, np.eye(1)
-    with np.errstate(all="ignore"):
-        for step in range(min(math.lcm(*map(len, loops)), MAX_PERIOD)):
-            matrix = _step_matrix(transition, moments, [loop[step % len(loop)] for loop in loops])
-            product = matrix @ product if step else matrix
-        if not np.isfinite(product).all():
-            return math.inf
-        # A state that nothing else reads, or that nothing else changes, is no part of a loop.
-        live = np.ones(len(product), dtype=bool)
-        coupled = (product != 0.0) & ~np.eye(len(product), dtype=bool)
-        while (left := live & coupled[live].any(axis=0) & coupled[:, live].any(axis=1)).sum() < live.sum():
-            live = left
-        values = np.linalg.eigvals(product[np.ix_(live, live)])
-    return float(np.abs(values).max(initial=0.0))
-
-
-def _step_matrix(transition: np.ndarray, moments: np.ndarray, loops: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the change of (speeds of the joints, positions of the shafts, states of the actuators) in a step."""
-    shafts, freedoms = moments.shape
-    starts = np.cumsum([freedoms + shafts, *(len(loop) - 1 for loop in loops)])
-    now, torques = np.eye(starts[-1]), np.zeros((shafts, starts[-1]))
-    after = np.zeros_like(now)
-    for index, (loop, start, end) in enumerate(zip(loops, starts[:-1], starts[1:], strict=True)):
-        seen = np.vstack([now[start:end], now[freedoms + index], moments[index] @ now[:freedoms]])
-        after[start:end], torques[index] = loop[:-1] @ seen, loop[-1] @ seen
-    after[: starts[0]] = transition @ np.vstack([now[: starts[0]], torques])
-    return after
-
-
-TOLERANCE = 1e-6
-"""Excess over 1 that the spectral radius of joints that nothing holds can have by rounding."""
-MAX_TOGETHER = 20
-"""Largest number of actuators whose loops are checked together: eigenvalues take the cube of it, 10 ms for 20."""
-
-
-@dataclasses.dataclass(frozen=True)
-class JointLoops:
-    """Actuators of a model, with the joints that they move together."""
-
-    mechanics: Mechanics
-    """The joints; a shaft for each actuator."""
-    names: Sequence[str]
-    """Names of the actuators, for messages."""
-    actuators: Sequence[Any]
-    """The actuators."""
-    advances: Sequence[Callable[..., Any]]
-    """The `advance` of each, compiled or not."""
-    inertias: Sequence[float]
-    """Inertia [kg*m^2] at each shaft."""
-    held: bool
-    """Whether the actuators are not told the inertia."""
-
-    def radius(self, timestep: float) -> float:
-        """Return the spectral radius of all loops together at a step [s]; of more than `MAX_TOGETHER` in groups."""
-        count = len(self.actuators)
-        groups = np.array_split(np.arange(count), math.ceil(count / MAX_TOGETHER))
-        return max(self.radius_of(group.tolist(), timestep) for group in groups)
-
-    def radius_of(self, chosen: Sequence[int], timestep: float) -> float:
-        """Return the spectral radius of some loops, the other shafts free."""
-        loops = []
-        for index in chosen:
-            one, advance, inertia = self.actuators[index], self.advances[index], self.inertias[index]
-            loops.append(linearize(one, advance, timestep, inertia if one.INERTIA and not self.held else math.inf))
-        return loop_radius(self.mechanics._replace(moments=self.mechanics.moments[chosen]), loops, timestep)
-
-    def check(self, timestep: float) -> float:
-        """Return `radius` if it is stable.
-
-        Raises:
-            UnstableError: it is not; the message has the number and a step that was tried, if one does.
-        """
-        radius = self.radius(timestep)
-        if radius < 1.0 + TOLERANCE:
-            return radius
-        alone = [self.radius_of([index], timestep) for index in range(len(self.actuators))]
-        worst, together = int(np.argmax(alone)), max(alone) < 1.0 + TOLERANCE
-        raise UnstableError(
-            f"{', '.join(self.names) if together else self.names[worst]}: the outer loops are unstable"
-            f"{' together' * together}: spectral radius {radius:.4g} over a mechanical step of {timestep:g} s, must be "
-            f"< 1. {self.actuators[worst].loop_remedy(self.inertias[worst])} {self._shorter(timestep)}; or pass "
-            "allow_unstable=True"
-        )
-
-    def _shorter(self, timestep: float) -> str:
-        """Return a sentence on the longest of the shorter steps at which all is stable."""
-        for parts in (2, 3, 4, 5, 8, 10, 16, 20, 32, 50, 64, 100):
-            shorter = timestep / parts
-            try:
-                for actuator in self.actuators:
-                    actuator.check(shorter)
-            except ValueError:
-                continue
-            if (radius := self.radius(shorter)) < 1.0 + TOLERANCE:
-                return f"Or shorten the step to {shorter:g} s, which does (spectral radius {radius:.4g})"
-        return "A shorter step does not help"
+    shafts, freedoms = joints.moments.shape
+    starts = np.cumsum([freedoms + shafts, *(len(loop[0]) - 1 for loop in loops)])
+    now, transition = np.eye(starts[-1]), joints.transition(timestep)
+    product = now
+    for step in range(math.lcm(*map(len, loops))):
+        torques, matrix = np.zeros((shafts, len(now))), np.zeros_like(now)
+        for index, (loop, start, end) in enumerate(zip(loops, starts[:-1], starts[1:], strict=True)):
+            seen = np.vstack([now[start:end], now[freedoms + index], joints.moments[index] @ now[:freedoms]])
+            *matrix[start:end], torques[index] = loop[step % len(loop)] @ seen
+        matrix[: starts[0]] = transition @ np.vstack([now[: starts[0]], torques])
+        product = matrix @ product
+    if not np.isfinite(product).all():
+        return math.inf
+    # A state that nothing else reads, or that nothing else changes, is no part of a loop.
+    live, coupled = np.ones(len(product), dtype=bool), (product != 0.0) & ~np.eye(len(product), dtype=bool)
+    while (left := live & coupled[live].any(axis=0) & coupled[:, live].any(axis=1)).sum() < live.sum():
+        live = left
+    return float(np.abs(np.linalg.eigvals(product[np.ix_(live, live)])).max(initial=0.0))

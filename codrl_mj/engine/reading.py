@@ -1,7 +1,7 @@
 """What compiled models and their data say of our actuators, at either door."""
 
 import numbers
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -171,13 +171,14 @@ def check_shafts(
     Raises:
         UnstableError: with the number and a remedy.
     """
-    asking = {index: one for index, one in (actuators or motors(model)).items() if one.INERTIA or one.MOTION}
+    asking = {index: one for index, one in (actuators or motors(model)).items() if one.closes_loops}
     if not asking:
         return 0.0
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
     shafts, inertias = [(model.actuator_trntype[index], *model.actuator_trnid[index]) for index in asking], []
-    for (index, actuator), shaft in zip(asking.items(), shafts, strict=True):
+    names = [model.actuator(index).name or f"actuator {index}" for index in asking]
+    for (index, actuator), shaft, name in zip(asking.items(), shafts, names, strict=True):
         arm = 1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius  # the callback's is in the gear
         inertias.append(shaft_inertia(model, data, model.actuator_outadr[index], 1.0 / arm))
         try:
@@ -185,42 +186,85 @@ def check_shafts(
             actuator.check_shaft(model.opt.timestep, inertias[-1] / several, several > 1 or held)
         except UnstableError as error:
             if not allow_unstable:
-                raise UnstableError(f"{_named(model, index)}: {error}") from None
-    loops = stability.JointLoops(
-        _mechanics(model, data, asking, explicit),
-        [_named(model, index) for index in asking],
-        list(asking.values()),
-        [one.advance if held else compiled_advance(type(one)) for one in asking.values()],
-        inertias,
-        held,
+                raise UnstableError(f"{name}: {error}") from None
+    radius, judged = _loop_radius(model, data, asking, inertias, held, explicit)
+    step = model.opt.timestep
+    found = radius(step)
+    if found < STABLE or allow_unstable:
+        return found
+    alone = {at: radius(step, at) for at in judged}
+    worst = max(alone, key=alone.__getitem__)
+    together = alone[worst] < STABLE
+    remedy = list(asking.values())[worst].loop_remedy(inertias[worst])
+    raise UnstableError(
+        f"{', '.join(names[at] for at in judged) if together else names[worst]}: the outer loops are unstable"
+        f"{' together' * together}: spectral radius {found:.4g} over a mechanical step of {step:g} s, must be < 1. "
+        f"{remedy} {_shorter(asking.values(), radius, step)}; or pass allow_unstable=True"
     )
-    return loops.radius(model.opt.timestep) if allow_unstable else loops.check(model.opt.timestep)
 
 
-def _named(model: mujoco.MjModel, index: int) -> str:
-    """Return an actuator's name for messages."""
-    return model.actuator(index).name or f"actuator {index}"
+def _loop_radius(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    actuators: Mapping[int, ActuatorModel],
+    inertias: Sequence[float],
+    held: bool,
+    explicit: bool,
+) -> tuple[Callable[..., float], list[int]]:
+    """Return a function of a step [s], and of some of the actuators unless of all, and which of these are judged."""
+    joints, each = _joints(model, data, actuators, explicit), list(actuators.values())
+    advances = [one.advance if held else compiled_advance(type(one)) for one in each]
+    told = [inertia if one.INERTIA and not held else np.inf for one, inertia in zip(each, inertias, strict=True)]
+
+    def linearized(at: int, timestep: float, size: float = 1.0) -> np.ndarray:
+        return stability.linearize(each[at], advances[at], timestep, told[at], size * stability.CHANGE)
+
+    def is_smooth(at: int) -> bool:
+        small, large = (linearized(at, model.opt.timestep, size) for size in (1.0, 10.0))
+        return np.allclose(small, large, rtol=0.01, atol=1e-6 * np.abs(small).max())
+
+    def radius(timestep: float, *chosen: int) -> float:
+        at = list(chosen or judged)
+        loops = [linearized(one, timestep) for one in at]
+        return stability.loop_radius(joints._replace(moments=joints.moments[at]), loops, timestep) if at else 0.0
+
+    # A family of the user's may have friction or a gap at rest, of which no linear loop says anything.
+    judged = [at for at, one in enumerate(each) if type(one) in BUILT_IN or is_smooth(at)]
+    return radius, judged
 
 
-def _mechanics(
+STABLE = 1.0 + 1e-6
+"""Spectral radius below which loops are stable: that of joints that nothing holds is 1, with rounding."""
+
+
+def _shorter(actuators: Collection[ActuatorModel], radius: Callable[[float], float], timestep: float) -> str:
+    """Return a sentence on the longest of some shorter steps [s] at which all is stable."""
+    for parts in (2, 3, 4, 5, 8, 10, 16, 20, 32, 50, 100):
+        try:
+            for actuator in actuators:
+                actuator.check(timestep / parts)
+        except ValueError:
+            continue
+        if (found := radius(timestep / parts)) < STABLE:
+            return f"Or shorten the step to {timestep / parts:g} s, which does (spectral radius {found:.4g})"
+    return "A shorter step does not help"
+
+
+def _joints(
     model: mujoco.MjModel, data: mujoco.MjData, actuators: Mapping[int, ActuatorModel], explicit: bool
-) -> stability.Mechanics:
-    """Return the linearized mechanics of a model at a position, with the shafts of some actuators."""
-    inertia, row = np.empty((model.nv, model.nv)), np.empty(model.nv)
-    for freedom, unit in enumerate(np.eye(model.nv)):
+) -> stability.Joints:
+    """Return the linearized joints of a model at a position, with the shafts of some actuators."""
+    inertia, every = np.empty((model.nv, model.nv)), np.zeros((len(data.moment_rownnz), model.nv))
+    for row, unit in zip(inertia, np.eye(model.nv), strict=True):
         mujoco.mj_mulM(model, data, row, unit)
-        inertia[freedom] = row
-    every = np.zeros((len(data.moment_rownnz), model.nv))
     mujoco.mju_sparse2dense(every, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    moments = [
-        every[model.actuator_outadr[index]] / (1.0 if model.actuator_plugin[index] < 0 else one.arm_radius)
-        for index, one in actuators.items()
-    ]
-    is_rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    by_euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
-    undamped = bool(by_euler and model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    arms = [1.0 if model.actuator_plugin[index] < 0 else one.arm_radius for index, one in actuators.items()]
+    moments = every[model.actuator_outadr[list(actuators)]] / np.array(arms)[:, np.newaxis]
+    kind, undamped = model.opt.integrator, model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    is_rk4 = kind == mujoco.mjtIntegrator.mjINT_RK4
     integrator = "rk4" if is_rk4 else "euler" if explicit else "semi-implicit"
-    return stability.Mechanics(inertia, model.dof_damping.copy(), np.array(moments), integrator, undamped)
+    undamped = undamped and kind == mujoco.mjtIntegrator.mjINT_EULER
+    return stability.Joints(inertia, model.dof_damping.copy(), moments, integrator, bool(undamped))
 
 
 class Readout:

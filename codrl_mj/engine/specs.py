@@ -69,7 +69,7 @@ def motorise(spec: mujoco.MjSpec, actuators: Mapping[str, Any], allow_unstable: 
         load_family(type(actuator))
         _drive(new, model, index, actuator)
     new.nuser_actuator = -1  # as many as are needed
-    if any(actuator.INERTIA or actuator.MOTION for _, actuator in chosen.values()):
+    if any(actuator.closes_loops for _, actuator in chosen.values()):
         check_shafts(new.compile(), allow_unstable)
     return new
 

@@ -277,7 +277,7 @@ def _dof(model: mujoco.MjModel, index: int) -> int:
 
 
 def _hold(model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> tuple[float, float]:
-    """Return how an actuator's control must change with its length, and be at 0, to hold it: zeros unless a position."""
+    """Return the slope over its length, and the offset, of a control that holds an actuator; zeros if it is a force."""
     if actuator.MOTION:
         asked = next(iter(actuator.commands().values()))
         return float(asked.unit in POSITIONS), 0.0

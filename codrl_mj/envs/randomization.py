@@ -1,5 +1,7 @@
 """Motors and models drawn at every reset: what is drawn of them, and what present episodes were drawn with."""
 
+import copy
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -7,20 +9,24 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import (
+    BUILT_IN,
     Actuator,
     ActuatorModel,
     Family,
     Ideal,
+    UnstableError,
     choices_of,
     field_paths,
     field_values,
     parameter_paths,
     unchecked,
 )
+from codrl_mj.engine.reading import check_shafts
+from codrl_mj.engine.reading import motors as motors_of
 from codrl_mj.engine.specs import matched_by, names_of
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
-from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable
+from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable, write_fields
 
 LIMIT = 1000
 """Draws of an unstable loop in a row after which a reset gives up."""
@@ -224,6 +230,58 @@ class Draws:
         if self.randomization.distributions:
             self._values[:], self._rejected[:] = snapshot["drawn"], snapshot["rejected"]
             self._put(self, np.arange(len(self._values)))
+
+
+def check_extremes(
+    randomization: Randomization,
+    motors: Sequence[ActuatorModel],
+    model: mujoco.MjModel,
+    held: bool = False,
+    explicit: bool = False,
+) -> None:
+    """Refuse draws that can make a loop over a position or a speed unstable.
+
+    From the lower bounds on, each drawn value in turn goes to the bound that makes the loops least stable.
+
+    Args:
+        randomization: what is drawn.
+        motors: the motors as they are.
+        model: the model with them; it is not changed.
+        held: as for `check_shafts`.
+        explicit: likewise.
+
+    Raises:
+        ValueError: with the values that were tried, and a remedy.
+    """
+    if not randomization.distributions or not any(one.MOTION or type(one) not in BUILT_IN for one in motors):
+        return
+    draws, model, indices = Draws(randomization, [motors], lambda *_: None), copy.copy(model), list(motors_of(model))
+    data, bounds = mujoco.MjData(model), [sorted(one.extremes) for one in randomization.distributions.values()]
+
+    def radius(values: list[float]) -> float:
+        draws._values[0] = values
+        try:
+            present = dict(zip(indices, draws.motors(), strict=True))
+            for index, one in present.items():
+                one.check(randomization.timestep)
+                if model.actuator_plugin[index] < 0:  # the callback's arm is in the gear
+                    model.actuator_gear[model.actuator_outadr[index], 0] = 1.0 / one.arm_radius
+        except ValueError:
+            return 0.0  # Such a set is drawn again.
+        write_fields(model, draws.model_fields(np.zeros(1, dtype=int)))
+        mujoco.mj_setConst(model, data)
+        try:
+            return check_shafts(model, held=held, actuators=present, explicit=explicit)
+        except UnstableError as error:
+            drawn = ", ".join(f"{path} = {value:g}" for path, value in zip(randomization.types, values, strict=True))
+            raise ValueError(f"randomize: {drawn}: {error}; or narrow the bounds") from None
+
+    values = [low for low, *_ in bounds]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for column, each in enumerate(bounds):
+            tried = [[*values[:column], bound, *values[column + 1 :]] for bound in (each[0], each[-1])]
+            values = max(tried, key=radius)
 
 
 def put_into(simulation: Any, draws: Draws, rows: np.ndarray) -> None:

@@ -14,7 +14,7 @@ from codrl_mj.engine.reading import check_shafts
 from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.motors import longer, sensor_names
-from codrl_mj.envs.randomization import Randomization
+from codrl_mj.envs.randomization import Randomization, check_extremes
 from codrl_mj.own_code import look_up
 from codrl_mj.physics import PHYSICS, Physics, Plant, Signals, trace_names
 from codrl_mj.physics.base import namer
@@ -57,9 +57,11 @@ class Setup:
         if not self.randomization.draws_actuator:  # else every draw is checked
             for one in plant.actuators:
                 one.check_at(plant.timestep, unstable)
-        if any(one.INERTIA or one.MOTION for one in plant.actuators):
-            held, explicit = self.config.physics == "analytic", plant.integrator == "euler"
-            check_shafts(task_model(plant), unstable, held, explicit=explicit)
+        if any(one.closes_loops for one in plant.actuators):
+            model, held, explicit = task_model(plant), self.config.physics == "analytic", plant.integrator == "euler"
+            check_shafts(model, unstable, held, explicit=explicit)
+            if not unstable:
+                check_extremes(self.randomization, plant.actuators, model, held, explicit)
 
     @functools.cached_property
     def commands(self) -> TaskCommands:
@@ -72,7 +74,13 @@ class Setup:
         integrator, commands = self.task.integrator(self.config.integrator), self.commands
         disturbances, joint = self.config.disturbances, self.config.joint
         return Plant(
-            self.task, commands.simulated, self.inner_steps, integrator, commands.max_forces, disturbances, joint,
+            self.task,
+            commands.simulated,
+            self.inner_steps,
+            integrator,
+            commands.max_forces,
+            disturbances,
+            joint,
             commands.holds,
         )
 

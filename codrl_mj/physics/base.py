@@ -102,7 +102,7 @@ class Plant:
         return self.task.step_duration / self.inner_steps
 
     def held(self, states: np.ndarray) -> np.ndarray:
-        """Return the desired forces that hold states (m, s) where they are, shape (m, n): 0 unless commands are positions."""
+        """Return the desired forces that hold states (m, s) there, shape (m, n): 0 unless commands are positions."""
         task = self.task
         positions = states[:, [task.qpos[task.qvel.index(speed)] for speed in task.speeds]]
         return np.where(self.holds != 0.0, self.holds * positions, 0.0)

@@ -39,9 +39,7 @@ class MujocoBatchPhysics:
         self.plant, task = plant, plant.task
         self.num_envs, self._num_threads = len(actuators), num_threads
         self._nominal = MujocoPhysics(plant)
-        self._disturber = Disturber(
-            plant.disturbances, plant.timestep, plant.max_forces, self.num_envs, plant.holds
-        )
+        self._disturber = Disturber(plant.disturbances, plant.timestep, plant.max_forces, self.num_envs, plant.holds)
         self._wiring = self._nominal.wiring
         self._positions, self._velocities = np.array(task.qpos), np.array(task.qvel)
         self._fields: dict[str, np.ndarray] = {}
