@@ -219,13 +219,14 @@ def loop_radius(joints: Joints, loops: Sequence[np.ndarray], timestep: float) ->
         torques, matrix = np.zeros((shafts, len(now))), np.zeros_like(now)
         for index, (loop, start, end) in enumerate(zip(loops, starts[:-1], starts[1:], strict=True)):
             seen = np.vstack([now[start:end], now[freedoms + index], joints.moments[index] @ now[:freedoms]])
-            *matrix[start:end], torques[index] = loop[step % len(loop)] @ seen
+            matrix[start:end], torques[index] = np.split(loop[step % len(loop)] @ seen, [-1])
         matrix[: starts[0]] = transition @ np.vstack([now[: starts[0]], torques])
         product = matrix @ product
     if not np.isfinite(product).all():
         return math.inf
-    # A state that nothing else reads, or that nothing else changes, is no part of a loop.
+    # A state, other than a speed, that nothing else reads, or that nothing else changes, is no part of a loop.
     live, coupled = np.ones(len(product), dtype=bool), (product != 0.0) & ~np.eye(len(product), dtype=bool)
+    coupled[:freedoms, :freedoms] = True
     while (left := live & coupled[live].any(axis=0) & coupled[:, live].any(axis=1)).sum() < live.sum():
         live = left
     return float(np.abs(np.linalg.eigvals(product[np.ix_(live, live)])).max(initial=0.0))

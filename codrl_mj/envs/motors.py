@@ -80,7 +80,7 @@ class Motors:
             distributions, bare, nominal, fixed, timestep, settings.allow_unstable, "the model"
         )
         if not settings.allow_unstable:
-            check_extremes(randomization, list(nominal.values()), model)
+            check_extremes(randomization, nominal, model)
         self.draws = Draws(randomization, [list(nominal.values())], functools.partial(put_into, self))
         drawn = settings.disturbances.random or randomization.random
         self._random = drawn or any(one.random for one in nominal.values())

@@ -59,9 +59,10 @@ class Setup:
                 one.check_at(plant.timestep, unstable)
         if any(one.closes_loops for one in plant.actuators):
             model, held, explicit = task_model(plant), self.config.physics == "analytic", plant.integrator == "euler"
-            check_shafts(model, unstable, held, explicit=explicit)
+            motors = {model.actuator(name).id: one for name, one in zip(self.task.motors, plant.actuators, strict=True)}
+            check_shafts(model, unstable, held, motors, explicit)
             if not unstable:
-                check_extremes(self.randomization, plant.actuators, model, held, explicit)
+                check_extremes(self.randomization, motors, model, held, explicit)
 
     @functools.cached_property
     def commands(self) -> TaskCommands:
