@@ -232,7 +232,7 @@ class ActuatorModel(fields.Checked):
 
     @property
     def closes_loops(self) -> bool:
-        """Whether it may close a loop over its shaft's position or speed, to be checked with what it moves."""
+        """True if it may close a loop over its shaft's position or speed, to be checked with what it moves."""
         return self.INERTIA or self.MOTION or type(self) not in BUILT_IN
 
     def steps_per_sample(self, timestep: float) -> int:

@@ -187,19 +187,19 @@ def check_shafts(
         except UnstableError as error:
             if not allow_unstable:
                 raise UnstableError(f"{name}: {error}") from None
-    radius, judged = _loop_radius(model, data, asking, inertias, held, explicit)
+    spectral_radius, linear = _loop_radius(model, data, asking, inertias, held, explicit)
     step = model.opt.timestep
-    found = radius(step)
-    if found < STABLE or allow_unstable:
-        return found
-    alone = {at: radius(step, at) for at in judged}
-    worst = max(alone, key=alone.__getitem__)
-    together = alone[worst] < STABLE
+    largest = spectral_radius(step)
+    if largest < STABLE or allow_unstable:
+        return largest
+    separate = {number: spectral_radius(step, number) for number in linear}
+    worst = max(separate, key=separate.__getitem__)
+    together = separate[worst] < STABLE
     remedy = list(asking.values())[worst].loop_remedy(inertias[worst])
     raise UnstableError(
-        f"{', '.join(names[at] for at in judged) if together else names[worst]}: the outer loops are unstable"
-        f"{' together' * together}: spectral radius {found:.4g} over a mechanical step of {step:g} s, must be < 1. "
-        f"{remedy} {_shorter(asking.values(), radius, step)}; or pass allow_unstable=True"
+        f"{', '.join(names[number] for number in linear) if together else names[worst]}: the outer loops are unstable"
+        f"{' together' * together}: spectral radius {largest:.4g} over a mechanical step of {step:g} s, must be < 1. "
+        f"{remedy} {_shorter(asking.values(), spectral_radius, step)}; or pass allow_unstable=True"
     )
 
 
@@ -211,33 +211,35 @@ def _loop_radius(
     held: bool,
     explicit: bool,
 ) -> tuple[Callable[..., float], list[int]]:
-    """Return a function of a step [s], and of some of the actuators unless of all, and which of these are judged."""
-    joints, each = _joints(model, data, actuators, explicit), list(actuators.values())
-    advances = [one.advance if held else compiled_advance(type(one)) for one in each]
-    told = [inertia if one.INERTIA and not held else np.inf for one, inertia in zip(each, inertias, strict=True)]
+    """Return a function of a step [s], and of the numbers of some actuators unless of all, and which are linear."""
+    joints, motors = _joints(model, data, actuators, explicit), list(actuators.values())
+    advances = [motor.advance if held else compiled_advance(type(motor)) for motor in motors]
+    known = [inertia if motor.INERTIA and not held else np.inf for motor, inertia in zip(motors, inertias, strict=True)]
 
-    def linearized(at: int, timestep: float, size: float = 1.0) -> np.ndarray:
-        return stability.linearize(each[at], advances[at], timestep, told[at], size * stability.CHANGE)
+    def linearized(number: int, timestep: float, size: float = 1.0) -> np.ndarray:
+        change = size * stability.CHANGE
+        return stability.linearize(motors[number], advances[number], timestep, known[number], change)
 
-    def is_smooth(at: int) -> bool:
-        small, large = (linearized(at, model.opt.timestep, size) for size in (1.0, 10.0))
+    def is_smooth(number: int) -> bool:
+        small, large = (linearized(number, model.opt.timestep, size) for size in (1.0, 10.0))
         return np.allclose(small, large, rtol=0.01, atol=1e-6 * np.abs(small).max())
 
-    def radius(timestep: float, *chosen: int) -> float:
-        at = list(chosen or judged)
-        loops = [linearized(one, timestep) for one in at]
-        return stability.loop_radius(joints._replace(moments=joints.moments[at]), loops, timestep) if at else 0.0
+    def spectral_radius(timestep: float, *numbers: int) -> float:
+        chosen = list(numbers or linear)
+        loops = [linearized(number, timestep) for number in chosen]
+        shafts = joints._replace(moments=joints.moments[chosen])
+        return stability.loop_radius(shafts, loops, timestep) if chosen else 0.0
 
-    # A family of the user's may have friction or a gap at rest, of which no linear loop says anything.
-    judged = [at for at, one in enumerate(each) if type(one) in BUILT_IN or is_smooth(at)]
-    return radius, judged
+    # A custom family may have friction or a gap at rest, of which a linear loop says nothing.
+    linear = [number for number, motor in enumerate(motors) if type(motor) in BUILT_IN or is_smooth(number)]
+    return spectral_radius, linear
 
 
 STABLE = 1.0 + 1e-6
 """Spectral radius below which loops are stable: that of joints that nothing holds is 1, with rounding."""
 
 
-def _shorter(actuators: Collection[ActuatorModel], radius: Callable[[float], float], timestep: float) -> str:
+def _shorter(actuators: Collection[ActuatorModel], radius_at: Callable[[float], float], timestep: float) -> str:
     """Return a sentence on the longest of some shorter steps [s] at which all is stable."""
     for parts in (2, 3, 4, 5, 8, 10, 16, 20, 32, 50, 100):
         try:
@@ -245,8 +247,8 @@ def _shorter(actuators: Collection[ActuatorModel], radius: Callable[[float], flo
                 actuator.check(timestep / parts)
         except ValueError:
             continue
-        if (found := radius(timestep / parts)) < STABLE:
-            return f"Or shorten the step to {timestep / parts:g} s, which does (spectral radius {found:.4g})"
+        if (radius := radius_at(timestep / parts)) < STABLE:
+            return f"Or shorten the step to {timestep / parts:g} s, which does (spectral radius {radius:.4g})"
     return "A shorter step does not help"
 
 

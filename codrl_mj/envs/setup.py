@@ -73,17 +73,8 @@ class Setup:
     def plant(self) -> Plant:
         """What is simulated."""
         integrator, commands = self.task.integrator(self.config.integrator), self.commands
-        disturbances, joint = self.config.disturbances, self.config.joint
-        return Plant(
-            self.task,
-            commands.simulated,
-            self.inner_steps,
-            integrator,
-            commands.max_forces,
-            disturbances,
-            joint,
-            commands.holds,
-        )
+        between = commands.max_forces, self.config.disturbances, self.config.joint, commands.holds
+        return Plant(self.task, commands.simulated, self.inner_steps, integrator, *between)
 
     @functools.cached_property
     def randomization(self) -> Randomization:
