@@ -34,11 +34,12 @@ class Disturbances(fields.Checked):
 
     command_delay: float = real(0.0, least=0, unit="s")
     """Delay of the command [s], >= 0; where it is no whole number of integration steps, the two neighbouring commands
-    are interpolated linearly. Before the first command there is zero."""
+    are interpolated linearly. Until the first command arrives, a position is held, and others are zero."""
     command_quantum: float = real(0.0, least=0, unit="N")
     """Quantisation step of the command [N or N*m], >= 0; rounds half to even, and ends at the largest force."""
     command_rate: float = real(0.0, least=0, unit="N/s")
-    """Largest change of the command per second [N/s or N*m/s], >= 0; 0: no limit. It starts from zero."""
+    """Largest change of the command per second [N/s or N*m/s], >= 0; 0: no limit. It starts from zero, or
+    from the position at the reset."""
     pulse_force: float = real(0.0, least=0, unit="N")
     """Size of random load pulses at the actuated joint [N or N*m], >= 0; either sign is as likely."""
     pulse_duration: float = real(0.0, least=0, unit="s")

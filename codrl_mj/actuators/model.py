@@ -223,7 +223,7 @@ class ActuatorModel(fields.Checked):
         """
 
     def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
-        """Refuse what cannot be simulated on a shaft that moves so much; called for families that ask for `INERTIA`.
+        """Refuse what cannot be simulated on a shaft that moves so much; called where `closes_loops`.
 
         Args:
             timestep: mechanical step [s].
@@ -234,6 +234,20 @@ class ActuatorModel(fields.Checked):
         Raises:
             UnstableError: it is unstable there; the reason, with its number, and a remedy.
         """
+
+    @property
+    def closes_loops(self) -> bool:
+        """True if it may close a loop over its shaft's position or speed, to be checked with what it moves."""
+        return self.INERTIA or self.MOTION or type(self) not in BUILT_IN
+
+    def steps_per_sample(self, timestep: float) -> int:
+        """Return the number of mechanical steps [s] after which its samples repeat."""
+        del timestep
+        return 1
+
+    def loop_remedy(self, inertia: float) -> str:
+        """Return a sentence on the gains of its loop over a shaft that moves an inertia [kg*m^2], for messages."""
+        return f"It moves {inertia:.3g} kg*m^2 at its shaft: lower its gains."
 
     def check_at(self, timestep: float, allow_unstable: bool) -> None:
         """`check`, but what is only unstable may be allowed.

@@ -6,6 +6,7 @@ a current. P and PD in one, u = kp*(q* - q) - kd*w, are `velocity_gain` kd, `pos
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from codrl_mj.actuators import drive, shaft, stability
 from codrl_mj.actuators.drive import ARM, Drive
-from codrl_mj.actuators.model import Command, Inputs, UnstableError
+from codrl_mj.actuators.model import Command, Inputs
 from codrl_mj.actuators.shaft import Means, Shaft
 from codrl_mj.fields import Checked, choice, real
 
@@ -145,7 +146,8 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
     amperes, volts, torque, power, loss = 0.0, 0.0, 0.0, 0.0, 0.0
     at_volts, at_amperes, too_warm = 0.0, 0.0, 0.0
     for _ in range(count):
-        if waiting <= 0.0:
+        # A servo that is faster than the mechanical step is sampled `count` times within it.
+        if waiting <= 0.0 or count > 1:
             asked, grown = demand(parameters, period * every, target, rate, position, speed, integral)
             waiting = float(every)
         else:
@@ -265,21 +267,29 @@ class Servo(Drive):
         return np.where(fitting, super().instability(numbers, timestep), np.inf)
 
     def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
-        """Refuse outer loops that are unstable on what they move, besides what `Drive.check_shaft` refuses.
-
-        Raises:
-            UnstableError: with the number and a remedy.
-        """
+        """As `Drive.check_shaft`; and warn of a position loop that is faster than the engine moves the joint."""
         super().check_shaft(timestep, inertia, held)
-        radius = _outer_radius(self, timestep, inertia, held or math.isinf(self.motor.load_inertia))
-        if not radius < 1.0:
-            loop, at_joint = self.loop, inertia * self.motor.gear_ratio**2
-            raise UnstableError(
-                f"loop.velocity_gain = {loop.velocity_gain:g}: the outer loops are unstable: spectral radius "
-                f"{radius:.4g} over a sample, must be < 1. It moves {at_joint:.3g} kg*m^2: for a bandwidth f the gain "
-                f"is 2*pi*f times that, f well below servo_rate = {loop.servo_rate:g} Hz, and position_gain = "
-                f"{loop.position_gain:g} well below 2*pi*f; or pass allow_unstable=True"
+        loop, count = self.loop, round(timestep * self.loop.servo_rate)
+        if loop.controls == "position" and count > 1 and timestep * loop.position_gain > 1.0:
+            warnings.warn(
+                f"loop.position_gain = {loop.position_gain:g}: the servo would be at its target within a step of "
+                f"{timestep:g} s, and the engine moves the joint by one speed in that: it comes later than it should. "
+                f"Shorten the step to {1.0 / loop.position_gain:.3g} s",
+                stacklevel=2,
             )
+
+    def steps_per_sample(self, timestep: float) -> int:
+        """As `ActuatorModel.steps_per_sample`."""
+        return max(int(1.0 / (timestep * self.loop.servo_rate) + 0.5), 1)
+
+    def loop_remedy(self, inertia: float) -> str:
+        """As `ActuatorModel.loop_remedy`."""
+        loop, at_joint = self.loop, inertia * self.motor.gear_ratio**2
+        return (
+            f"It moves {at_joint:.3g} kg*m^2: for a bandwidth f loop.velocity_gain = {loop.velocity_gain:g} is 2*pi*f "
+            f"times that, f well below servo_rate = {loop.servo_rate:g} Hz, and position_gain = "
+            f"{loop.position_gain:g} well below 2*pi*f."
+        )
 
 
 def _fits(servo_rate: float, sample_rate: float, timestep: float) -> bool:
@@ -287,22 +297,3 @@ def _fits(servo_rate: float, sample_rate: float, timestep: float) -> bool:
     in_step = timestep * servo_rate
     multiples = max(in_step, 1.0 / in_step), sample_rate / max(servo_rate, 1.0 / timestep)
     return all(abs(one - round(one)) <= 1e-6 * one and one >= 0.5 for one in multiples)
-
-
-def _outer_radius(servo: Servo, timestep: float, inertia: float, held: bool) -> float:
-    """Spectral radius of the outer loops on a free inertia, over one of their samples, at the rotor."""
-    loop = servo.loop
-    period = max(1.0 / loop.servo_rate, timestep if held else 0.0)  # held, they see the speed as the step began
-    gain = loop.velocity_gain / servo.motor.gear_ratio**2
-    reacts = gain * np.array([-loop.position_gain if loop.controls == "position" else 0.0, -1.0])  # to angle and speed
-    adds = loop.velocity_integral_gain * period
-    speed, angle = period / inertia, 0.5 * period**2 / inertia  # of a torque
-    matrix = np.array(
-        [
-            [1.0 + angle * reacts[0], period + angle * reacts[1], angle],
-            [speed * reacts[0], 1.0 + speed * reacts[1], speed],
-            [adds * reacts[0], adds * reacts[1], 1.0],
-        ]
-    )
-    part = np.ix_(*[np.flatnonzero([loop.controls == "position", True, adds > 0.0])] * 2)
-    return float(np.abs(np.linalg.eigvals(matrix[part])).max())

@@ -1,11 +1,13 @@
-"""Stability of the discrete closed loop of controller and winding, without the mechanics."""
+"""Stability of discrete closed loops: of controller and winding, and of actuators with the joints that they move."""
 
 import dataclasses
-from typing import Any
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators.model import UnstableError
+from codrl_mj.actuators.model import Inputs, UnstableError
 from codrl_mj.actuators.parameters import parameters_type
 
 
@@ -121,3 +123,110 @@ def check_stable(actuator: Any, timestep: float) -> None:
         f"actuator: the current loop is unstable at a step of {timestep:g} s: spectral radius {radius:.4g}, must be "
         f"< 1. {remedy}, or pass allow_unstable=True to study it as it is"
     )
+
+
+class Joints(NamedTuple):
+    """Joints and shafts at rest, linearized without gravity, springs, contacts and limits.
+
+    `inertia` (v, v) and `damping` (v,) are of the degrees of freedom, `moments` (n, v) the speeds of shafts for theirs.
+    The `integrator` is `euler`, which moves positions by the old speeds, `semi-implicit` or `rk4`; unless by RK4,
+    `explicit_damping` damps the old speeds.
+    """
+
+    inertia: np.ndarray
+    damping: np.ndarray
+    moments: np.ndarray
+    integrator: str
+    explicit_damping: bool
+
+    def transition(self, timestep: float) -> np.ndarray:
+        """Return speeds and shafts' positions after a step, for speeds, positions and held torques: (v + n, v + 2n)."""
+        shafts, freedoms = self.moments.shape
+        speeds, positions = slice(freedoms), slice(freedoms, freedoms + shafts)
+        after, drag = np.eye(freedoms + 2 * shafts), np.diag(self.damping)
+        if self.integrator == "rk4":
+            rate = np.zeros_like(after)
+            rate[speeds] = np.linalg.solve(self.inertia, np.hstack([-drag, 0.0 * self.moments.T, self.moments.T]))
+            rate[positions, speeds] = self.moments
+            for order in (4, 3, 2, 1):  # Of a linear system RK4 is the Taylor series of order 4.
+                after = np.eye(len(rate)) + timestep / order * rate @ after
+        else:
+            implicit, explicit = (0.0, timestep) if self.explicit_damping else (timestep, 0.0)
+            pushes = np.hstack([self.inertia - explicit * drag, 0.0 * self.moments.T, timestep * self.moments.T])
+            after[speeds] = np.linalg.solve(self.inertia + implicit * drag, pushes)
+            moving = np.eye(len(after))[speeds] if self.integrator == "euler" else after[speeds]
+            after[positions] += timestep * self.moments @ moving
+        return after[: positions.stop]
+
+
+CHANGE = -1e-6
+"""Added to each state in turn. It is negative so that counters and times stay on the side where a sample is due."""
+FREE = {"stribeck_friction": 0.0, "gear_efficiency": 1.0, "deadband": 0.0}
+"""Parameters of families that have them -> values without friction and dead zone, which hide small motions."""
+
+
+def linearize(
+    actuator: Any, advance: Callable[..., Any], timestep: float, inertia: float, change: float = CHANGE
+) -> np.ndarray:
+    """Linearize an actuator's `advance` at rest, for each mechanical step until its samples repeat.
+
+    Args:
+        actuator: the actuator.
+        advance: its family's `advance`, compiled or not.
+        timestep: mechanical step [s].
+        inertia: inertia [kg*m^2] that it is told; `inf` where it is told none.
+        change: what is added to each state in turn.
+
+    Returns:
+        Shape (steps, s + 1, s + 2): the new states and the torque, for the states, the position and the speed.
+    """
+    family: Any = type(actuator)
+    period = actuator.steps_per_sample(timestep)
+    parameters, count = parameters_type(family)(*actuator.numbers), len(family.State._fields)
+    parameters = parameters._replace(**{name: FREE[name] for name in FREE.keys() & {*parameters._fields}})
+    maps, state = [], np.zeros(count)
+
+    def advanced(point: np.ndarray, time: float) -> np.ndarray:
+        *states, position, speed = point.tolist()
+        inputs = Inputs(0.0, position, speed, time, 0.0, inertia)
+        after, torque, _ = advance(parameters, timestep, family.State(*states), inputs)
+        return np.array([*after, torque])
+
+    # The first period only brings counters and times to where they repeat.
+    for step in range(2 * period):
+        time, point = step * timestep, np.append(state, [0.0, 0.0])
+        rest = advanced(point, time)
+        if step >= period:
+            changed = [advanced(point + row, time) - rest for row in change * np.eye(count + 2)]
+            maps.append(np.stack(changed, axis=1) / change)
+        state = rest[:count]
+    return np.array(maps)
+
+
+def loop_radius(joints: Joints, loops: Sequence[np.ndarray], timestep: float) -> float:
+    """Return the spectral radius of actuators and joints together, over the steps after which their samples repeat.
+
+    Args:
+        joints: the joints, with a shaft for each actuator.
+        loops: the actuators, as `linearize` returns them.
+        timestep: mechanical step [s].
+    """
+    shafts, freedoms = joints.moments.shape
+    starts = np.cumsum([freedoms + shafts, *(len(loop[0]) - 1 for loop in loops)])
+    now, transition = np.eye(starts[-1]), joints.transition(timestep)
+    product = now
+    for step in range(math.lcm(*map(len, loops))):
+        torques, matrix = np.zeros((shafts, len(now))), np.zeros_like(now)
+        for index, (loop, start, end) in enumerate(zip(loops, starts[:-1], starts[1:], strict=True)):
+            seen = np.vstack([now[start:end], now[freedoms + index], joints.moments[index] @ now[:freedoms]])
+            matrix[start:end], torques[index] = np.split(loop[step % len(loop)] @ seen, [-1])
+        matrix[: starts[0]] = transition @ np.vstack([now[: starts[0]], torques])
+        product = matrix @ product
+    if not np.isfinite(product).all():
+        return math.inf
+    # A state, other than a speed, that nothing else reads, or that nothing else changes, is no part of a loop.
+    live, coupled = np.ones(len(product), dtype=bool), (product != 0.0) & ~np.eye(len(product), dtype=bool)
+    coupled[:freedoms, :freedoms] = True
+    while (left := live & coupled[live].any(axis=0) & coupled[:, live].any(axis=1)).sum() < live.sum():
+        live = left
+    return float(np.abs(np.linalg.eigvals(product[np.ix_(live, live)])).max(initial=0.0))

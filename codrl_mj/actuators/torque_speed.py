@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
-from codrl_mj.actuators.model import ActuatorModel, Inputs, Nothing
+from codrl_mj.actuators.model import ActuatorModel, Inputs, Nothing, UnstableError
 from codrl_mj.fields import real
 
 
@@ -61,3 +61,24 @@ class TorqueSpeed(ActuatorModel):
     def back_emf_damping(self) -> float:
         """As `ActuatorModel.back_emf_damping`: the slope of the line."""
         return self.stall_torque / self.no_load_speed
+
+    @property
+    def closes_loops(self) -> bool:
+        """True: on its line the torque follows the speed."""
+        return True
+
+    def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
+        """Refuse a line that overshoots the no-load speed within a step, from step to step and for ever.
+
+        Raises:
+            UnstableError: with the number and a remedy.
+        """
+        del held
+        share = timestep * self.stall_torque / (self.no_load_speed * inertia)
+        if share >= 2.0:
+            raise UnstableError(
+                f"stall_torque = {self.stall_torque:g} at no_load_speed = {self.no_load_speed:g}: on the line between "
+                f"them a step of {timestep:g} s takes {share:.3g} of the way to the no-load speed, must be < 2. It "
+                f"moves {inertia:.3g} kg*m^2. Shorten the step to less than {2.0 * timestep / share:.3g} s, or pass "
+                "allow_unstable=True to study it as it is"
+            )

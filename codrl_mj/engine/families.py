@@ -224,6 +224,20 @@ def _compile(family: Any) -> Any:
     return step
 
 
+def compiled_advance(family: Family) -> Callable[..., Any]:
+    """Return a family's `advance`, compiled, to be called from Python; states and signals are arrays."""
+    load_family(family)
+    function, (states, signals, _) = _compile(family).ctypes, family_sizes(family)[:3]
+
+    def advance(parameters: Any, timestep: float, state: Any, inputs: Inputs) -> tuple[Any, float, Any]:
+        numbers, before, after, seen = np.array(parameters), np.array(state), np.empty(states), np.empty(signals)
+        addresses = [one.ctypes.data for one in (numbers, before, after, seen)]
+        torque = function(addresses[0], timestep, *addresses[1:], *inputs)
+        return after, torque, seen
+
+    return advance
+
+
 @functools.cache
 def compiled_observe(family: Family) -> Any:
     """(parameters, signals, timestep, time, key, seen) -> nothing: writes what the sensors say.

@@ -1,7 +1,7 @@
 """What compiled models and their data say of our actuators, at either door."""
 
 import numbers
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -14,10 +14,11 @@ from codrl_mj.actuators import (
     family_number,
     parameters_type,
     reference,
+    stability,
 )
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.engine.doors import shaft_inertia
-from codrl_mj.engine.families import HEAD, SIGNATURE, loaded_families, signals_at, slot_size
+from codrl_mj.engine.families import HEAD, SIGNATURE, compiled_advance, loaded_families, signals_at, slot_size
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEAD, REASONS
 from codrl_mj.plugin import FAMILY, NAME, registered
 
@@ -160,23 +161,121 @@ def check_shafts(
     allow_unstable: bool = False,
     held: bool = False,
     actuators: Mapping[int, ActuatorModel] | None = None,
-) -> None:
-    """Refuse motors that what they move makes unstable; where they are `held`, they are not told what that is."""
-    asking = {index: one for index, one in (actuators or motors(model)).items() if one.INERTIA}
+    explicit: bool = False,
+) -> float:
+    """Refuse actuators that are unstable with the joints that they move, at the model's step and initial position.
+
+    Gravity, springs, contacts, limits and the model's own servos are left out of the check.
+
+    Args:
+        model: a compiled model.
+        allow_unstable: whether to return instead.
+        held: whether actuators are not told the inertia, so that they hold the speed over a step.
+        actuators: the actuators by their indices; the model's own if None.
+        explicit: whether positions are moved by the old speeds.
+
+    Returns:
+        The spectral radius of all loops over positions and speeds together; 0 if there are none.
+
+    Raises:
+        UnstableError: with the number and a remedy.
+    """
+    asking = {index: one for index, one in (actuators or motors(model)).items() if one.closes_loops}
     if not asking:
-        return
+        return 0.0
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
-    shafts = [(model.actuator_trntype[index], *model.actuator_trnid[index]) for index in asking]
-    for (index, actuator), shaft in zip(asking.items(), shafts, strict=True):
+    shafts, inertias = [(model.actuator_trntype[index], *model.actuator_trnid[index]) for index in asking], []
+    names = [model.actuator(index).name or f"actuator {index}" for index in asking]
+    for (index, actuator), shaft, name in zip(asking.items(), shafts, names, strict=True):
         arm = 1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius  # the callback's is in the gear
-        inertia = shaft_inertia(model, data, model.actuator_outadr[index], 1.0 / arm)
+        inertias.append(shaft_inertia(model, data, model.actuator_outadr[index], 1.0 / arm))
         try:
             several = shafts.count(shaft)
-            actuator.check_shaft(model.opt.timestep, inertia / several, several > 1 or held)
+            actuator.check_shaft(model.opt.timestep, inertias[-1] / several, several > 1 or held)
         except UnstableError as error:
             if not allow_unstable:
-                raise ValueError(f"{model.actuator(index).name or f'actuator {index}'}: {error}") from None
+                raise UnstableError(f"{name}: {error}") from None
+    spectral_radius, linear = _loop_radius(model, data, asking, inertias, held, explicit)
+    step = model.opt.timestep
+    largest = spectral_radius(step)
+    if largest < STABLE or allow_unstable:
+        return largest
+    separate = {number: spectral_radius(step, number) for number in linear}
+    worst = max(separate, key=separate.__getitem__)
+    together = separate[worst] < STABLE
+    remedy = list(asking.values())[worst].loop_remedy(inertias[worst])
+    raise UnstableError(
+        f"{', '.join(names[number] for number in linear) if together else names[worst]}: the outer loops are unstable"
+        f"{' together' * together}: spectral radius {largest:.4g} over a mechanical step of {step:g} s, must be < 1. "
+        f"{remedy} {_shorter(asking.values(), spectral_radius, step)}; or pass allow_unstable=True"
+    )
+
+
+def _loop_radius(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    actuators: Mapping[int, ActuatorModel],
+    inertias: Sequence[float],
+    held: bool,
+    explicit: bool,
+) -> tuple[Callable[..., float], list[int]]:
+    """Return a function of a step [s], and of the numbers of some actuators unless of all, and which are linear."""
+    joints, motors = _joints(model, data, actuators, explicit), list(actuators.values())
+    advances = [motor.advance if held else compiled_advance(type(motor)) for motor in motors]
+    known = [inertia if motor.INERTIA and not held else np.inf for motor, inertia in zip(motors, inertias, strict=True)]
+
+    def linearized(number: int, timestep: float, size: float = 1.0) -> np.ndarray:
+        change = size * stability.CHANGE
+        return stability.linearize(motors[number], advances[number], timestep, known[number], change)
+
+    def is_smooth(number: int) -> bool:
+        small, large = (linearized(number, model.opt.timestep, size) for size in (1.0, 10.0))
+        return np.allclose(small, large, rtol=0.01, atol=1e-6 * np.abs(small).max())
+
+    def spectral_radius(timestep: float, *numbers: int) -> float:
+        chosen = list(numbers or linear)
+        loops = [linearized(number, timestep) for number in chosen]
+        shafts = joints._replace(moments=joints.moments[chosen])
+        return stability.loop_radius(shafts, loops, timestep) if chosen else 0.0
+
+    # A custom family may have friction or a gap at rest, of which a linear loop says nothing.
+    linear = [number for number, motor in enumerate(motors) if type(motor) in BUILT_IN or is_smooth(number)]
+    return spectral_radius, linear
+
+
+STABLE = 1.0 + 1e-6
+"""Spectral radius below which loops are stable: that of joints that nothing holds is 1, with rounding."""
+
+
+def _shorter(actuators: Collection[ActuatorModel], radius_at: Callable[[float], float], timestep: float) -> str:
+    """Return a sentence on the longest of some shorter steps [s] at which all is stable."""
+    for parts in (2, 3, 4, 5, 8, 10, 16, 20, 32, 50, 100):
+        try:
+            for actuator in actuators:
+                actuator.check(timestep / parts)
+        except ValueError:
+            continue
+        if (radius := radius_at(timestep / parts)) < STABLE:
+            return f"Or shorten the step to {timestep / parts:g} s, which does (spectral radius {radius:.4g})"
+    return "A shorter step does not help"
+
+
+def _joints(
+    model: mujoco.MjModel, data: mujoco.MjData, actuators: Mapping[int, ActuatorModel], explicit: bool
+) -> stability.Joints:
+    """Return the linearized joints of a model at a position, with the shafts of some actuators."""
+    inertia, every = np.empty((model.nv, model.nv)), np.zeros((len(data.moment_rownnz), model.nv))
+    for row, unit in zip(inertia, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, row, unit)
+    mujoco.mju_sparse2dense(every, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    arms = [1.0 if model.actuator_plugin[index] < 0 else one.arm_radius for index, one in actuators.items()]
+    moments = every[model.actuator_outadr[list(actuators)]] / np.array(arms)[:, np.newaxis]
+    kind, undamped = model.opt.integrator, model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    is_rk4 = kind == mujoco.mjtIntegrator.mjINT_RK4
+    integrator = "rk4" if is_rk4 else "euler" if explicit else "semi-implicit"
+    undamped = undamped and kind == mujoco.mjtIntegrator.mjINT_EULER
+    return stability.Joints(inertia, model.dof_damping.copy(), moments, integrator, bool(undamped))
 
 
 class Readout:

@@ -100,7 +100,7 @@ def motorise(
     for each in mounted:
         _drive(new, model, each)
     new.nuser_actuator = -1  # as many as are needed
-    if any(actuator.INERTIA for actuator in driven.values()):
+    if any(actuator.closes_loops for actuator in driven.values()):
         check_shafts(new.compile(), allow_unstable)
     for text in [*_past_motors(model, mounted), *(doubled(model, driven) if joint_dynamics is None else ())]:
         _warn(f"the model {spec.modelname!r}: {text}")

@@ -1,5 +1,6 @@
 """What an agent's actions stand for: forces, or what its actuators take besides, such as currents and voltages."""
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,10 +10,14 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Drive, Ideal, Servo
 from codrl_mj.disturbances import OFF, Disturbances, check_delay
+from codrl_mj.engine.reading import motors as motors_of
 from codrl_mj.engine.reading import sharing
 from codrl_mj.engine.specs import ON_JOINT
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
+
+POSITIONS = ("rad", "m")
+"""Units of commands that are positions."""
 
 
 def command_of(actuator: ActuatorModel, name: str, whose: str = "") -> Command:
@@ -73,6 +78,8 @@ class TaskCommands:
         limits = [command.limit for command in chosen]
         if not all(limit is None or np.isfinite(limit) for limit in limits):
             raise ValueError(f"action = {name!r}: needs a finite controller.max_voltage, it is inf")
+        self.holds = np.where([command.unit in POSITIONS for command in chosen], scales, 0.0)
+        """As `codrl_mj.physics.Plant.holds`."""
         each = zip(limits, scales, task.max_forces, strict=True)
         self.max_forces = np.array([most if limit is None else limit * scale for limit, scale, most in each])
         """Largest forces [N] or torques [N*m] that the physics is asked for, shape (n,)."""
@@ -202,6 +209,10 @@ class ControlCommands:
         largest = np.where(limited, np.abs(model.actuator_ctrlrange[places]).max(axis=1), np.inf)
         self._gains = np.array([_plain_gain(model, index) or 1.0 for index in every])
         self._disturber = Disturber(disturbances, step_duration, largest * np.abs(self._gains), 1)
+        present = motors_of(model)
+        holds = [_hold(model, one, present[index]) for index in indices for one in sharing(model, index)]
+        self._holds = np.array(holds).reshape(-1, 2).T
+        self._outputs = model.actuator_outadr[every]
         # loads are on joints, one for each motor; commands, one for each of its actuators
         self._dofs = [_dof(model, index) for index in indices] if self._pulses else []
         self._loaded = [every.index(index) for index in indices]
@@ -249,8 +260,17 @@ class ControlCommands:
     def begin(self, key: float) -> None:
         """Forget everything at the start of an episode with this key of random numbers."""
         if self._disturber.on:
-            self._disturber.reset(np.zeros(1, dtype=int), key)
+            self._disturber.reset(np.zeros(1, dtype=int), key, self._held())
             self._data.qfrc_applied[self._dofs] = 0.0
+
+    def _held(self) -> Any:
+        """Return the commands on their way that hold the motors where they are: 0 unless they are positions."""
+        slopes, offsets = self._holds * self._gains
+        if not slopes.any():
+            return 0.0
+        present = copy.copy(self._data)  # not every environment has brought its lengths up to date at a reset
+        mujoco.mj_fwdPosition(present.model, present)
+        return slopes * present.actuator_length[self._outputs] + offsets
 
     def controls(self, action: Any) -> Any:
         """The environment's own action for one of `action_space`, as it arrives in a step; loads go to the joints."""
@@ -278,6 +298,19 @@ def _dof(model: mujoco.MjModel, index: int) -> int:
             "load could act; give only command_delay, command_quantum and command_rate"
         )
     return int(model.jnt_dofadr[model.actuator_trnid[index, 0]])
+
+
+def _hold(model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> tuple[float, float]:
+    """Return the slope over its length, and the offset, of a control that holds an actuator; zeros if it is a force."""
+    if actuator.MOTION:
+        asked = next(iter(actuator.commands().values()))
+        return float(asked.unit in POSITIONS), 0.0
+    gain, (offset, slope) = float(model.actuator_gainprm[index, 0]), model.actuator_biasprm[index, :2].tolist()
+    fixed = model.actuator_gaintype[index] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0.0
+    integrates = model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_INTEGRATOR
+    if not fixed or integrates or model.actuator_biastype[index] != mujoco.mjtBias.mjBIAS_AFFINE or slope == 0.0:
+        return 0.0, 0.0
+    return -slope / gain, -offset / gain
 
 
 def _plain_gain(model: mujoco.MjModel, index: int) -> float | None:

@@ -17,7 +17,7 @@ from codrl_mj.engine.reading import Readout, bring_to_rest, sharing, slots
 from codrl_mj.engine.specs import matched_by, names_of
 from codrl_mj.envs.commands import ControlCommands, command_of
 from codrl_mj.envs.distributions import paths_of
-from codrl_mj.envs.randomization import Draws, Randomization, put_into
+from codrl_mj.envs.randomization import Draws, Randomization, check_extremes, put_into
 from codrl_mj.physics.base import diverged, namer
 from codrl_mj.physics.variation import without_motors, write_fields
 
@@ -81,6 +81,8 @@ class Motors:
         randomization = Randomization(
             distributions, bare, nominal, fixed, timestep, settings.allow_unstable, "the model"
         )
+        if not settings.allow_unstable:
+            check_extremes(randomization, nominal, model)
         self.draws = Draws(randomization, [list(nominal.values())], functools.partial(put_into, self))
         drawn = settings.disturbances.random or randomization.random
         self._random = drawn or any(one.random for one in nominal.values())

@@ -1,5 +1,8 @@
 """Motors and models drawn at every reset: what is drawn of them, and what present episodes were drawn with."""
 
+import copy
+import random
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -7,22 +10,26 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import (
+    BUILT_IN,
     Actuator,
     ActuatorModel,
     Family,
     Ideal,
+    UnstableError,
     choices_of,
     field_paths,
     field_values,
     parameter_paths,
     unchecked,
 )
-from codrl_mj.engine.reading import sharing
+from codrl_mj.engine.reading import check_shafts, sharing
 from codrl_mj.engine.specs import matched_by, names_of
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
-from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable
+from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable, write_fields
 
+MAX_CORNERS = 32
+"""Combinations of bounds that are checked: all of five drawn values, and of more so many at random."""
 LIMIT = 1000
 """Draws of an unstable loop in a row after which a reset gives up."""
 Uniforms = Callable[[np.ndarray, int], np.ndarray]
@@ -225,6 +232,52 @@ class Draws:
         if self.randomization.distributions:
             self._values[:], self._rejected[:] = snapshot["drawn"], snapshot["rejected"]
             self._put(self, np.arange(len(self._values)))
+
+
+def check_extremes(
+    randomization: Randomization,
+    motors: Mapping[int, ActuatorModel],
+    model: mujoco.MjModel,
+    held: bool = False,
+    explicit: bool = False,
+) -> None:
+    """Refuse draws that can make a loop over a position or a speed unstable, by combinations of their bounds.
+
+    Args:
+        randomization: what is drawn.
+        motors: the motors as they are, by the indices of their actuators.
+        model: the model with them; it is not changed.
+        held: as for `check_shafts`.
+        explicit: likewise.
+
+    Raises:
+        ValueError: with the values that were tried, and a remedy.
+    """
+    if not randomization.distributions or not any(one.MOTION or type(one) not in BUILT_IN for one in motors.values()):
+        return
+    draws, model = Draws(randomization, [list(motors.values())], lambda *_: None), copy.copy(model)
+    data, bounds = mujoco.MjData(model), [sorted(one.extremes) for one in randomization.distributions.values()]
+    count = 2 ** len(bounds)
+    for corner in range(count) if count <= MAX_CORNERS else random.Random(0).sample(range(count), MAX_CORNERS):
+        values = [each[-(corner >> column & 1)] for column, each in enumerate(bounds)]
+        draws._values[0] = values
+        try:
+            present = dict(zip(motors, draws.motors(), strict=True))
+            for index, one in present.items():
+                one.check(randomization.timestep)
+                if model.actuator_plugin[index] < 0:  # the callback's arm is in the gear
+                    model.actuator_gear[model.actuator_outadr[index], 0] = 1.0 / one.arm_radius
+        except ValueError:
+            continue  # Such a set is drawn again.
+        write_fields(model, draws.model_fields(np.zeros(1, dtype=int)))
+        mujoco.mj_setConst(model, data)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                check_shafts(model, held=held, actuators=present, explicit=explicit)
+        except UnstableError as error:
+            drawn = ", ".join(f"{path} = {value:g}" for path, value in zip(randomization.types, values, strict=True))
+            raise ValueError(f"randomize: {drawn}: {error}; or narrow the bounds") from None
 
 
 def put_into(simulation: Any, draws: Draws, rows: np.ndarray) -> None:

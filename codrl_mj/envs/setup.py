@@ -15,7 +15,7 @@ from codrl_mj.engine.reading import check_shafts
 from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.motors import longer, sensor_names
-from codrl_mj.envs.randomization import Randomization
+from codrl_mj.envs.randomization import Randomization, check_extremes
 from codrl_mj.own_code import look_up
 from codrl_mj.physics import PHYSICS, Physics, Plant, Signals, trace_names
 from codrl_mj.physics.base import namer
@@ -59,8 +59,12 @@ class Setup:
         if not self.randomization.draws_actuator:  # else every draw is checked
             for one in plant.actuators:
                 one.check_at(plant.timestep, unstable)
-        if any(one.INERTIA for one in plant.actuators):
-            check_shafts(task_model(plant), unstable, held=self.config.physics == "analytic")
+        if any(one.closes_loops for one in plant.actuators):
+            model, held, explicit = task_model(plant), self.config.physics == "analytic", plant.integrator == "euler"
+            motors = {model.actuator(name).id: one for name, one in zip(self.task.motors, plant.actuators, strict=True)}
+            check_shafts(model, unstable, held, motors, explicit)
+            if not unstable:
+                check_extremes(self.randomization, motors, model, held, explicit)
 
     @functools.cached_property
     def commands(self) -> TaskCommands:
@@ -71,10 +75,8 @@ class Setup:
     def plant(self) -> Plant:
         """What is simulated."""
         integrator, commands = self.task.integrator(self.config.integrator), self.commands
-        disturbances, joint = self.config.disturbances, self.config.joint
-        return Plant(
-            self.task, commands.simulated, self.inner_steps, integrator, commands.max_forces, disturbances, joint
-        )
+        between = commands.max_forces, self.config.disturbances, self.config.joint, commands.holds
+        return Plant(self.task, commands.simulated, self.inner_steps, integrator, *between)
 
     @functools.cached_property
     def randomization(self) -> Randomization:

@@ -43,7 +43,7 @@ class AnalyticPhysics(Physics):
         self._states = [rest] * len(self._actuators)
         self.time = 0.0
         self._key = key
-        self._disturber.reset(np.zeros(1, dtype=np.int64), key)
+        self._disturber.reset(np.zeros(1, dtype=np.int64), key, self.plant.held(self.state[np.newaxis]))
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the actuators for others of their family; to be followed by a reset."""

@@ -73,6 +73,8 @@ class Plant:
     """Imperfections of the commands' way, and load pulses."""
     joint: Joint = PLAIN
     """What is added to the actuated joints."""
+    holds: np.ndarray = None  # type: ignore[assignment]
+    """Desired force [N or N*m] that stands for a position of 1 m or rad, shape (n,); 0 where commands are none."""
 
     def __post_init__(self) -> None:
         """Fill in what is the task's."""
@@ -81,6 +83,8 @@ class Plant:
             object.__setattr__(self, "integrator", self.task.integrators[0])
         if self.max_forces is None:
             object.__setattr__(self, "max_forces", self.task.max_forces)
+        if self.holds is None:
+            object.__setattr__(self, "holds", np.zeros(len(self.max_forces)))
 
     @functools.cached_property
     def family(self) -> Family:
@@ -96,6 +100,12 @@ class Plant:
     def timestep(self) -> float:
         """Integration step [s]."""
         return self.task.step_duration / self.inner_steps
+
+    def held(self, states: np.ndarray) -> np.ndarray:
+        """Return the desired forces that hold states (m, s) there, shape (m, n): 0 unless commands are positions."""
+        task = self.task
+        positions = states[:, [task.qpos[task.qvel.index(speed)] for speed in task.speeds]]
+        return np.where(self.holds != 0.0, self.holds * positions, 0.0)
 
 
 class Physics(abc.ABC):
@@ -126,7 +136,7 @@ class Physics(abc.ABC):
         self.trace = np.zeros((plant.inner_steps, len(plant.actuators), len(trace_names(plant.family))))
         """What each actuator did in each integration step of the last environment step, shape (inner_steps, actuators,
         columns), float64; columns as in `trace_names`. A live array: the next step overwrites it."""
-        self._disturber = Disturber(plant.disturbances, plant.timestep, plant.max_forces, 1)
+        self._disturber = Disturber(plant.disturbances, plant.timestep, plant.max_forces, 1, plant.holds)
 
     @abc.abstractmethod
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:

@@ -45,6 +45,8 @@ class Numbers(NamedTuple):
     """[s]."""
     pulse_interval: float
     """Mean time between them [s]."""
+    hold: float
+    """Command [N or N*m] that holds the joint at a position of 1 m or rad; 0 where commands are no positions."""
 
 
 _AFTER_HISTORY = 1 + len(PULSE_NAMES)
@@ -58,11 +60,18 @@ class Disturber:
     actuator of a simulation.
     """
 
-    def __init__(self, disturbances: Disturbances, timestep: float, limits: np.ndarray, simulations: int) -> None:
+    def __init__(
+        self,
+        disturbances: Disturbances,
+        timestep: float,
+        limits: np.ndarray,
+        simulations: int,
+        holds: np.ndarray | None = None,
+    ) -> None:
         """Start with nothing remembered, for a number of simulations at a timestep [s].
 
-        `limits`, shape (n,), are the largest forces [N or N*m] of the actuators of one. Where all is off, commands
-        arrive as they are, there are no loads, and rows are empty.
+        `limits`, shape (n,), are the largest forces [N or N*m] of the actuators of one, `holds`, likewise, as in
+        `Numbers`. Where all is off, commands arrive as they are, there are no loads, and rows are empty.
         """
         self.on = disturbances != OFF
         whole, fraction = whole_and_fraction(disturbances.command_delay, timestep)
@@ -77,18 +86,24 @@ class Disturber:
                 disturbances.pulse_force,
                 disturbances.pulse_duration,
                 disturbances.pulse_interval,
+                hold,
             )
-            for limit in limits.tolist()
+            for limit, hold in zip(limits.tolist(), np.zeros(len(limits)) if holds is None else holds, strict=True)
         ]
         self.numbers = np.array(rows) if self.on else np.empty((len(rows), 0))
         length = whole + 1 + (fraction > 0.0) + _AFTER_HISTORY if self.on else 0
         self.memory = np.zeros((simulations * len(rows), length))
 
-    def reset(self, rows: np.ndarray, keys: Any) -> None:
-        """Forget everything at the start of episodes of some simulations, with these keys of random numbers."""
+    def reset(self, rows: np.ndarray, keys: Any, held: Any = 0.0) -> None:
+        """Forget everything at the start of episodes of m simulations, with these keys of random numbers.
+
+        Until the first command arrives, the commands `held` (m, n) [N or N*m] do.
+        """
         count = len(self.numbers)
+        held = np.broadcast_to(held, (len(rows), count))
         for actuator in range(count if self.on else 0):
             self.memory[rows * count + actuator] = 0.0
+            self.memory[rows * count + actuator, :KEY_COLUMN] = held[:, actuator, np.newaxis]
             self.memory[rows * count + actuator, KEY_COLUMN] = np.asarray(keys) + actuator
 
     def disturbed(self, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,7 @@ class MujocoBatchPhysics:
         self.plant, task = plant, plant.task
         self.num_envs, self._num_threads = len(actuators), num_threads
         self._nominal = MujocoPhysics(plant)
-        self._disturber = Disturber(plant.disturbances, plant.timestep, plant.max_forces, self.num_envs)
+        self._disturber = Disturber(plant.disturbances, plant.timestep, plant.max_forces, self.num_envs, plant.holds)
         self._wiring = self._nominal.wiring
         self._positions, self._velocities = np.array(task.qpos), np.array(task.qvel)
         self._fields: dict[str, np.ndarray] = {}
@@ -146,7 +146,8 @@ class MujocoBatchPhysics:
         if self.plant.motorised:
             for at, one in enumerate(self._wiring):
                 self._act[rows, int(one.act) + NOISE_KEY] = keys + at
-        self._disturber.reset(rows, keys)
+        if self._disturber.on:
+            self._disturber.reset(rows, keys, self.plant.held(states))
 
     def step(self, kernel: Any, steps: Any) -> bool:
         """Take an environment step of every simulation; `kernel` is `Kernels.step_rows` of `codrl_mj.envs.compiled`.

@@ -37,9 +37,10 @@ class MujocoPhysics(Physics):
         """Where the actuators' numbers are in the model."""
         for name, actuator in zip(task.motors, plant.actuators, strict=True):
             index = self.model.actuator(name).id
-            dof = self.model.jnt_dofadr[self.model.actuator_trnid[index, 0]]
+            joint = self.model.actuator_trnid[index, 0]
+            dof, qpos = self.model.jnt_dofadr[joint], self.model.jnt_qposadr[joint]
             first = max(self.model.actuator_actadr[index], 0)
-            self.wiring.append(Wiring(index, self.model.actuator_ctrladr[index], first, dof, actuator.arm_radius))
+            self.wiring.append(Wiring(index, self.model.actuator_ctrladr[index], first, dof, actuator.arm_radius, qpos))
         self.settings = np.hstack([np.array(self.wiring, dtype=np.float64), self._disturber.numbers])
         """See `codrl_mj.physics.stepping`, where `places` and `where`, too, are explained."""
         self._bind()

@@ -41,6 +41,8 @@ class Wiring(NamedTuple):
     """Index of its joint's velocity."""
     arm: float
     """[m]."""
+    qpos: float
+    """Index of its joint's position."""
 
 
 WIRING = len(Wiring._fields)
@@ -190,7 +192,10 @@ def _stepping(
             if motorised:
                 DATA.act(data)[int(row_as(settings[actuator], Wiring).act) + NOISE_KEY] = key + actuator
             if disturbed:
+                hold = row_as(settings[actuator, WIRING:], Numbers).hold
+                position = qpos[int(row_as(settings[actuator], Wiring).qpos)]
                 memory[actuator] = 0.0
+                memory[actuator, : memory.shape[1] + KEY_COLUMN] = hold * position if hold != 0.0 else 0.0
                 memory[actuator, memory.shape[1] + KEY_COLUMN] = key + actuator
 
     @njit(nogil=True, error_model="numpy")

@@ -11,7 +11,17 @@ from scipy import signal
 
 import codrl_mj
 from codrl_mj import Uniform
-from codrl_mj.actuators import GearMotor, Inputs, SampledLoop, Servo, ServoLoop, Supply, parameters_type
+from codrl_mj.actuators import (
+    GearMotor,
+    Inputs,
+    SampledLoop,
+    Servo,
+    ServoLoop,
+    Supply,
+    UnstableError,
+    parameters_type,
+)
+from codrl_mj.engine.reading import check_shafts
 from tests.matrix import but
 
 INERTIA, RATIO = 0.02, 10.0
@@ -72,6 +82,21 @@ def test_a_position_loop_is_the_linear_system_that_it_looks_like(timestep, rate)
     assert positions[-1] == pytest.approx(0.3, abs=1e-3)
 
 
+@pytest.mark.parametrize("integral", [0.0, 20.0])
+@pytest.mark.parametrize(("timestep", "rate"), [(0.05, 1000.0), (0.01, 2000.0), (0.004, 250.0)])
+def test_a_servo_is_sampled_at_its_own_rate_within_a_long_step(timestep, rate, integral):
+    """The recursion of a PI velocity loop on an inertia, sample by sample, against one or a few long steps."""
+    one = servo(controls="velocity", velocity_gain=1.5, velocity_integral_gain=integral, servo_rate=rate)
+    one = dataclasses.replace(one, controller=SampledLoop(100e3))
+    _, speeds = turned(one, [2.0] * 4, timestep)
+    speed, torque, expected = 0.0, 0.0, []
+    for _ in range(round(4 * timestep * rate)):
+        error = 2.0 - speed
+        speed, torque = speed + (1.5 * error + torque) / TOTAL / rate, torque + 1.5 * integral * error / rate
+        expected.append(speed)
+    np.testing.assert_allclose(speeds, expected[round(timestep * rate) - 1 :: round(timestep * rate)], rtol=0.01)
+
+
 @pytest.mark.parametrize("saved", [False, True])
 def test_what_the_model_s_own_servo_was_is_gone(saved):
     """That is `<position kp="3" kv="30">`, under an integrator that would use its derivative too; and in its XML."""
@@ -130,7 +155,7 @@ def test_feed_forward_takes_the_lag_away():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"velocity_gain": 50.0}, r"outer loops are unstable: spectral radius .* It moves 0\.0201 kg\*m\^2"),
+        ({"velocity_gain": 80.0}, r"outer loops are unstable: spectral radius .* It moves 0\.0201 kg\*m\^2"),
         ({"position_gain": 9000.0}, r"position_gain = 9000 well below 2\*pi\*f"),
         ({"servo_rate": 700.0}, r"servo_rate = 700: must be a multiple of the mechanical step's rate, 1000 Hz"),
         ({"controls": "force"}, r"controls = 'force': must be one of position, velocity"),
@@ -142,31 +167,57 @@ def test_what_cannot_work_is_refused(change, message):
         turned(servo(**{"velocity_gain": 1.5, **change}), [])
 
 
-@pytest.mark.parametrize("rate", [500.0, 1000.0])
-@pytest.mark.parametrize("gains", [(20.0, 0.0), (60.0, 5.0), (40.0, 30.0)])
-def test_the_bound_of_stability_is_where_it_is(gains, rate):
-    """Just below the refused gain a small disturbance dies away, just above it it grows."""
-    position, integral = gains
+def growth(model, steps=1500):
+    """The growth of a disturbance at rest without gravity: its largest speed late, for that early."""
+    data, speeds = mujoco.MjData(model), []
+    data.qpos[:], data.qvel[:] = 1e-6 * np.arange(1, model.nq + 1), 1e-6
+    while len(speeds) < steps and np.abs(data.qvel).max() < 1e-3:
+        mujoco.mj_step(model, data)
+        speeds.append(np.abs(data.qvel).max())
+    return math.inf if len(speeds) < steps else max(speeds[-steps // 10 :]) / max(speeds[: steps // 10])
 
-    def grows(gain):
-        one = servo(position_gain=position, velocity_gain=gain, velocity_integral_gain=integral, servo_rate=rate)
-        try:
-            one.check_shaft(0.001, TOTAL / RATIO**2)
-        except ValueError:
-            return True
-        return False
 
-    high = 100.0
-    while grows(high / 1.02):
-        high /= 1.02
-    low = high / 1.02
-    for gain, most, least in ((0.9 * low, 0.5, 0.0), (1.1 * high, np.inf, 2.0)):
+@pytest.mark.parametrize(
+    ("rate", "gains", "integrator", "links", "damping"),
+    [
+        (1000.0, ("position", 20.0, 0.0), "EULER", 1, 0.0),
+        (500.0, ("position", 60.0, 5.0), "IMPLICITFAST", 1, 0.0),
+        (2000.0, ("position", 40.0, 30.0), "RK4", 1, 15.0),
+        (250.0, ("velocity", 20.0, 5.0), "EULER", 2, 0.0),
+        (1000.0, ("position", 20.0, 0.0), "RK4", 3, 0.0),
+    ],
+)
+def test_the_bound_of_stability_is_where_it_is(rate, gains, integrator, links, damping):
+    """3 % below the refused gain a small disturbance dies away, 3 % above it it grows; of chains of links too."""
+    controls, position, integral = gains
+    spec, parent = mujoco.MjSpec(), None
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+    spec.option.timestep, spec.option.gravity = 0.001, [0.0] * 3
+    for link in range(links):
+        parent = (parent or spec.worldbody).add_body(pos=[0.3 * (link > 0), 0.0, 0.0])
+        parent.add_geom(size=[0.1] * 3, pos=[0.15, 0.0, 0.0], mass=0.5)
+        parent.add_joint(name=f"j{link}", axis=[0.0, 0.0, 1.0], damping=[damping, 0.0, 0.0])
+        spec.add_actuator(name=f"a{link}", target=f"j{link}", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+
+    def motorised(gain, allow_unstable):
         one = servo(
-            supply=1e9, position_gain=position, velocity_gain=gain, velocity_integral_gain=integral, servo_rate=rate
+            1e9,
+            controls=controls,
+            position_gain=position,
+            velocity_gain=gain,
+            velocity_integral_gain=integral,
+            servo_rate=rate,
         )
-        one = dataclasses.replace(one, controller=SampledLoop(100e3))
-        model = codrl_mj.motorise(hinge(), {"shaft": one}, allow_unstable=True).compile()
-        assert least * 1e-6 <= np.abs(run(model, [0.0] * 1500, start=1e-6)[0][-50:]).max() <= most * 1e-6
+        return codrl_mj.motorise(spec, {f"a{link}": one for link in range(links)}, allow_unstable)
+
+    low, high = 0.2, 2000.0
+    while high / low > 1.01:
+        middle = math.sqrt(low * high)
+        stable = check_shafts(motorised(middle, True).compile(), allow_unstable=True) < 1.0 + 1e-6
+        low, high = (middle, high) if stable else (low, middle)
+    assert growth(motorised(low / 1.03, False).compile()) < 1.0 < growth(motorised(high * 1.03, True).compile())
+    with pytest.raises(UnstableError, match=r"spectral radius 1\."):
+        motorised(high * 1.03, False)
 
 
 ASKED = Servo(GearMotor(gear_ratio=20.0), SampledLoop(20e3), Supply(48.0), ServoLoop(velocity_gain=3.0))

@@ -1,5 +1,9 @@
 """The command's way: delay against interpolation, quantiser and rate limiter by their properties."""
 
+import copy
+import dataclasses
+import functools
+
 import gymnasium
 import mujoco
 import numpy as np
@@ -7,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from codrl_mj.actuators import GearMotor, SampledLoop, Servo, ServoLoop, Supply
 from codrl_mj.disturbances import Disturbances, quantised, rate_limited, whole_and_fraction
 from codrl_mj.physics.disturber import Disturber
 
@@ -53,6 +58,59 @@ def test_a_delayed_environment_is_one_that_is_told_everything_later(physics, act
         assert ours[4]["desired_force"] == action[0]
         assert ours[4]["actual_force"] == theirs[4]["actual_force"]
         assert ours[4]["reference_current"] == theirs[4]["reference_current"]
+
+
+SERVO = Servo(
+    GearMotor(rotor_inertia=0.0, gear_ratio=20.0),
+    SampledLoop(20e3),
+    Supply(48.0),
+    ServoLoop(servo_rate=100.0, velocity_gain=3.0, position_gain=5.0),
+)
+
+
+@pytest.mark.parametrize("physics", ["mujoco", "analytic", "batch"])
+@pytest.mark.parametrize("more", [{}, {"command_rate": 1e6}])
+def test_a_late_position_is_held_where_the_episode_starts(physics, more):
+    """As in an environment without delay that is asked to stay there first; again after a second reset elsewhere."""
+    arguments = {"actuator": SERVO, "action": "position", "timestep": 0.01}
+    if physics == "batch":
+        make = functools.partial(gymnasium.make_vec, num_envs=2, vectorization_mode="vector_entry_point")
+    else:
+        make, arguments = gymnasium.make, {"physics": physics, **arguments}
+    late = make("codrl_mj/Pendulum-v0", disturbances={"command_delay": 0.1, **more}, **arguments)
+    plain = make("codrl_mj/Pendulum-v0", **arguments)
+    for options in (None, {"x_init": 0.5, "y_init": 0.1}):
+        late.reset(seed=4, options=options)
+        plain.reset(seed=4, options=options)
+        start = np.atleast_2d(late.unwrapped.state)[:, :1].astype(np.float32)
+        rows = [start, start, *(start + 0.1 * np.sin(step) for step in range(6))]
+        for action, earlier in zip(rows[2:], rows, strict=False):
+            shape = late.action_space.shape
+            ours, theirs = late.step(action.reshape(shape)), plain.step(earlier.reshape(shape))
+            np.testing.assert_allclose(late.unwrapped.state, plain.unwrapped.state, rtol=0, atol=2e-6)
+            np.testing.assert_allclose(ours[4]["current"], theirs[4]["current"], rtol=0, atol=2e-4)
+
+
+def test_a_late_velocity_is_zero_before():
+    servo = dataclasses.replace(SERVO, loop=ServoLoop("velocity", servo_rate=100.0, velocity_gain=3.0))
+    env = gymnasium.make(
+        "codrl_mj/Pendulum-v0", actuator=servo, action="velocity", timestep=0.01, disturbances={"command_delay": 0.1}
+    )
+    env.reset(seed=4)
+    assert (env.unwrapped.physics.memory == 0.0).all()
+
+
+def test_a_snapshot_keeps_the_positions_on_their_way():
+    arguments = {"actuator": SERVO, "action": "position", "timestep": 0.01, "disturbances": {"command_delay": 0.1}}
+    env, other = (gymnasium.make("codrl_mj/Pendulum-v0", **arguments).unwrapped for _ in range(2))
+    env.reset(seed=4)
+    other.reset(seed=5)
+    other.restore(env.snapshot())
+    copied = copy.deepcopy(env)
+    for _ in range(3):
+        states = [one.step(np.array([0.3], np.float32))[0] for one in (env, other, copied)]
+        np.testing.assert_array_equal(states[0], states[1])
+        np.testing.assert_array_equal(states[0], states[2])
 
 
 def test_the_delay_counts_integration_steps_within_an_environment_step():

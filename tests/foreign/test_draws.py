@@ -1,14 +1,17 @@
 """`make`: motors and models that are drawn at resets, loads and delays, in Gymnasium's environments."""
 
+import dataclasses
+import functools
+
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 
 import codrl_mj
-from codrl_mj.actuators import Drive, Lag
+from codrl_mj.actuators import Drive, GearMotor, Lag, SampledLoop, Servo, ServoLoop, Supply
 from codrl_mj.catalogue import motor_entry
-from tests.foreign.models import actions, assert_same, run
+from tests.foreign.models import ARM, ArmEnv, actions, assert_same, run
 from tests.foreign.test_gymnasium import CHEETAH, IDEAL, MAXON, NOISY
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # deprecated attributes in other people's models
@@ -146,3 +149,45 @@ def test_commands_are_delayed_by_whole_environment_steps():
         for index, row in enumerate(rows):
             expected = inputs[index - 3] if index >= 3 else np.zeros(6)  # three steps of 0.05 s
             np.testing.assert_allclose(row[4]["desired_force"], expected, rtol=0, atol=1e-7)
+
+
+SERVO = Servo(
+    GearMotor(gear_ratio=20.0), SampledLoop(20e3), Supply(48.0), ServoLoop(servo_rate=100.0, velocity_gain=1.0)
+)
+WEAK = dataclasses.replace(SERVO, loop=ServoLoop(servo_rate=100.0, velocity_gain=0.05))
+
+
+@pytest.mark.parametrize("face", ["gymnasium", "stale"])
+@pytest.mark.parametrize(
+    ("motors", "action"),
+    [
+        ({"servo": "ideal", "motor": "ideal"}, "force"),  # the model's own position servo
+        ({"servo": SERVO, "motor": WEAK}, "position"),
+        ({"servo": SERVO, "motor": "ideal"}, "force"),
+    ],
+)
+def test_late_positions_are_held_where_the_episode_starts_and_late_forces_are_zero(tmp_path, motors, action, face):
+    """As in the environment without delay, whose first actions are the positions at which it starts."""
+
+    class Stale(ArmEnv):
+        """Does not bring the data up to date at a reset."""
+
+        def reset_model(self):
+            self.data.qpos[:] = self.np_random.uniform(-0.5, 0.5, 2)
+            return self.state_vector()
+
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM)
+    creator = functools.partial(Stale if face == "stale" else ArmEnv, path)
+    late = codrl_mj.make(creator, motors, action=action, disturbances={"command_delay": 0.02}, max_episode_steps=99)
+    plain = codrl_mj.make(creator, motors, action=action, max_episode_steps=99)
+    for seed in (3, 4):
+        observation = late.reset(seed=seed)[0]
+        np.testing.assert_array_equal(plain.reset(seed=seed)[0], observation)
+        forced = np.array([False, action == "force"])
+        lengths = observation[:2] * [1.0, 5.0]  # the gear of the second
+        start = np.where(forced, 0.0, lengths)
+        rows = [start, start, *(start + 0.1 * np.sin(step) for step in range(6))]
+        for wanted, earlier in zip(rows[2:], rows, strict=False):
+            ours, theirs = late.step(wanted), plain.step(earlier)
+            np.testing.assert_allclose(ours[0], theirs[0], rtol=0, atol=1e-12)
