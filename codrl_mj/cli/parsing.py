@@ -135,7 +135,7 @@ def understood(arguments: Sequence[str]) -> list[str]:
         if counted and number:
             value = float(number[2] + (number[3] or ""))
             word = f"{number[1] or ''}{int(value) if value.is_integer() else value}"
-        elif file := re.fullmatch(r"(.*=)?([^=:]+\.py):([\w.-]+)", word):
+        elif file := re.fullmatch(r"(.*=)?([^=:]+\.py):([\w./-]+)", word):
             word = f"{file[1] or ''}{_module(Path(file[2]), here)}:{file[3]}"
         found.append(word)
     typed = re.findall(r"^(?:.*=)?(\w+)[\w.]*:[\w./-]+$", "\n".join(found), re.MULTILINE)
