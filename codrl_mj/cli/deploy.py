@@ -9,6 +9,7 @@ import tyro
 
 from codrl_mj.cli.parsing import AsJson, Trust, named_numbers
 from codrl_mj.cli.subject import Source
+from codrl_mj.fields import command
 
 Exported = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="What export wrote.")]
 """Type of a verb's folder."""
@@ -62,7 +63,7 @@ class Export:
         if contract.controller["loop"] is None and contract.actuators:
             print("no current loop: the motors differ, have none, or are commanded otherwise")
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
-        print(f"{written}; try: codrl-mj board test {self.out}")
+        print(f"{written}; try: {command('board', 'test', self.out)}")
         return 0
 
 
@@ -143,7 +144,7 @@ class Test:
         print_table(f"{self.folder} as C on {self.target}", ("", ""), rows)
         if self.log is not None:
             write_log(self.log, Contract.read(self.folder), done.on_board[0])
-            print(f"wrote {self.log}; try: codrl-mj board check {self.folder} {self.log}")
+            print(f"wrote {self.log}; try: {command('board', 'check', self.folder, self.log)}")
         if self.film is not None:
             from codrl_mj.films.film import film, record
 
@@ -222,7 +223,7 @@ class RunBoard:
             ("rows; frames without an answer; late", f"{done.rows}; {done.missed}; {done.late}"),
         ]
         print_table(f"{self.folder} on {self.port}", ("", ""), rows)
-        print(f"wrote {self.out}; try: codrl-mj board check {self.folder} {self.out}")
+        print(f"wrote {self.out}; try: {command('board', 'check', self.folder, self.out)}")
         return int(done.why != "told to")
 
 
