@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import json
 import os
 import signal
 import sys
@@ -85,7 +86,7 @@ class Render(OfEpisodes):
         with progress_bar("{task.completed}/{task.total} frames") as bar:
             row = bar.add_task("filming", total=None)
             film([panel], self.out, *view, lambda done, total: bar.update(row, completed=done, total=total))
-        print(f"wrote {self.out}")
+        print(f"wrote {self.out}{_rank(self, env, episode)}")
         if self.trajectory is not None:
             save_episode(episode, self.trajectory)
             print(f"wrote {self.trajectory}")
@@ -111,8 +112,18 @@ class Replay(OfEpisodes):
         (episode,) = run_episodes(policy, env.make, 1, self.seed)
         title = f"{title}: return {episode.total:.0f}"
         write_replay(motion_of_episode(episode, env), self.out, title)
-        print(f"wrote {self.out} ({self.out.stat().st_size / 1e6:.1f} MB)")
+        print(f"wrote {self.out} ({self.out.stat().st_size / 1e6:.1f} MB){_rank(self, env, episode)}")
         return 0
+
+
+def _rank(verb: Any, env: Any, episode: Any) -> str:
+    """Return how an episode compares with those of a run's evaluation, if it is one of the same environment."""
+    from codrl_mj.runs.summaries import rank, read_evaluation
+
+    evaluation = read_evaluation(Path(verb.subject), verb.source.which == "best") or {}
+    same = (evaluation.get("conditions") or {}).get("env") == json.loads(json.dumps(env.as_mapping()))
+    said = rank(evaluation, episode.total) if same else ""
+    return f": seed {verb.seed}, return {episode.total:.3g}; {said}" if said else ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,8 +210,8 @@ class Report:
     """The page to write, .html."""
     which: Literal["last", "best"] = "last"
     """Whose policy acts in the episode: the last, or that of the best evaluation; of an unfinished run its best."""
-    seed: int = 0
-    """Seed of the episode."""
+    seed: int | None = None
+    """Seed of the episode; unless given, that of the evaluated episode with the median return."""
     film: bool = True
     """Film the episode."""
     replay: bool = False
