@@ -114,11 +114,7 @@ class EnvConfig:
         return cls(task, actuator, options={**options_mapping(arguments.get("options")), **options}, **fields)
 
     def over(self, arguments: Mapping[str, Any]) -> tuple["EnvConfig", dict[str, Any]]:
-        """Set fields and options, given by keyword, over this configuration's.
-
-        Returns:
-            The configuration, and the arguments that are neither: those of rendering, of a vector, of a constructor.
-        """
+        """Set fields and options, given by keyword, over this configuration's; return it and the other arguments."""
         world, rest = self.world, dict(arguments)
         fields = {name: rest.pop(name) for name in world.fields if name in rest}
         if options := {name: rest.pop(name) for name in world.option_names if name in rest}:
@@ -195,17 +191,7 @@ class EnvConfig:
         return made
 
     def make_vec(self, num_envs: int = 1, **arguments: Any) -> Any:
-        """Build N environments as one of Gymnasium's vectors.
-
-        Args:
-            num_envs: Number of environments, >= 1.
-            **arguments: `num_threads`, `autoreset_mode`, `render_mode` and the other arguments of
-                `codrl_mj.envs.ActuatedVectorEnv`. Or fields to set otherwise; a list of actuators has one for each
-                environment of a task.
-
-        Raises:
-            ValueError: fields do not go with each other, or with the model; or more than memory holds.
-        """
+        """Build N environments as one of Gymnasium's vectors; arguments and errors as for `codrl_mj.make_vec`."""
         # A list is no value of the field: it has an actuator for each environment.
         each = {name: arguments.pop(name) for name in ("actuator",) if isinstance(arguments.get(name), list | tuple)}
         config, rest = self.over(arguments)

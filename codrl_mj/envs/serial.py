@@ -11,7 +11,7 @@ from gymnasium.wrappers import TimeLimit
 from codrl_mj.envs.setup import one_for_each
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
-from codrl_mj.envs.vector import autoreset_of, check_counts
+from codrl_mj.envs.vector import check_counts
 from codrl_mj.physics import Signals
 
 Array = np.ndarray
@@ -67,7 +67,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         if len(each) != num_envs:
             raise ValueError(f"actuator: {len(each)} actuators for {num_envs} environments: there must be one for each")
         makers = [functools.partial(_limited, max_episode_steps, make, {**arguments, **one}) for one in each]
-        super().__init__(makers, autoreset_mode=autoreset_of(autoreset_mode))
+        super().__init__(makers, autoreset_mode=AutoresetMode(autoreset_mode))
         self.signals: Signals | None = None  # of the last step, each an array of shape (N,) or (N, motors)
         self._signal_names = self.get_attr("signal_names")[0]
         self.arm_radii = np.array([one.arm_radius for one in self.get_attr("motors")[0].values()])

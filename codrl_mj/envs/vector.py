@@ -95,7 +95,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self.num_envs = int(num_envs)
         self.setup, actuators = set_up_many(self.num_envs, task, actuator, arguments)
         self.physics = MujocoBatchPhysics(self.setup.plant, actuators, int(num_threads))
-        self.autoreset_mode = autoreset_of(autoreset_mode)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             **self.metadata,
             "render_fps": self.setup.task.render_fps,
@@ -385,15 +385,6 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-
-
-def autoreset_of(mode: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's autoreset mode of a name."""
-    try:
-        return AutoresetMode(mode)
-    except ValueError:
-        names = ", ".join(one.value for one in AutoresetMode)
-        raise ValueError(f"autoreset_mode = {mode!r}: must be one of {names}") from None
 
 
 def check_counts(num_envs: int, max_episode_steps: int | None, each: int = 3_000) -> None:

@@ -135,15 +135,8 @@ def _plot_signal(episode: Episode, axes: Any) -> list[Any]:
     name, _ = _signal(actuator)
     if name is None:
         axes.set_ylim(-1, 1)
-        kind = "an ideal actuator has" if isinstance(actuator, Ideal) else f"{type(actuator).__name__} has"
-        axes.text(
-            0.02,
-            0,
-            f"{kind} no voltage, and no signal with a unit in SIGNAL_UNITS",
-            va="center",
-            fontsize=8,
-            color="0.5",
-        )
+        shown = "an ideal actuator has" if isinstance(actuator, Ideal) else f"{type(actuator).__name__} shows"
+        axes.text(0.02, 0, f"{shown} no voltage", va="center", fontsize=8, color="0.5")
         return []
     values, limit = episode.signals[name], actuator.voltage_limit if name == "voltage" else None
     span = 1.2 * max(np.abs(values).max(), 1e-9)

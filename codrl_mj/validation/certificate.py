@@ -133,13 +133,10 @@ def _certify(
     return Certificate(subject, tuple(found), tuple(skips), quick, time.perf_counter() - started)
 
 
-_FAULTS = {
-    "dynamics": "your model and your twin differ: compare masses, gravity and the integrator",
-    "trajectories": "your model and your twin differ: compare masses, gravity and the integrator",
-    "energy": f"if it passes on a gentler run in Task.trials, this one was too violent; if not, {REPORT}",
-    "motor": f"an `advance` of your own has to depend on its arguments alone; if it does, {REPORT}",
-    "execution": f"functions and an `advance` of your own have to depend on their arguments alone; if so, {REPORT}",
-}
+_OWN = f"an `advance` or a function of your own has to depend on its arguments alone; if it does, {REPORT}"
+_RUN = f"if it passes on a gentler run in Task.trials, this one was too violent; if not, {REPORT}"
+_TWIN = "your model and your twin differ: compare masses, gravity and the integrator"
+_FAULTS = {"dynamics": _TWIN, "trajectories": _TWIN, "convergence": _RUN, "energy": _RUN}
 """Whose fault it is if a check of somebody's own task or model fails, by its group."""
 
 
@@ -149,7 +146,7 @@ def _fault(check: Check) -> str:
         return REPORT
     if check.name == DIVERGED or check.name.startswith("stable: "):
         return "your model or motor is not stable at this step: shorten it, or slow down the motor's loop"
-    return _FAULTS.get(check.group, REPORT)
+    return _FAULTS.get(check.group, _OWN)
 
 
 def _to_the_end(outcomes: Outcomes) -> Outcomes:

@@ -39,9 +39,6 @@ from codrl_mj.validation.compare import (
 )
 from codrl_mj.validation.table import ORDER_TOLERANCE, REPORT, Case, Check, Family, Skipped, check, of_order, order
 
-Derivative = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
-"""(time, state of mechanics and loops, desired forces) -> the state's time derivative."""
-
 
 def free_run(task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The run of `Task.trials`, the same every time; of a task that has none, a few steps from one of its starts.
@@ -117,13 +114,25 @@ def engine_equations(task: Task) -> Equations:
     return derivative
 
 
-def coupled(task: Task, equations: Equations, size: int, actuators: Sequence[ActuatorModel]) -> Derivative:
-    """Join `size` mechanical states by those of each motor's circuit and analogue PI loop.
+def solve(
+    task: Task,
+    equations: Equations,
+    start: np.ndarray,
+    forces: np.ndarray,
+    actuators: Sequence[ActuatorModel],
+    inner_steps: int = 0,
+    fourth: bool = False,
+) -> np.ndarray:
+    """Mechanical states, shape (steps, n), at the ends of the environment steps, the forces held over each.
 
+    They are found by scipy's DOP853 at a relative tolerance of 1e-12; with `inner_steps` by as many textbook steps:
+    Gymnasium's Runge-Kutta of fourth order, or Euler's.
+
+    With motors they are joined by those of each circuit and its analogue PI loop,
     L di/dt = u - kE*omega - R*i, u = kP*e + kI*I + kFF*i_ref (+ kE*omega), dI/dt = e, torque = kT*i;
     such a loop has no derivative gain and no filter, is never saturated, and starts at rest.
     """
-    motors = [one for one in actuators if isinstance(one, Actuator)]
+    size, motors = len(start), [one for one in actuators if isinstance(one, Actuator)]
 
     def derivative(_: float, state: np.ndarray, desired: np.ndarray) -> np.ndarray:
         delivered, electrical = [*desired], []
@@ -139,38 +148,17 @@ def coupled(task: Task, equations: Equations, size: int, actuators: Sequence[Act
         force = delivered[0] if len(delivered) == 1 else np.array(delivered)
         return np.concatenate([equations(state[:size], force), electrical])
 
-    return derivative
-
-
-def solve(
-    task: Task,
-    equations: Equations,
-    start: np.ndarray,
-    forces: np.ndarray,
-    actuators: Sequence[ActuatorModel],
-    inner_steps: int = 0,
-    promised: float = 0.0,
-) -> np.ndarray:
-    """Mechanical states, shape (steps, n), at the ends of the environment steps, the forces held over each.
-
-    They are found by scipy's DOP853 at a relative tolerance of 1e-12; with `inner_steps` by Gymnasium's Runge-Kutta
-    steps where fourth order is promised, and by Euler steps elsewhere.
-    """
-    derivative, span = coupled(task, equations, len(start), actuators), (0.0, task.step_duration)
-    motors = sum(isinstance(one, Actuator) for one in actuators)
-    state, rows = np.concatenate([start, np.zeros(2 * motors)]), []
-    for force in np.reshape(forces, (len(forces), -1)):
+    state, rows = np.concatenate([start, np.zeros(2 * len(motors))]), []
+    span, step = (0.0, task.step_duration), task.step_duration / max(inner_steps, 1)
+    for force in forces:
+        given = (np.atleast_1d(force),)
         if not inner_steps:
-            state = integrate.solve_ivp(derivative, span, state, "DOP853", rtol=1e-12, atol=1e-15, args=(force,)).y[
-                :, -1
-            ]
+            found = integrate.solve_ivp(derivative, span, state, "DOP853", rtol=1e-12, atol=1e-15, args=given)
+            state = found.y[:, -1]
+        slope = functools.partial(derivative, 0.0, desired=given[0])
         for _ in range(inner_steps):
-            step = task.step_duration / inner_steps
-            if promised == 4.0:
-                state = rk4(lambda now: derivative(0.0, now, force), state, [0.0, step])  # noqa: B023
-            else:
-                state = state + step * derivative(0.0, state, force)
-        rows.append(state[: len(start)])
+            state = rk4(slope, state, [0.0, step]) if fourth else state + step * slope(state)
+        rows.append(state[:size])
     return np.array(rows)
 
 
@@ -200,21 +188,20 @@ def refined(task: Task, judged: Callable[[int], Case], most: int = 4) -> Case:
     return case
 
 
-def blamed(task: Task, outcome: Check, promised: float, reference: Callable[[], Family]) -> Check | Skipped:
-    """Return a failed check of somebody's task with whose fault it is: the run's, if a reference fails it as well."""
+def blamed(task: Task, outcome: Check, promised: float, steps: np.ndarray, errors: Callable[[], list[float]]) -> Any:
+    """Return a failed check of somebody's task with whose fault it is: the run's, if textbook steps fail it as well."""
     if outcome.passed or task in OURS:
         return outcome
-    family = reference()
-    distance, found = family.judged(promised)
-    if distance > ORDER_TOLERANCE:
-        why = f"{found}, where {promised:g} was promised: the run is too violent for these steps, or not smooth"
-        return Skipped(outcome.name, f"{why}. Name a gentler one in Task.trials, or a smaller max_force")
-    return dataclasses.replace(outcome, fault=f"{family.label} has that order at the same steps: {REPORT}")
+    distance, found = Family("textbook steps", steps, np.array(errors()), 1e-12).judged(promised)
+    if distance <= ORDER_TOLERANCE:
+        return dataclasses.replace(outcome, fault=f"textbook steps of that size have this order: {REPORT}")
+    why = f"{found}, where {promised:g} was promised: the run is too violent for these steps, or not smooth"
+    return Skipped(outcome.name, f"{why}. Name a gentler one in Task.trials, or a smaller max_force")
 
 
-def _counts(task: Task, promised: float, motors: Sequence[Motor], finer: int, quick: bool) -> np.ndarray:
+def _counts(task: Task, fourth: bool, motors: Sequence[Motor], finer: int, quick: bool) -> np.ndarray:
     """Return the integration steps in an environment step, which are compared."""
-    if promised == 4.0:
+    if fourth:
         return 2 ** (np.arange(2, 6 if quick else 7) + finer)
     if not motors:
         return 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + finer)
@@ -248,27 +235,20 @@ def order_in_the_step(
     yield refined(task, judged)
 
 
-def _lagging(task: Task, finer: int, quick: bool) -> tuple[np.ndarray, list[list[Actuator]]]:
-    """Return lags of current loops [s], and the motors with each."""
-    lags = task.step_duration / 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + finer)
-    motors = [Motor(arm_radius=actuator.motor.arm_radius) for actuator in actuators_of(task)]
-    rate = motors[0].resistance / motors[0].inductance
-    gains = [motors[0].inductance / lag for lag in lags]
-    loops = [CurrentLoop(kp=kp, ki=kp * rate, max_voltage=math.inf) for kp in gains]
-    return lags, [[Actuator(motor, loop) for motor in motors] for loop in loops]
-
-
 @check("convergence", order("rate in the loop's bandwidth", "{whose} with the desired force itself"))
 def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
     """The lag is resolved by two integration steps at every bandwidth; both runs take the same steps."""
     integrator, physics = task.integrators[0], physics_of(task)
+    motors = [Motor(arm_radius=actuator.motor.arm_radius) for actuator in actuators_of(task)]
 
     def judged(finer: int) -> Case:
+        lags = task.step_duration / 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + finer)  # tau [s]
         errors: dict[str, list[float]] = {label: [] for label, _ in physics}
-        for lag, actuators in zip(
-            lags := _lagging(task, finer, quick)[0], _lagging(task, finer, quick)[1], strict=True
-        ):
+        for lag in lags:
             count = round(2 * task.step_duration / lag)
+            kp = motors[0].inductance / lag
+            loop = CurrentLoop(kp=kp, ki=kp * motors[0].resistance / motors[0].inductance, max_voltage=math.inf)
+            actuators = [Actuator(motor, loop) for motor in motors]
             ideal = _states(physics[-1][1], task, actuators_named("ideal", task), count, integrator)
             for label, kind in physics:
                 errors[label].append(_error(_states(kind, task, actuators, count, integrator), ideal))
@@ -281,18 +261,9 @@ def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
     yield refined(task, judged)
 
 
-def _textbook(task: Task, solved: Any, solution: np.ndarray, counts: np.ndarray, promised: float) -> Family:
-    """Return errors of textbook steps of the same equations, which are not ours."""
-    errors = [_error(solved(int(count), promised), solution) for count in counts]
-    return Family("a textbook integrator", task.step_duration / counts, np.array(errors), 1e-12)
-
-
-def _exact(task: Task, equations: Equations, lags: np.ndarray, loops: Sequence[Sequence[ActuatorModel]]) -> Family:
-    """Return how far the exact motion with loops is from that without."""
-    start, forces, _ = free_run(task)
-    without = solve(task, equations, start, forces, ())
-    errors = [_error(solve(task, equations, start, forces, actuators), without) for actuators in loops]
-    return Family("the exact solution", 1 / (2 * np.pi * lags), np.array(errors))
+def _textbook(solved: Any, solution: np.ndarray, counts: np.ndarray) -> list[float]:
+    """Return errors of textbook steps of the same equations."""
+    return [_error(solved(int(count)), solution) for count in counts]
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
@@ -314,12 +285,14 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
         solution, motors = solved(), [one.motor for one in actuators if isinstance(one, Actuator)]
         said = whose if case == "ideal actuator" else f"{whose} and of the motor"
         for integrator in task.integrators:
-            promised = 4.0 if integrator == "rk4" and not motors else 1.0
-            counts = functools.partial(_counts, task, promised, motors, quick=quick)
-            textbook = functools.partial(_textbook, task, solved, solution, counts(finest), promised)
-            for outcome in order_in_the_step(task, case, integrator, actuators, solution, counts, promised, whose=said):
-                yield blamed(task, outcome, promised, textbook)
+            fourth = integrator == "rk4" and not motors
+            promised, counts = 4.0 if fourth else 1.0, functools.partial(_counts, task, fourth, motors, quick=quick)
 
-    exact = functools.partial(_exact, task, equations, *_lagging(task, finest, quick))
-    for outcome in rate_in_the_bandwidth(task, quick, whose=named):
-        yield blamed(task, outcome, -1.0, exact)
+            def errors(
+                solved: Any = solved, solution: Any = solution, counts: Any = counts, fourth: Any = fourth
+            ) -> Any:
+                return [_error(solved(int(count), fourth), solution) for count in counts(finest)]
+
+            for outcome in order_in_the_step(task, case, integrator, actuators, solution, counts, promised, whose=said):
+                yield blamed(task, outcome, promised, task.step_duration / counts(finest), errors)
+    yield from rate_in_the_bandwidth(task, quick, whose=named)

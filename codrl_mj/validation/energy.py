@@ -36,12 +36,10 @@ from codrl_mj.tasks import OURS, Task, find_task
 from codrl_mj.validation.compare import STAND_IN, actuators_named, forces_of, gymnasium_equations, physics_of
 from codrl_mj.validation.convergence import (
     analogues,
-    engine_equations,
     free_run,
     halvings,
     obstacle,
     refined,
-    solve,
 )
 from codrl_mj.validation.table import Case, Check, Family, Skipped, check, of_order, order
 
@@ -286,27 +284,15 @@ def _flows(task: Task, integrator: str, kept: dict[str, list[Ledger]]) -> Plot:
 
 
 def unnamed(task: Task) -> str:
-    """Return why no balance can hold in somebody's model: its exact motion has energy that no entry names; or nothing.
-
-    The motion is scipy's, of the accelerations that MuJoCo finds; so are the work of the forces, and what is lost.
-    """
-    meter, equations, (start, _, forces) = Meter(task), engine_equations(task), free_run(task)
-    size, speeds = len(start), list(task.speeds)
-
-    def with_work(state: np.ndarray, force: np.ndarray) -> np.ndarray:
-        lost = meter.loss(state[:size]) if meter.lossy else 0.0
-        return np.concatenate([equations(state[:size], force), [np.sum(force * state[speeds]), lost]])
-
-    ended = solve(task, with_work, np.append(start, [0.0, 0.0]), forces, ())[-1]
-    stored, (work, lost) = meter(ended[:size]) - meter(start), ended[size:]
-    left, scale = work - lost - stored, max(abs(work), abs(stored), abs(lost))
-    if abs(left) <= 1e-6 * scale:
-        return ""
-    return (
-        f"{abs(left):.2g} of {scale:.2g} J of MuJoCo's own motion are no work of the motors, no kinetic or potential "
-        "energy and no damping: the model has gravity compensation, another actuator or a force of its own. Leave it "
-        "out to have the balance checked"
-    )
+    """Return why no balance can hold in somebody's model: energy comes and goes that no entry names; or nothing."""
+    model = mujoco.MjModel.from_xml_path(str(asset_path(task.asset)))
+    sources = {
+        "gravity compensation": model.body_gravcomp.any(),
+        "actuators besides the task's motors": model.nactuator > len(task.motors),
+        "plugins": model.nplugin,
+    }
+    found = " and ".join(name for name, there in sources.items() if there)
+    return f"the model has {found}, whose energy no balance knows: leave that out to have it checked" if found else ""
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:

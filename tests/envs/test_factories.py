@@ -211,7 +211,6 @@ def test_another_task_given_over_a_configuration_is_that_task():
         ),
         (lambda: make("pendulum", {".*": codrl_mj.actuators.Lag}), r"must be an instance of it: Lag\(\.\.\.\)"),
         (lambda: make_vec("pendulum", 2, actuater="lag"), "unknown option 'actuater' of pendulum: did you mean 'actua"),
-        (lambda: make_vec("pendulum", 2, autoreset_mode="next"), "autoreset_mode = 'next': must be one of NextStep, S"),
         (lambda: EnvConfig("cartpole", options=3), "options = 3: must be a mapping of option names to values"),
         (lambda: make("cartpole", options="ab"), "options = 'ab': must be a mapping of option names to values"),
         (lambda: suite.load(make), "must be a task's name or an EnvConfig; others go into DmEnvironment"),

@@ -124,7 +124,7 @@ def test_a_bad_argument_of_many_environments_is_refused(make, arguments, message
         ({"physics": "analytic"}, "one Gymnasium environment at a time: use vectorization_mode='sync' for it"),
         ({"num_threads": -1}, "num_threads = -1: must be an integer >= 0"),
         ({"num_threads": "2"}, "num_threads = '2': must be an integer >= 0"),
-        ({"autoreset_mode": "Sometimes"}, "autoreset_mode = 'Sometimes': must be one of NextStep, SameStep, Disabled"),
+        ({"autoreset_mode": "Sometimes"}, "'Sometimes' is not a valid AutoresetMode"),
         ({"render_mode": "human"}, "render_mode = 'human': must be one of None, rgb_array"),
         ({"render_mode": "rgb_array", "camera": "far"}, "camera = 'far'"),
         ({"actuator": [STABLE, "ideal", STABLE]}, "actuator[1] = 'ideal': must be an Actuator"),
