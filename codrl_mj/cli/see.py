@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import json
 import os
 import signal
 import sys
@@ -17,8 +16,10 @@ from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, with_environment
 from codrl_mj.cli.parsing import Trust
 from codrl_mj.cli.subject import Source, policy_and_environment
 from codrl_mj.cli.terminal import progress_bar
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.worlds import is_world
 from codrl_mj.fields import did_you_mean
+from codrl_mj.own_code import trusting
 from codrl_mj.runs import told_apart
 
 
@@ -121,7 +122,11 @@ def _rank(verb: Any, env: Any, episode: Any) -> str:
     from codrl_mj.runs.summaries import rank, read_evaluation
 
     evaluation = read_evaluation(Path(verb.subject), verb.source.which == "best") or {}
-    same = (evaluation.get("conditions") or {}).get("env") == json.loads(json.dumps(env.as_mapping()))
+    try:
+        with trusting(verb.source.trust):
+            same = EnvConfig.from_mapping(evaluation["conditions"]["env"]) == env
+    except (KeyError, TypeError, ValueError):  # no evaluation, or one that this version does not read
+        same = False
     said = rank(evaluation, episode.total) if same else ""
     return f": seed {verb.seed}, return {episode.total:.3g}; {said}" if said else ""
 

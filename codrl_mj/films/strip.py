@@ -124,7 +124,7 @@ def _signal(actuator: ActuatorModel) -> tuple[str | None, str]:
     """The second plot's signal and its label: the voltage, or the family's first with a unit; None if there is none."""
     fields: tuple[str, ...] = actuator.Signals._fields  # type: ignore[attr-defined]
     if "voltage" in fields or isinstance(actuator, Ideal):
-        return "voltage" if "voltage" in fields else None, "u [V]"
+        return None if isinstance(actuator, Ideal) else "voltage", "u [V]"
     name = next((name for name in actuator.SIGNAL_UNITS if name in fields), None)
     return name, f"{name} [{actuator.SIGNAL_UNITS[name]}]" if name else ""
 

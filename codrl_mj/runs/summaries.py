@@ -98,8 +98,9 @@ def typical_seed(evaluation: Mapping[str, Any] | None) -> int | None:
     """Return the seed of the evaluated episode with the median return (of two, the lower); None if none is known."""
     returns, conditions = ((evaluation or {}).get(name) for name in ("episode_returns", "conditions"))
     seed = conditions.get("seed") if isinstance(conditions, Mapping) else None
-    known = isinstance(returns, list) and returns and all(isinstance(one, int | float) for one in returns)
-    if not known or not isinstance(seed, int):
+    if not isinstance(returns, list) or not returns or not isinstance(seed, int):
+        return None
+    if not all(isinstance(one, int | float) for one in returns):
         return None
     return seed + sorted(range(len(returns)), key=returns.__getitem__)[(len(returns) - 1) // 2]
 

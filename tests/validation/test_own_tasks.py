@@ -140,9 +140,8 @@ def test_a_fault_of_ours_is_still_found_in_somebodys_task_and_said_to_be_ours(tm
 
 def test_an_unstable_motor_is_its_owners():
     unstable = Actuator(controller=CurrentLoop(kp=200.0))
-    spec = arm("implicitfast")
-    codrl_mj.motorise(spec, {".*": unstable}, allow_unstable=True)
-    found = validate_model(spec.compile(), quick=True).checks
+    model = codrl_mj.motorise(arm("implicitfast"), {".*": unstable}, allow_unstable=True).compile()
+    found = validate_model(model, quick=True).checks
     failed = [one.fault for one in found if one.name.startswith("stable: ")]
     assert failed == ["your model or motor is not stable at this step: shorten it, or slow down the motor's loop"] * 2
 
