@@ -9,6 +9,7 @@ import itertools
 import math
 import numbers
 import re
+import shlex
 import textwrap
 import types
 import typing
@@ -309,3 +310,8 @@ def _is_real(value: Any, infinite: bool = False) -> bool:
 
 def _is_integer(value: Any) -> bool:
     return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+
+
+def command(*words: object, trust: bool = False) -> str:
+    """Return a command line of this program as a shell takes it, whatever is in the words."""
+    return shlex.join(["codrl-mj", *map(str, words), *["--trust"] * trust])

@@ -1,6 +1,5 @@
 """What makes environments of whatever world: one, or many at once."""
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +9,7 @@ from gymnasium.vector import VectorEnv
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.serial import SerialVectorEnv
-from codrl_mj.envs.worlds import by_pattern, find_world
+from codrl_mj.envs.worlds import VECTOR_ARGUMENTS, by_pattern, find_world
 from codrl_mj.foreign import environments
 
 
@@ -37,17 +36,16 @@ def make(
         gymnasium.error.UnregisteredEnv: there is no such environment.
         ValueError: names or arguments that are unknown, or do not go with each other; the message has the remedy.
     """
-    if hasattr(env, "make"):
-        return env.make(**arguments, **({} if actuator is None else {"actuator": actuator}))
-    env_id = find_world(env).env_id if isinstance(env, str) else ""
-    if env_id:
-        given = {} if actuator is None else {"actuator": actuator}
-        return gymnasium.make(env_id, **given, **arguments)
-    if isinstance(env, str) and ":" in env:
-        view = {name: arguments.pop(name) for name in ("render_mode",) if name in arguments}
-        limit = arguments.pop("max_episode_steps", None)
-        config = EnvConfig.of(env, "default" if actuator is None else actuator, arguments)
-        return dataclasses.replace(config, max_episode_steps=limit).make(**view)
+    given = {} if actuator is None else {"actuator": actuator}
+    if isinstance(env, EnvConfig):
+        return env.make(**arguments, **given)
+    if isinstance(env, str):
+        if env_id := find_world(env).env_id:
+            return gymnasium.make(env_id, **given, **arguments)
+        if ":" in env:
+            config, arguments = _configured(env, actuator, arguments)
+            return config.make(**arguments)
+        arguments |= dict(arguments.pop("options", None) or {})
     return environments.make(env, by_pattern("default" if actuator is None else actuator), **arguments)
 
 
@@ -58,25 +56,37 @@ def make_vec(
 
         >>> envs = codrl_mj.make_vec("pendulum", 1024, "weak", randomize={"motor.resistance": "uniform(1, 2)"})
 
-    Tasks on MuJoCo are stepped as a batch, in threads; whatever else there is, one by one.
+    Tasks on MuJoCo are stepped as a batch, in threads, also where they are rendered: an `ActuatedVectorEnv`. For
+    everything else (environments of others, functions, `physics="analytic"`) a `SerialVectorEnv` is all there is, which
+    steps one environment after the other. A warning says so where a task falls back to it: for `render_mode="human"`.
 
     Args:
         env: as for `make`.
         num_envs: how many, >= 1.
-        actuator: as for `make`.
-        **arguments: as for `make`; of an `EnvConfig`, fields to set otherwise, and those of the vector, such as
-            `num_threads`.
+        actuator: as for `make`; or of a task a list with one for each environment.
+        **arguments: as for `make`, and those of the vector: `num_threads` (of a batch), `autoreset_mode` (`SameStep`
+            unless given), `render_mode`. They do the same beside a name and beside an `EnvConfig`.
 
     Raises:
         ValueError: see `make`; or more than memory holds.
     """
-    if callable(env) or "render_mode" in arguments:
-        return SerialVectorEnv(num_envs, functools.partial(make, env, actuator, **arguments))
-    if isinstance(env, str):
-        limit = {name: arguments.pop(name) for name in ("max_episode_steps",) if name in arguments}
-        chosen = find_world(env).default_actuator if actuator is None else actuator
-        env, arguments = EnvConfig.of(env, chosen, arguments), limit
-    elif actuator is not None:
-        arguments["actuator"] = actuator
-    vector: VectorEnv[Any, Any, Any] = env.world.vector(env, num_envs, **arguments)
+    if not isinstance(env, EnvConfig | str):
+        own = {name: arguments.pop(name) for name in VECTOR_ARGUMENTS if name in arguments}
+        return SerialVectorEnv(num_envs, functools.partial(make, env, actuator, **arguments), **own)
+    config, arguments = _configured(env, actuator, arguments)
+    vector: VectorEnv[Any, Any, Any] = config.make_vec(num_envs, **arguments)
     return vector
+
+
+def _configured(env: str | EnvConfig, actuator: Any, arguments: dict[str, Any]) -> tuple[EnvConfig, dict[str, Any]]:
+    """Return the configuration of a name, and the arguments that its `make` or `make_vec` takes besides."""
+    if isinstance(env, EnvConfig):
+        config = env
+    elif ":" in env and not find_world(env).env_id:
+        # A world of one's own, or a package's environment: keyword arguments that are no fields are its options.
+        names = "max_episode_steps", "render_mode", *VECTOR_ARGUMENTS
+        own = {name: arguments.pop(name) for name in names if name in arguments}
+        return EnvConfig.of(env, "default" if actuator is None else actuator, arguments), own
+    else:
+        config = EnvConfig(env)
+    return config, arguments if actuator is None else {**arguments, "actuator": actuator}

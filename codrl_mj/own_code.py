@@ -12,6 +12,7 @@ import inspect
 import itertools
 import numbers
 import re
+import sysconfig
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -188,12 +189,22 @@ def load_module(text: str) -> Any:
                 f"{text!r}: {error}; must be module:NAME of a module that is installed or in the present folder, "
                 f"{Path.cwd()}; on the command line FILE.py:NAME does as well"
             ) from None
-        frames, package = traceback.extract_tb(error.__traceback__), Path(__file__).parent
-        ours = [Path(frame.filename).is_relative_to(package) for frame in frames]
-        theirs = (frame for frame, own in zip(frames[::-1], ours[::-1], strict=True) if not own)
-        where = next(frame for frame in theirs if not frame.filename.startswith("<"))  # of what dataclasses make
-        said = str(error) if ours[-1] else f"importing {module} failed: {type(error).__name__}: {error}"
-        raise ValueError(f"{text!r}: {said} ({where.filename}, line {where.lineno})") from error
+        where, ours = _origin(error)
+        said = str(error) if ours else f"importing {module} failed: {type(error).__name__}: {error}"
+        raise ValueError(f"{text!r}: {said} ({where})") from error
+
+
+def _origin(error: Exception) -> tuple[str, bool]:
+    """Return the user's file and line that an error comes from, and whether it is one that this package raised."""
+    frames, package = traceback.extract_tb(error.__traceback__), Path(__file__).parent
+    places = [(frame.filename, frame.lineno) for frame in frames if not frame.filename.startswith("<")]
+    if isinstance(error, SyntaxError) and error.filename:  # no frame is in the file that is not parsed
+        places.append((error.filename, error.lineno))
+    installed = [Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+    others = [place for place in places if not Path(place[0]).is_relative_to(package)]
+    users = [one for one in others if not any(Path(one[0]).is_relative_to(folder) for folder in installed)]
+    file, line = (users or others)[-1]
+    return f"{file}, line {line}", Path(frames[-1].filename).is_relative_to(package)
 
 
 def load_object(text: str) -> Any:

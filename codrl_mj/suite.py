@@ -200,7 +200,11 @@ def load(
         limit = options.pop("max_episode_steps", None)
         config: Any = EnvConfig.of(domain_name, "default" if actuator is _DEFAULT else actuator, options)
         config = dataclasses.replace(config, max_episode_steps=limit)
+    elif not isinstance(domain_name, EnvConfig):
+        raise ValueError(
+            f"domain_name = {domain_name!r}: must be a task's name or an EnvConfig; others go into DmEnvironment(...)"
+        )
     else:
         over = options if actuator is _DEFAULT else {"actuator": actuator, **options}
-        config = type(domain_name).from_mapping(over, domain_name)
+        config = EnvConfig.from_mapping(over, domain_name)
     return DmEnvironment(config.make(), given.get("random"), **(environment_kwargs or {}))

@@ -1,18 +1,34 @@
 """Evaluation: every measure against counting, a closed form, an identity of the equations, or a direct calculation."""
 
+import dataclasses
 import functools
 import json
 import math
+from typing import ClassVar, NamedTuple
 
 import gymnasium
 import numpy as np
 import pytest
 
 from codrl_mj import Uniform
-from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop, Drive, GearMotor, Motor, SampledLoop, Supply
+from codrl_mj.actuators import (
+    IDEAL,
+    Actuator,
+    ActuatorModel,
+    CurrentLoop,
+    Drive,
+    GearMotor,
+    Lag,
+    Motor,
+    SampledLoop,
+    Supply,
+)
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import MEASURES, Episode, RandomPolicy, evaluate, run_episodes, summarize
+from codrl_mj.fields import real
+from codrl_mj.films import strip
+from codrl_mj.pages.episode import Shown, _lines, _motor_plots
 from codrl_mj.physics import trace_names
 from codrl_mj.tasks import TASKS, named_actuator
 
@@ -184,6 +200,65 @@ def test_a_voltage_that_the_agent_commands_asks_for_no_torque():
     result = evaluate(Constant(1.0), env, episodes=2)
     assert result.tracking_rms is result.tracking_percent is result.tracking_max is result.tracking_lag is None
     assert result.peak_voltage == 1.0
+
+
+class Seen(NamedTuple):
+    """What `Position` shows: volts, without a unit in `SIGNAL_UNITS`."""
+
+    current: float
+    voltage: float
+
+
+def advance(parameters, timestep, state, inputs):
+    voltage = min(max(parameters.gain * (inputs.desired_torque - inputs.position), -12.0), 12.0)
+    current = (voltage - inputs.speed) / 4.0
+    return state, 0.01 * current, Seen(current, voltage)
+
+
+@dataclasses.dataclass(frozen=True)
+class Position(ActuatorModel):
+    """A hobby servo: asked for an angle, it puts a voltage on its winding."""
+
+    Signals: ClassVar[type] = Seen
+    advance: ClassVar = staticmethod(advance)
+    MOTION: ClassVar[bool] = True
+    tracks: ClassVar[bool] = False
+    gain: float = real(5.0, above=0.0)
+
+
+def test_an_angle_that_is_asked_for_is_no_torque_that_could_be_missed():
+    env = EnvConfig("Reacher-v5", {"joint0": Position(), "joint1": Lag(time_constant=0.1)}, max_episode_steps=4)
+    (episode,) = run_episodes(RandomPolicy(env.action_space, 0), env.make, 1, 3)
+    assert episode.tracks == (False, True)
+    result = summarize(env.task, [episode])
+    assert result.motors["joint0"]["tracking_rms"] is None
+    # overall it is the error of the one motor that was asked for a torque
+    asked = np.repeat(episode.signals["desired_force"][:, 1], episode.inner_steps)
+    error = asked - episode.trace["actual_force"][:, 1]
+    assert result.tracking_rms == pytest.approx(math.sqrt(np.mean(error**2)), rel=1e-12)
+    assert result.motors["joint1"]["tracking_rms"] == result.tracking_rms
+    shown = [Shown("run", env, episode, None, None, 3)]
+    plots = {plot.title: plot for plot in _motor_plots(_lines(shown, list(episode.motors)))}
+    for title, name in (("Torque at the shaft", "desired"), ("Error: desired less actual", "desired less actual")):
+        assert [curve.label for curve in plots[title].curves if name in curve.label] == [f"joint1: {name}"]
+    alone = EnvConfig("Reacher-v5", Position(), max_episode_steps=4)
+    (episode,) = run_episodes(RandomPolicy(alone.action_space, 0), alone.make, 1, 3)
+    result = summarize(alone.task, [episode])
+    assert result.tracking_rms is result.tracking_percent is result.tracking_max is result.tracking_lag is None
+    plots = _motor_plots(_lines([Shown("run", alone, episode, None, None, 3)], list(episode.motors)))
+    assert "Error: desired less actual" not in [plot.title for plot in plots]
+
+
+def test_a_film_shows_the_voltage_of_every_family_that_has_one(monkeypatch):
+    assert strip._signal(Position()) == ("voltage", "u [V]")
+    assert strip._signal(IDEAL) == (None, "u [V]")
+    assert strip._signal(Lag()) == (None, "")
+    drawn = []
+    monkeypatch.setattr(strip, "_pixels", lambda figure: drawn.append(figure) or np.zeros((1, 1, 3), np.uint8))
+    env = EnvConfig("Reacher-v5", Position(), max_episode_steps=4)
+    (episode,) = run_episodes(RandomPolicy(env.action_space, 0), env.make, 1, 3)
+    strip.draw_strip(env.task, episode, 0, 300, 1.0, 1.0)
+    assert [text.get_text() for text in drawn[0].legends[0].get_texts()] == ["actual", "voltage"]
 
 
 # -- the motor ----------------------------------------------------------------------------------------------

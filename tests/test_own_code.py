@@ -1,9 +1,11 @@
 """What users write for tasks and families is refused in one sentence where it is wrong, and never ends the process."""
 
+import itertools
 import math
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium
 import numpy as np
@@ -221,3 +223,61 @@ def test_an_actuator_file_names_modules_only_with_trust(tmp_path, monkeypatch, c
         assert main([*line, "--trust"]) == 0
         Path("executed").unlink()
         sys.modules.pop("of_theirs")
+
+
+LOCATED = itertools.count()
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("x = 1\n\ndef f(:\n", 3),  # Python's parser
+        ("x = 1\n  y = 2\n", 2),
+        ("import json\n\nx = json.loads('{')\n", 3),  # raised inside Python's own library
+        ("import dataclasses\n\n\n@dataclasses.dataclass\nclass A:\n    x: list = []\n", 4),
+        ("import scipy.linalg\n\nx = scipy.linalg.inv([[1.0, 2.0]])\n", 3),  # inside an installed one
+        ("import codrl_mj\n\nx = codrl_mj.EnvConfig('pendulm')\n", 3),  # inside ours
+        ("def f():\n    return 1 / 0\n\n\nf()\n", 2),
+    ],
+)
+@pytest.mark.parametrize("imported", ["itself", "by another"])
+def test_an_error_in_a_users_module_is_at_its_own_file_and_line(tmp_path, monkeypatch, text, line, imported):
+    monkeypatch.syspath_prepend(tmp_path)
+    name = f"located{next(LOCATED)}"
+    (tmp_path / f"{name}.py").write_text(text)
+    (tmp_path / f"by_{name}.py").write_text(f"import {name}\n")
+    module = name if imported == "itself" else f"by_{name}"
+    told = refused(lambda: codrl_mj.make(f"{module}:TASK"), f"'{module}:TASK': ")
+    assert told.endswith(f"({tmp_path / f'{name}.py'}, line {line})")
+
+
+class Winds(NamedTuple):
+    """Options whose defaults are zero, negative and positive."""
+
+    wind: float = 0.0
+    slope: float = -0.5
+    length: float = 2.0
+    gusts: bool = False
+
+
+def test_an_option_takes_its_own_default_and_what_is_of_its_kind():
+    task = codrl_mj.register(slips.task(options=Winds))
+    config = codrl_mj.EnvConfig(task.name, "ideal")
+    for given in Winds()._asdict(), {"wind": -3.0, "slope": 0.0, "length": 1}:
+        for env in codrl_mj.make(task.name, "ideal", **given), codrl_mj.make(config, **given):
+            assert env.unwrapped.setup.config.options == Winds(**given)
+    for given, kind in [
+        ({"wind": np.nan}, "a finite number"),
+        ({"slope": np.inf}, "a finite number"),
+        ({"wind": True}, "a finite number"),
+        ({"length": 0.0}, "a number > 0"),
+        ({"gusts": 0}, "True or False"),
+    ]:
+        refused(lambda given=given: codrl_mj.make(task.name, **given), rf"\w+ = .*: must be {kind}")
+
+
+def test_a_default_that_is_no_number_is_refused_with_the_task():
+    class Lost(NamedTuple):
+        wind: float = float("nan")
+
+    refused(lambda: slips.task(options=Lost), "Task.options = .*a typing.NamedTuple of numbers and flags")

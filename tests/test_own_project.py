@@ -98,7 +98,7 @@ def test_two_motors_have_two_forces_within_their_own_limits():
     ("arguments", "message"),
     [
         ({"actuator": ["lag", series_elastic.SOFT]}, "several families"),
-        ({"actuator": ["lag"] * 3}, "3 actuators for the 2 motors of arm: shoulder, elbow"),
+        ({"actuator": ["lag"] * 3}, r"3 actuators, but arm has 2 motors \(shoulder, elbow\)"),
         ({"actuator": "lag", "physics": "analytic"}, "arm rebuilds no environment of Gymnasium's"),
         ({"actuator": "weak"}, "'weak': a variation of the paper's actuator, of which arm has none"),
     ],

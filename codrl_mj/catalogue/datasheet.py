@@ -9,7 +9,7 @@ from typing import Any
 
 from codrl_mj.catalogue.derivation import MotorNumbers, derive
 from codrl_mj.catalogue.units import Kind, read
-from codrl_mj.fields import check_names
+from codrl_mj.fields import check_names, command
 from codrl_mj.own_code import asset_folder, read_text
 
 
@@ -257,7 +257,9 @@ def motor_entry(name: str) -> MotorEntry:
     try:
         return _entry(path.stem, tomllib.loads(read_text(path)), name.endswith(".toml"))
     except FileNotFoundError as error:
-        raise ValueError(f"motor {name!r}: there is no such file; codrl-mj motor new {name} writes one") from error
+        raise ValueError(
+            f"motor {name!r}: there is no such file; {command('motor', 'new', name)} writes one"
+        ) from error
     except (OSError, tomllib.TOMLDecodeError) as error:
         raise ValueError(f"motor {name!r}: {path} is no TOML file that can be read: {error}") from error
     except ValueError as error:

@@ -12,7 +12,7 @@ from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, environment, wit
 from codrl_mj.cli.parsing import AsJson, Trust, named_numbers
 from codrl_mj.cli.subject import Source, Subject
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.fields import differing
+from codrl_mj.fields import command, differing
 
 Exported = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="What export wrote.")]
 """Type of a verb's folder."""
@@ -76,7 +76,7 @@ class Export:
             print(f"no current loop: {why}")
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
         names = env.task, *(family_name(type(one)) for one in env.actuators)
-        print(f"{written}; try: codrl-mj board test {self.out}{' --trust' * any(':' in name for name in names)}")
+        print(f"{written}; try: {command('board', 'test', self.out, trust=any(':' in name for name in names))}")
         return 0
 
     def _environment(self: Any, subject: Subject) -> EnvConfig:
@@ -173,7 +173,7 @@ class Test:
         print_table(f"{self.folder} as C on {self.target}", ("", ""), rows)
         if self.log is not None:
             write_log(self.log, Contract.read(self.folder), done.on_board[0])
-            print(f"wrote {self.log}; try: codrl-mj board check {self.folder} {self.log}")
+            print(f"wrote {self.log}; try: {command('board', 'check', self.folder, self.log)}")
         if self.film is not None:
             from codrl_mj.films.film import film, record
 
@@ -252,7 +252,7 @@ class RunBoard:
             ("rows; frames without an answer; late", f"{done.rows}; {done.missed}; {done.late}"),
         ]
         print_table(f"{self.folder} on {self.port}", ("", ""), rows)
-        print(f"wrote {self.out}; try: codrl-mj board check {self.folder} {self.out}")
+        print(f"wrote {self.out}; try: {command('board', 'check', self.folder, self.out)}")
         return int(done.why != "told to")
 
 

@@ -9,6 +9,7 @@ import tyro
 
 from codrl_mj.cli.parsing import AsJson
 from codrl_mj.cli.terminal import number, print_table, say
+from codrl_mj.fields import command
 
 MotorName = Annotated[
     tyro.conf.Positional[str],
@@ -301,7 +302,7 @@ class New:
         from codrl_mj.catalogue import new_motor
 
         new_motor(self.file)
-        print(f"wrote {self.file}: fill it in; next: codrl-mj motor show {self.file}")
+        print(f"wrote {self.file}: fill it in; next: {command('motor', 'show', self.file)}")
         return 0
 
 

@@ -16,8 +16,10 @@ from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, with_environment
 from codrl_mj.cli.parsing import Trust
 from codrl_mj.cli.subject import Source, policy_and_environment
 from codrl_mj.cli.terminal import progress_bar
+from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.worlds import is_world
 from codrl_mj.fields import did_you_mean
+from codrl_mj.own_code import trusting
 from codrl_mj.runs import told_apart
 
 
@@ -85,7 +87,7 @@ class Render(OfEpisodes):
         with progress_bar("{task.completed}/{task.total} frames") as bar:
             row = bar.add_task("filming", total=None)
             film([panel], self.out, *view, lambda done, total: bar.update(row, completed=done, total=total))
-        print(f"wrote {self.out}")
+        print(f"wrote {self.out}{_rank(self, env, episode)}")
         if self.trajectory is not None:
             save_episode(episode, self.trajectory)
             print(f"wrote {self.trajectory}")
@@ -111,8 +113,22 @@ class Replay(OfEpisodes):
         (episode,) = run_episodes(policy, env.make, 1, self.seed)
         title = f"{title}: return {episode.total:.0f}"
         write_replay(motion_of_episode(episode, env), self.out, title)
-        print(f"wrote {self.out} ({self.out.stat().st_size / 1e6:.1f} MB)")
+        print(f"wrote {self.out} ({self.out.stat().st_size / 1e6:.1f} MB){_rank(self, env, episode)}")
         return 0
+
+
+def _rank(verb: Any, env: Any, episode: Any) -> str:
+    """Return how an episode compares with those of a run's evaluation, if it is one of the same environment."""
+    from codrl_mj.runs.summaries import rank, read_evaluation
+
+    evaluation = read_evaluation(Path(verb.subject), verb.source.which == "best") or {}
+    try:
+        with trusting(verb.source.trust):
+            same = EnvConfig.from_mapping(evaluation["conditions"]["env"]) == env
+    except (KeyError, TypeError, ValueError):  # no evaluation, or one that this version does not read
+        same = False
+    said = rank(evaluation, episode.total) if same else ""
+    return f": seed {verb.seed}, return {episode.total:.3g}; {said}" if said else ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,8 +215,8 @@ class Report:
     """The page to write, .html."""
     which: Literal["last", "best"] = "last"
     """Whose policy acts in the episode: the last, or that of the best evaluation; of an unfinished run its best."""
-    seed: int = 0
-    """Seed of the episode."""
+    seed: int | None = None
+    """Seed of the episode; unless given, that of the evaluated episode with the median return."""
     film: bool = True
     """Film the episode."""
     replay: bool = False

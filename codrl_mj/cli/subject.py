@@ -79,7 +79,7 @@ class Source:
     def load(self, path: Path) -> Subject:
         """The policy at a path: a run folder, a folder with a policy alone, or a Stable-Baselines3 zip."""
         from codrl_mj.runs.policies import load_policy, load_sb3_zip
-        from codrl_mj.training.folder import BEST, load_config
+        from codrl_mj.training.folder import BEST, load_config, resuming
 
         if self.normalize is not None and path.suffix != ".zip":
             raise ValueError(f"--normalize {self.normalize}: {path} is no zip of Stable-Baselines3: leave it out")
@@ -92,8 +92,8 @@ class Source:
                 raise ValueError(f"--agent {self.agent}: {path} was trained by {config.agent.name}: leave --agent out")
             if self.which == "last" and not finished(path):
                 raise FileNotFoundError(
-                    f"{path} is not finished and has no last policy yet: continue it with codrl-mj train --resume "
-                    f"{path}, or take its best one so far with --which best"
+                    f"{path} is not finished and has no last policy yet: continue it with {resuming(path)}, or take "
+                    "its best one so far with --which best"
                 )
             policy = load_policy(path / BEST if self.which == "best" else path, self.trust)
             return Subject(policy, config.env, config.agent.known_as(), path)

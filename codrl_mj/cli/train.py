@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from codrl_mj.actuators.model import family_name
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
 from codrl_mj.cli.environments import (
@@ -28,12 +27,13 @@ from codrl_mj.cli.environments import (
 from codrl_mj.cli.parsing import AsJson
 from codrl_mj.cli.terminal import progress_bar, say
 from codrl_mj.envs.worlds import find_world
+from codrl_mj.fields import command
 from codrl_mj.runs import PROGRESS, RESULT, finished
 from codrl_mj.runs.files import read_json
 from codrl_mj.runs.summaries import read_reports
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
-from codrl_mj.training.folder import admit, load_config
+from codrl_mj.training.folder import admit, load_config, needs_trust
 from codrl_mj.training.history import REPORT_COLUMNS
 
 _OWN_FLAGS = ("agent", "env")  # of the configuration: not made from its fields' types
@@ -130,7 +130,7 @@ class Train:
         from codrl_mj.training import train
 
         if find_world(self.task).reference != find_world(self.base.task).reference and self.resume is None:
-            raise ValueError(f"name the task before the flags, as in codrl-mj train {self.task} --seed 1")
+            raise ValueError(f"name the task before the flags, as in {command('train', self.task, '--seed', 1)}")
         if self.resume is not None and self.out not in (None, self.resume):
             raise ValueError(f"--out {self.out}: a run continues in its own folder, {self.resume}: leave --out out")
         config = dataclasses.replace(
@@ -146,11 +146,8 @@ class Train:
         through = "-".join(dict.fromkeys(Path(each.rpartition("=")[2]).stem for each in self.actuators))
         through = "-".join(filter(None, (through or self.actuator_name, self.actuator_fields.family)))
         parts = config.task, config.agent.name, through, str(config.seed)
-        families = (family_name(type(each)) for each in config.env.actuators)
-        own = any(":" in one for one in (*parts, *families))  # module:NAME
-        following = "next: codrl-mj evaluate" + (" --trust" if own else "")
         if self.resume is not None and finished(self.resume) and config == load_config(self.resume, self.trust):
-            print(f"{self.resume} is finished already; {following} {self.resume}")
+            print(f"{self.resume} is finished already; {_following(self.resume)}")
             return 0, _came_to(self.resume) if self.as_json else None
         name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
         out = self.resume or self.out or Path("runs") / name
@@ -166,8 +163,13 @@ class Train:
                 tensorboard=self.tensorboard,
                 wandb=self.wandb,
             )
-        print(f"wrote {out}: see {out / 'learning_curve.png'}; {following} {out}")
+        print(f"wrote {out}: see {out / 'learning_curve.png'}; {_following(out)}")
         return 0, _came_to(out) if self.as_json else None
+
+
+def _following(run: Path) -> str:
+    """Return the command to go on with after a training."""
+    return f"next: {command('evaluate', run, trust=needs_trust(run))}"
 
 
 def _came_to(run: Path) -> dict[str, Any]:

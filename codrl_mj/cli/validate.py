@@ -88,7 +88,8 @@ def print_checks(checks: Sequence[Check], title: str = "MuJoCo against Gymnasium
     print_table(title, columns, rows, right=columns[1:5], whole=("worst", "allowed", "verdict"), **_FRAMED)
     for check in checks:
         if not check.passed:
-            say(f"{check.name}, against {check.oracle}: FAILED at {check.where}", style="red")
+            said = f". Whose fault: {check.fault}" if check.fault else ""
+            say(f"{check.name}, against {check.oracle}: FAILED at {check.where}{said}", style="red")
 
 
 def print_certificate(certificate: Certificate) -> None:

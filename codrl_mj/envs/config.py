@@ -14,7 +14,7 @@ import numpy as np
 from codrl_mj.actuators import ActuatorModel, mapping_of, names_together
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve
 from codrl_mj.envs.distributions import Distribution, paths_of
-from codrl_mj.envs.worlds import World, find_world
+from codrl_mj.envs.worlds import World, find_world, options_mapping
 from codrl_mj.fields import check_joint_dynamics, check_names
 
 
@@ -104,16 +104,27 @@ class EnvConfig:
         Args:
             task: the world's name.
             actuator: as for the field.
-            arguments: other fields, and the world's own options; a time limit is the face's own matter.
+            arguments: other fields, and the world's own options, one by one or as `options`; a time limit is the face's
+                own matter.
 
         Raises:
             UnknownOptionError: neither has a name that is given.
             ValueError: as for the class.
         """
-        names = {field.name for field in dataclasses.fields(cls)} - {"options", "max_episode_steps"}
+        # An environment of others may have an argument of its own with the name of a field that only tasks have.
+        names = {*find_world(task).fields} - {"options", "max_episode_steps"}
         fields = {name: value for name, value in arguments.items() if name in names}
-        options = {name: value for name, value in arguments.items() if name not in names}
-        return cls(task, actuator, options=options, **fields)
+        options = {name: value for name, value in arguments.items() if name not in (*names, "options")}
+        return cls(task, actuator, options={**options_mapping(arguments.get("options")), **options}, **fields)
+
+    def over(self, arguments: Mapping[str, Any]) -> tuple["EnvConfig", dict[str, Any]]:
+        """Set fields and options, given by keyword, over this configuration's; return it and the other arguments."""
+        world, rest = self.world, dict(arguments)
+        fields = {name: rest.pop(name) for name in world.fields if name in rest}
+        if options := {name: rest.pop(name) for name in world.option_names if name in rest}:
+            given = options_mapping(fields["options"]) if "options" in fields else world.changed(self.options)
+            fields["options"] = {**given, **options}
+        return dataclasses.replace(self, **fields), rest
 
     @property
     def world(self) -> World:
@@ -172,16 +183,23 @@ class EnvConfig:
 
         Args:
             **view: `render_mode`, and what else it takes for its rendering; of a task `width`, `height`, `camera` and
-                `pretty`, as for `codrl_mj.envs.ActuatedEnv`. Or fields to set otherwise.
+                `pretty`, as for `codrl_mj.envs.ActuatedEnv`. Or fields and options to set otherwise.
 
         Raises:
             ValueError: fields do not go with each other, or with the model.
         """
-        fields = {name: view.pop(name) for name in self.world.fields if name in view}
-        made = self.world.make(dataclasses.replace(self, **fields), **view)
+        config, view = self.over(view)
+        made = config.world.make(config, **view)
         if not isinstance(made, gymnasium.Env):
-            raise ValueError(f"{self.task}: its `make` returned {made!r}: must be a gymnasium.Env")
+            raise ValueError(f"{config.task}: its `make` returned {made!r}: must be a gymnasium.Env")
         return made
+
+    def make_vec(self, num_envs: int = 1, **arguments: Any) -> Any:
+        """Build N environments as one of Gymnasium's vectors; arguments and errors as for `codrl_mj.make_vec`."""
+        # A list is no value of the field: it has an actuator for each environment.
+        each = {name: arguments.pop(name) for name in ("actuator",) if isinstance(arguments.get(name), list | tuple)}
+        config, rest = self.over(arguments)
+        return config.world.vector(config, num_envs, **each, **rest)
 
     def as_mapping(self) -> dict[str, Any]:
         """The configuration as JSON-serialisable values; `from_mapping` reads it."""

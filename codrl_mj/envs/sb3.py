@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from codrl_mj.envs.config import EnvConfig
@@ -33,6 +34,8 @@ class ActuatedVecEnv(VecEnv):
             )
         elif not isinstance(acts, spaces.Box | spaces.Discrete) or getattr(acts, "start", 0) != 0:
             wrong = f"actions are {acts}: must be a vector (Box), or a choice (Discrete) that counts from 0"
+        elif env.autoreset_mode != AutoresetMode.SAME_STEP:
+            wrong = f"autoreset_mode = {env.autoreset_mode.value!r}: must be 'SameStep', as Stable-Baselines3 has it"
         if wrong:
             env.close()
             raise ValueError(wrong)
@@ -187,7 +190,7 @@ class ActuatedVecEnv(VecEnv):
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
 
 
-def make_sb3_vec_env(env_id: Any, num_envs: int = 64, **arguments: Any) -> ActuatedVecEnv:
+def make_sb3_vec_env(env_id: Any, num_envs: int = 64, actuator: Any = None, **arguments: Any) -> ActuatedVecEnv:
     """Many environments as one Stable-Baselines3 `VecEnv`.
 
     Args:
@@ -195,6 +198,7 @@ def make_sb3_vec_env(env_id: Any, num_envs: int = 64, **arguments: Any) -> Actua
             environment's whole configuration; or a function that makes an environment with motors, such as
             `functools.partial(codrl_mj.make, "Hopper-v5", {".*": "lag"})`.
         num_envs: how many, >= 1.
+        actuator: as for `codrl_mj.make_vec`. A function's environments have their motors already: leave it out.
         **arguments: as for `codrl_mj.envs.ActuatedVectorEnv`; the time limit is Gymnasium's unless given. Whatever is
             no task of ours on `mujoco` is stepped one by one: a `SerialVectorEnv`.
 
@@ -202,7 +206,13 @@ def make_sb3_vec_env(env_id: Any, num_envs: int = 64, **arguments: Any) -> Actua
         ValueError: unknown id, or an argument out of bounds; more than memory holds; observations are no vector, or
             actions neither a vector nor a choice.
     """
+    given = {} if actuator is None else {"actuator": actuator}
     if callable(env_id):
+        if given:
+            raise ValueError(
+                f"actuator = {actuator!r}: the function makes environments that have their motors: leave it out, and "
+                "give functools.partial(codrl_mj.make, ENV, ACTUATOR)"
+            )
         return ActuatedVecEnv(SerialVectorEnv(num_envs, env_id, **arguments))
     config = EnvConfig(env_id) if isinstance(env_id, str) else env_id
-    return ActuatedVecEnv(config.world.vector(config, num_envs, **arguments))
+    return ActuatedVecEnv(config.make_vec(num_envs, **given, **arguments))

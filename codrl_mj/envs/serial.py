@@ -15,10 +15,12 @@ from codrl_mj.envs.vector import check_counts
 from codrl_mj.physics import Signals
 
 Array = np.ndarray
+_BOOKKEEPING = ("elapsed", "observations", "ended")
+"""Entries of a snapshot that are not the environments' own."""
 
 
 class SerialVectorEnv(SyncVectorEnv[Array, Array]):
-    """Gymnasium's `SyncVectorEnv` in `SAME_STEP` mode, with what Stable-Baselines3's face needs of an environment.
+    """Gymnasium's `SyncVectorEnv`, by default in `SAME_STEP` mode, with what Stable-Baselines3's face needs.
 
     Of each it asks for `motors`, `signal_names`, `randomization`, `snapshot` and `restore`, as an `ActuatedEnv` and
     what `codrl_mj.make` makes have them.
@@ -30,6 +32,8 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         task: str | Callable[..., Any],
         actuator: Any = "default",
         max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        num_threads: int = 0,
         **arguments: Any,
     ) -> None:
         """Build the environments.
@@ -40,6 +44,8 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
                 for processes.
             actuator: as for `ActuatedEnv`; or a sequence of N actuators, one for each environment.
             max_episode_steps: time limit of each environment [steps]; None for none.
+            autoreset_mode: when an environment whose episode ended is reset, as for `ActuatedVectorEnv`.
+            num_threads: 0 or 1: there is one thread.
             **arguments: the other arguments of `ActuatedEnv`, `physics` among them; or the function's.
 
         Raises:
@@ -47,6 +53,11 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
         check_counts(num_envs, max_episode_steps, 20_000 if isinstance(task, str) else 200_000)
+        if num_threads not in (0, 1):
+            raise ValueError(
+                f"num_threads = {num_threads!r}: must be 0 or 1 here: these environments are stepped one by one, only "
+                "tasks on physics='mujoco' as a batch: leave it out"
+            )
         make: Any = task
         each = [{} if actuator == "default" else {"actuator": actuator}] * num_envs
         if isinstance(task, str):
@@ -56,7 +67,7 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         if len(each) != num_envs:
             raise ValueError(f"actuator: {len(each)} actuators for {num_envs} environments: there must be one for each")
         makers = [functools.partial(_limited, max_episode_steps, make, {**arguments, **one}) for one in each]
-        super().__init__(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+        super().__init__(makers, autoreset_mode=AutoresetMode(autoreset_mode))
         self.signals: Signals | None = None  # of the last step, each an array of shape (N,) or (N, motors)
         self._signal_names = self.get_attr("signal_names")[0]
         self.arm_radii = np.array([one.arm_radius for one in self.get_attr("motors")[0].values()])
@@ -87,9 +98,11 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         ended = terminated | truncated
         last = infos.get("final_info", infos)  # of those that ended
         others = last if ended.all() else infos
+        # In NEXT_STEP mode a step may have reset all of them, and tells nothing of motors.
         self.signals = {
             name: np.where(ended.reshape(-1, *[1] * (last[name].ndim - 1)), last[name], others[name])
             for name in self._signal_names
+            if name in others
         }
         return observations, rewards, terminated, truncated, infos
 
@@ -101,7 +114,9 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
     def snapshot(self) -> dict[str, Array]:
         """Everything that the future depends on, as plain arrays: the environments' own, and their bookkeeping."""
         each = self.call("snapshot")
+        same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
         return {
+            **({} if same_step else {"ended": self._autoreset_envs.copy()}),
             **{name: np.stack([one[name] for one in each]) for name in each[0]},
             "elapsed": np.stack([elapsed_steps(env) for env in self.envs]),
             "observations": self._observations.copy(),
@@ -119,12 +134,13 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         if self._env_obs[0] is None:  # Gymnasium's wrappers insist on a reset
             self.reset()
         check_snapshot(snapshot, self.snapshot())
-        own = {name: values for name, values in snapshot.items() if name not in ("elapsed", "observations")}
+        own = {name: values for name, values in snapshot.items() if name not in _BOOKKEEPING}
         begun = [
             env.get_wrapper_attr("restore")({name: values[row] for name, values in own.items()})
             for row, env in enumerate(self.envs)
         ]
         self.signals = None  # of a step that was not this one's past
+        self._autoreset_envs[:] = snapshot.get("ended", False)
         if begun[0] is not None:
             self._keep(np.stack(begun))
             return self._observations.copy()

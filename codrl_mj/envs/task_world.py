@@ -1,6 +1,7 @@
 """Tasks as worlds: what an `EnvConfig` of one can have besides, and how its environments are made."""
 
 import dataclasses
+import math
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,8 +13,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.envs.worlds import COMMON, World, described, patterns_of, world_of
-from codrl_mj.fields import check_pattern, field_docs
+from codrl_mj.envs.worlds import COMMON, World, described, options_mapping, patterns_of, world_of
+from codrl_mj.fields import check_pattern, did_you_mean, field_docs
 from codrl_mj.own_code import asset_path
 from codrl_mj.tasks import TASKS, Task, find_task, reference_of, register, resolve_actuators
 
@@ -46,9 +47,15 @@ class TaskWorld(World):
         from codrl_mj.envs.vector import ActuatedVectorEnv
 
         arguments = {"max_episode_steps": config.time_limit} | config.as_arguments() | arguments
-        if arguments["physics"] != "mujoco":
-            return SerialVectorEnv(num_envs, config.task, **arguments)
-        return ActuatedVectorEnv(num_envs, config.task, autoreset_mode=AutoresetMode.SAME_STEP, **arguments)
+        human = arguments.get("render_mode") == "human"
+        if arguments["physics"] == "mujoco" and not human:
+            return ActuatedVectorEnv(num_envs, config.task, **{"autoreset_mode": AutoresetMode.SAME_STEP, **arguments})
+        if arguments["physics"] == "mujoco":
+            gymnasium.logger.warn(
+                f"render_mode = 'human': {num_envs} environments of {self.name} are stepped one by one, which is slow; "
+                "batches render with 'rgb_array'"
+            )
+        return SerialVectorEnv(num_envs, config.task, **arguments)
 
     @property
     def reference(self) -> str:
@@ -62,17 +69,21 @@ class TaskWorld(World):
     def options(self, given: Any) -> Any:
         """The task's options as its `NamedTuple`."""
         known = self.task.options
-        plain = self.changed(given) if isinstance(given, tuple) else dict(given or {})
+        plain = self.changed(given) if isinstance(given, tuple) else options_mapping(given)
         for name, value in plain.items():
             if name not in known._fields:
                 has = ", ".join(known._fields) or "none"
+                hint = did_you_mean(name, [*known._fields, *self.fields])
                 raise UnknownOptionError(
-                    f"unknown option {name!r} of {self.name}: it has {has} (unexpected keyword argument {name!r})"
+                    f"unknown option {name!r} of {self.name}: {hint}it has {has} (unexpected keyword argument {name!r})"
                 )
             plain[name] = value = value.item() if isinstance(value, np.generic) else value
-            flag = isinstance(known._field_defaults[name], bool)
-            if isinstance(value, bool) != flag or not isinstance(value, int | float) or not (flag or value > 0):
-                raise ValueError(f"{name} = {value!r}: must be {'True or False' if flag else 'a number > 0'}")
+            default = known._field_defaults[name]
+            flag, positive = isinstance(default, bool), default > 0
+            allowed = isinstance(value, int | float) and (flag or (value > 0 if positive else math.isfinite(value)))
+            if isinstance(value, bool) != flag or not allowed:
+                kind = "True or False" if flag else "a number > 0" if positive else "a finite number"
+                raise ValueError(f"{name} = {value!r}: must be {kind}")
         return known(**{name: value if isinstance(value, bool) else float(value) for name, value in plain.items()})
 
     def changed(self, options: Any) -> dict[str, Any]:

@@ -30,6 +30,8 @@ COMMON = (
     *("disturbances", "randomize", "options"),
 )
 """Fields of an `EnvConfig` that every world has."""
+VECTOR_ARGUMENTS = ("num_threads", "autoreset_mode")
+"""Keyword arguments of vectors of environments that a single environment does not have."""
 _KINDS = ("codrl_mj.envs.task_world", "codrl_mj.foreign.world")
 """Our kinds of worlds, a module each with `claims(name)`, `find(name)`: which names, and what is called so."""
 _UNITS = (
@@ -87,13 +89,14 @@ class World(abc.ABC):
         Args:
             config: their `EnvConfig`.
             num_envs: how many, >= 1.
-            **arguments: those of `EnvConfig.make`.
+            **arguments: those of `EnvConfig.make`, and `VECTOR_ARGUMENTS`.
 
         Raises:
             ValueError: see `make`.
         """
         serial = importlib.import_module("codrl_mj.envs.serial")
-        return serial.SerialVectorEnv(num_envs, functools.partial(config.make, **arguments))
+        own = {name: arguments.pop(name) for name in VECTOR_ARGUMENTS if name in arguments}
+        return serial.SerialVectorEnv(num_envs, functools.partial(config.make, **arguments), **own)
 
     # -- what is known without making one --------------------------------------------------------------------
 
@@ -271,6 +274,14 @@ def described(names: Sequence[str], box: spaces.Box, units: Sequence[str | None]
     return [{"name": name, "unit": unit, "least": least, "most": most} for name, unit, least, most in columns]
 
 
+def options_mapping(options: Any) -> dict[str, Any]:
+    """Return options as keyword arguments, from a mapping, a task's `NamedTuple` or None."""
+    try:
+        return options._asdict() if hasattr(options, "_asdict") else dict(options or {})
+    except (TypeError, ValueError):
+        raise ValueError(f"options = {options!r}: must be a mapping of option names to values") from None
+
+
 @functools.cache
 def _own_actions(world: World, options: str) -> "spaces.Space[Any]":
     config = importlib.import_module("codrl_mj.envs.config").EnvConfig(world.reference, options=json.loads(options))
@@ -289,7 +300,9 @@ def patterns_of(given: Any) -> Mapping[str, Any] | None:
     """What a user wrote for actuators, if it is a mapping of patterns to them; None if it is one for all."""
     if not isinstance(given, Mapping) or {"family", "name"} & given.keys():
         return None
-    for one in given.values():
+    for pattern, one in given.items():
+        if isinstance(one, type) and issubclass(one, ActuatorModel):
+            raise ValueError(f"actuator[{pattern!r}] = {one!r}: must be an instance of it: {one.__name__}(...)")
         fields = one.items() if isinstance(one, Mapping) else ()
         of_actuator = any(
             name in ("family", "name") or dataclasses.is_dataclass(value) or isinstance(value, Mapping)

@@ -60,6 +60,12 @@ class Episode:
         return self.actuator if isinstance(self.actuator, tuple) else (self.actuator,)
 
     @property
+    def tracks(self) -> tuple[bool, ...]:
+        """For each motor True if a torque was asked of it; a voltage, a position or a speed is none."""
+        asked = (one if self.command == "force" else one.commands()[self.command].actuator for one in self.actuators)
+        return tuple(one.tracks for one in asked)
+
+    @property
     def total(self) -> float:
         """The return: the sum of the rewards."""
         return float(self.reward.sum())

@@ -63,8 +63,8 @@ class Evaluation:
     """Time from which the goal was held until the end, in successful episodes; None if there are none, or if the goal
     is to last until the time limit."""
     tracking_rms: float | None = _measure("shaft torque error, rms", "N*m")
-    """Root mean square of desired less delivered torque; None where the agent commands the voltage, and none of the
-    tracking measures exists."""
+    """Root mean square of desired less delivered torque, of the motors of which a torque is asked; None where there is
+    none, as where the agent commands the voltage or a position, and none of the tracking measures exists."""
     tracking_percent: float | None = _measure("shaft torque error / desired", "%")
     """The same, relative to the root mean square of the desired torque."""
     tracking_max: float | None = _measure("shaft torque error, largest", "N*m")
@@ -230,6 +230,8 @@ class Driven:
     """Force delivered to it [N or N*m]."""
     signals: dict[str, np.ndarray]
     """The family's."""
+    tracks: bool
+    """True if a torque was asked of it. If False, `desired` is the torque delivered at each step's end."""
 
     @property
     def work(self) -> float:
@@ -265,6 +267,7 @@ def driven_in(episode: Episode) -> list[Driven]:
                 np.append(episode.first_speeds[number], speed),
                 force,
                 shown,
+                episode.tracks[number],
             )
         )
     return made
@@ -276,19 +279,20 @@ def _measures(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]]) -
     How well the torque follows the desired one, which is held over an environment step; what the delivered one does to
     gears and bearings; what that asks of the supply; the work done.
     """
-    desired = [one.desired for each in driven for one in each]
     actual = [one.actual for each in driven for one in each]
     delivered = np.concatenate(actual)
+    tracked = [[one for one in each if one.tracks] for each in driven]
     found: dict[str, Any] = dict.fromkeys(("tracking_rms", "tracking_percent", "tracking_max", "tracking_lag"))
-    if all(one.command == "force" or one.actuators[0].commands()[one.command].actuator.tracks for one in episodes):
+    if all(tracked):
+        desired, followed = ([getattr(one, name) for each in tracked for one in each] for name in ("desired", "actual"))
         asked = np.concatenate(desired)
-        error = asked - delivered
+        error = asked - np.concatenate(followed)
         rms, scale = _root_mean_square(error), _root_mean_square(asked)
         found = {
             "tracking_rms": rms,
             "tracking_percent": 100 * rms / scale if scale > 0 else None,
             "tracking_max": float(np.abs(error).max()),
-            "tracking_lag": delay(desired, actual, episodes[0].timestep, len(driven[0])),
+            "tracking_lag": delay(desired, followed, episodes[0].timestep, len(tracked[0])),
         }
     duration = math.fsum(episode.time[-1] for episode in episodes) * len(driven[0])
     return {

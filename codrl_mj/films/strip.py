@@ -98,6 +98,7 @@ def _plot_torque(episode: Episode, axes: Any) -> list[Any]:
     lines = [
         axes.stairs(values, edges, baseline=None, color=colour, linewidth=line, label=label)
         for values, colour, label, line in ((desired, DESIRED, "desired", 1.0), (actual, ACTUAL, "actual", 2.0))
+        if label == "actual" or all(episode.tracks)
     ]
     limits = [name for name in _LIMITS if name in episode.actuator.Signals._fields] or ["saturated"]
     for name in limits:
@@ -121,11 +122,11 @@ def torque_label(task: str, actuator: ActuatorModel, motor: int) -> str:
 
 def _signal(actuator: ActuatorModel) -> tuple[str | None, str]:
     """The second plot's signal and its label: the voltage, or the family's first with a unit; None if there is none."""
-    names = [name for name in actuator.SIGNAL_UNITS if name in actuator.Signals._fields]  # type: ignore[attr-defined]
-    if not names:
-        return None, "u [V]" if isinstance(actuator, Ideal) else ""
-    name = "voltage" if "voltage" in names else names[0]
-    return name, "u [V]" if name == "voltage" else f"{name} [{actuator.SIGNAL_UNITS[name]}]"
+    fields: tuple[str, ...] = actuator.Signals._fields  # type: ignore[attr-defined]
+    if "voltage" in fields or isinstance(actuator, Ideal):
+        return None if isinstance(actuator, Ideal) else "voltage", "u [V]"
+    name = next((name for name in actuator.SIGNAL_UNITS if name in fields), None)
+    return name, f"{name} [{actuator.SIGNAL_UNITS[name]}]" if name else ""
 
 
 def _plot_signal(episode: Episode, axes: Any) -> list[Any]:
@@ -134,8 +135,8 @@ def _plot_signal(episode: Episode, axes: Any) -> list[Any]:
     name, _ = _signal(actuator)
     if name is None:
         axes.set_ylim(-1, 1)
-        kind = "an ideal" if isinstance(actuator, Ideal) else f"a {type(actuator).__name__}"
-        axes.text(0.02, 0, f"{kind} actuator has no voltage", va="center", fontsize=8, color="0.5")
+        shown = "an ideal actuator has" if isinstance(actuator, Ideal) else f"{type(actuator).__name__} shows"
+        axes.text(0.02, 0, f"{shown} no voltage", va="center", fontsize=8, color="0.5")
         return []
     values, limit = episode.signals[name], actuator.voltage_limit if name == "voltage" else None
     span = 1.2 * max(np.abs(values).max(), 1e-9)

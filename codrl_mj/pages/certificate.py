@@ -50,7 +50,7 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
         rows = [
             (
                 *(check.name, check.oracle, f"{check.samples:,}", f"{check.worst:.2g}", f"{check.tolerance:.2g}"),
-                *(check.margin, check.unit, check.where),
+                *(check.margin, check.unit, f"{check.where}. {check.fault}" if check.fault else check.where),
                 page.judged(check.passed, "passed" if check.passed else "FAILED"),
             )
             for check in own

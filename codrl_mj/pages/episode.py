@@ -45,6 +45,8 @@ class Shown(NamedTuple):
     """Whether the policy of its best evaluation acts."""
     summary: Any = None
     """What its folder says: a `RunSummary`."""
+    rank: str = ""
+    """How its return compares with those of the run's evaluation."""
 
 
 def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Shown:
@@ -137,7 +139,8 @@ def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Ma
 def _caption(one: Shown, named: bool) -> str:
     episode = one.episode
     over = f"{'ended' if episode.terminated else 'time limit'} at {episode.time[-1]:.2f} s"
-    return f"{one.name + ': ' if named else ''}seed {one.seed}, return {page.number(episode.total)}, {over}"
+    found = f"{one.name + ': ' if named else ''}seed {one.seed}, return {page.number(episode.total)}, {over}"
+    return f"{found}; {one.rank}" if one.rank else found
 
 
 def _lines(shown: Sequence[Shown], motors: list[str]) -> list[_MotorLine]:
@@ -168,8 +171,10 @@ def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
         unit = "force [N] or torque [N·m]" if force else "torque [N·m], of the ideal actuator force [N]"
     torque, error, current, voltage, power, warmth = ([] for _ in range(6))  # type: ignore[var-annotated]
     for line in lines:
-        torque += [line.curve("actual", line.actual, 1), line.curve("desired", line.desired, 0, dashed=True)]
-        error.append(line.curve("desired less actual", line.desired - line.actual, 4))
+        torque.append(line.curve("actual", line.actual, 1))
+        if line.tracks:
+            torque.append(line.curve("desired", line.desired, 0, dashed=True))
+            error.append(line.curve("desired less actual", line.desired - line.actual, 4))
         if line.has("current"):
             current.append(line.curve("current", line.signals["current"], 1, held=False))
         if line.has("current", "reference_current"):

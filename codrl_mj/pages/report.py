@@ -22,7 +22,15 @@ from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.runs import BEST, EPISODES, PROGRESS, finished, told_apart
 from codrl_mj.runs.files import check_page, read_json
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.runs.summaries import RunSummary, compare, read_reports, read_run
+from codrl_mj.runs.summaries import (
+    RunSummary,
+    compare,
+    rank,
+    read_evaluation,
+    read_reports,
+    read_run,
+    typical_seed,
+)
 from codrl_mj.training.folder import load_config
 from codrl_mj.training.history import learning_curves, read_episodes
 
@@ -34,7 +42,7 @@ def report(
     out: Path,
     *,
     which: str = "last",
-    seed: int = 0,
+    seed: int | None = None,
     trust: bool = False,
     filmed: bool = True,
     certificate: Path | None = None,
@@ -47,7 +55,7 @@ def report(
         runs: run folders, at least one; also unfinished and damaged ones.
         out: the page, an .html file.
         which: `last` or `best`: whose policy acts in the episode. An unfinished run has only its best so far.
-        seed: of the episode.
+        seed: of the episode; None: that of the evaluated episode with the median return, or 0 where there is none.
         trust: whether to import modules that a run folder names as its task, agent or actuator, which executes them.
         filmed: whether to film the episode.
         certificate: a `certificate.json`, or the folder of one; None: that in a run folder, if there is one.
@@ -64,7 +72,7 @@ def report(
     """
     if not runs:
         raise ValueError("runs: none was given; give one run folder or more")
-    if seed < 0:
+    if seed is not None and seed < 0:
         raise ValueError(f"seed = {seed}: must be >= 0")
     check_page(out)
     certified = _certificate(runs, certificate)
@@ -92,22 +100,31 @@ def report(
 
 
 def _run(
-    summary: RunSummary, name: str, which: str, seed: int, trust: bool, filmed: bool, on_part: Callable[[str], None]
+    summary: RunSummary,
+    name: str,
+    which: str,
+    given: int | None,
+    trust: bool,
+    filmed: bool,
+    on_part: Callable[[str], None],
 ) -> Shown:
     """A run with an episode, as far as there is one."""
+    best = which == "best" or not finished(summary.path)
+    evaluation = read_evaluation(summary.path, best)
+    seed = given if given is not None else typical_seed(evaluation) or 0
     try:
         config = load_config(summary.path, trust)
     except (ValueError, OSError, ImportError) as error:
         return Shown(name, None, None, None, str(error), seed, summary=summary)
     env = config.evaluation_env
-    best = which == "best" or not finished(summary.path)
     policy = summary.path / BEST if best else summary.path
     if not (policy / "policy.json").is_file():
         yet = "best policy" if finished(summary.path) else "policy yet"
         return Shown(name, env, None, None, f"the run has no {yet}: none was evaluated so far", seed, summary=summary)
     try:
         on_part(f"{name}: episode")
-        return show(name, env, load_policy(policy, trust), seed, filmed)._replace(best=best, summary=summary)
+        shown = show(name, env, load_policy(policy, trust), seed, filmed)
+        return shown._replace(best=best, summary=summary, rank=rank(evaluation, shown.episode.total))
     except Exception as error:  # environments and actuators of others raise what they like
         return Shown(name, env, None, None, f"{type(error).__name__}: {error}", seed, summary=summary)
 

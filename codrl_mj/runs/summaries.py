@@ -94,6 +94,31 @@ def find_runs(root: Path) -> list[RunSummary]:
     return sorted(found, key=lambda run: run.name)
 
 
+def typical_seed(evaluation: Mapping[str, Any] | None) -> int | None:
+    """Return the seed of the evaluated episode with the median return (of two, the lower); None if none is known."""
+    returns, conditions = ((evaluation or {}).get(name) for name in ("episode_returns", "conditions"))
+    seed = conditions.get("seed") if isinstance(conditions, Mapping) else None
+    if not isinstance(returns, list) or not returns or not isinstance(seed, int):
+        return None
+    if not all(isinstance(one, int | float) for one in returns):
+        return None
+    return seed + sorted(range(len(returns)), key=returns.__getitem__)[(len(returns) - 1) // 2]
+
+
+def rank(evaluation: Mapping[str, Any] | None, total: float) -> str:
+    """Return in words how an episode's return compares with those of an evaluation; nothing where there is none."""
+    if (seed := typical_seed(evaluation)) is None or evaluation is None:
+        return ""
+    returns = evaluation["episode_returns"]
+    median, worse = returns[seed - evaluation["conditions"]["seed"]], sum(one < total for one in returns)
+    return f"of {len(returns)} evaluated episodes {worse} returned less, the median {median:.3g} (seed {seed})"
+
+
+def read_evaluation(run: Path, best: bool) -> Mapping[str, Any] | None:
+    """Return the evaluation of a run's last policy, or of its best; None if there is none that can be read."""
+    return _mapping((run / BEST if best else run) / EVALUATION, "policy evaluation", [])
+
+
 def read_run(path: Path, name: str | None = None) -> RunSummary:
     """What a run folder says; it is called by its own name unless another is given."""
     if not (path / CONFIG).is_file():

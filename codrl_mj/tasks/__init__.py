@@ -28,9 +28,9 @@ def resolve_actuators(given: Any, task: Task) -> tuple[Any, ...]:
     count = len(task.motors)
     each = list(given) if isinstance(given, list | tuple) else [given] * count
     if len(each) != count:
-        raise ValueError(
-            f"actuator: {len(each)} actuators for the {count} motors of {task.name}: {', '.join(task.motors)}"
-        )
+        hint = "; a list with one for each environment is for codrl_mj.make_vec" * (count == 1)
+        there = f"{task.name} has {count} motor{'s' * (count > 1)} ({', '.join(task.motors)})"
+        raise ValueError(f"actuator: got {len(each)} actuators, but {there}{hint}")
     for at, one in enumerate(each):  # the task's own in the place of `default`
         if isinstance(one, Mapping) and one.get("name") == "default":
             each[at] = {**one, "name": task.default_actuator}

@@ -1,5 +1,6 @@
 """What a task declares against what its functions return, once, when it is made: compiled code relies on it."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,8 @@ def check_fields(task: Any) -> None:
         fine = names and all(isinstance(one, str) for one in names) and len({*names}) == len(names)
         _require(task, name, fine, "one or more names, each another")
     motors, forces, defaults = len(task.motors), task.forces, getattr(task.options, "_field_defaults", {"": None})
-    fine = all(isinstance(one, int | float) for one in defaults.values()) and len(defaults) == len(task.options._fields)
+    fine = all(isinstance(one, int | float) and not math.isnan(one) for one in defaults.values())
+    fine = fine and len(defaults) == len(task.options._fields)
     _require(task, "options", fine, "a typing.NamedTuple of numbers and flags that have defaults")
     _require(task, "paper", len(task.paper) in (0, motors), f"empty, or of {motors}: `motors`")
     fine = _are_numbers(task.max_force, (), (motors,)) and np.min(task.max_force) > 0.0

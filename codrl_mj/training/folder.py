@@ -14,7 +14,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from codrl_mj.actuators import label_of, labelled, trusting
-from codrl_mj.fields import differing
+from codrl_mj.fields import command, differing
 from codrl_mj.runs import (
     BEST,
     CHECKPOINT,
@@ -98,11 +98,25 @@ def unused(run: Path) -> bool:
     return {path.name for path in run.iterdir()} <= {LOCK, *(path.name for path in _leftovers(run))}
 
 
+def needs_trust(run: Path) -> bool:
+    """Return True if loading a run imports the module of somebody's own task, agent or actuator."""
+    try:
+        load_config(run)
+    except ValueError:  # also of a damaged run, which says so when it is loaded
+        return True
+    return False
+
+
+def resuming(run: Path) -> str:
+    """Return the command that continues a training."""
+    return command("train", "--resume", run, trust=needs_trust(run))
+
+
 def standing(run: Path) -> str:
     """What there is to go on from in the folder of a training that was broken off, and how."""
     if kept := checkpoints(run / CHECKPOINTS):
         step = max(int(named["step"]) for named in kept.values())
-        return f"Its last checkpoint is of step {step:,}: continue with codrl-mj train --resume {run}"
+        return f"Its last checkpoint is of step {step:,}: continue with {resuming(run)}"
     if (run / BEST / EVALUATION).exists():
         return f"It has no checkpoint to continue from, only its best policy so far, in {run / BEST}: start it anew"
     return "It had no checkpoint yet, and nothing of it is left: start it anew"

@@ -90,7 +90,7 @@ class Watcher(BaseCallback):
         stopping = bool(self._asked)
         self.boundary(stopping)
         if stopping:
-            told = f"stopped after {self.saved_steps:,} steps: continue with codrl-mj train --resume {self._out}"
+            told = f"stopped after {self.saved_steps:,} steps: continue with {folder.resuming(self._out)}"
             raise folder.TrainingStoppedError(told, self._asked[-1])
 
     def _on_step(self) -> bool:

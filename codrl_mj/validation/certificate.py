@@ -15,7 +15,7 @@ import mujoco
 from codrl_mj.physics import install_callbacks, motors
 from codrl_mj.tasks import OURS, TASKS, find_task
 from codrl_mj.validation import execution, own_model
-from codrl_mj.validation.table import Check, Skipped
+from codrl_mj.validation.table import REPORT, Check, Skipped
 
 GROUPS: dict[str, str] = {
     "dynamics": "Accelerations and single steps against the installed Gymnasium",
@@ -30,6 +30,8 @@ GROUPS: dict[str, str] = {
 WITHOUT_TASK = ("motor",)
 """Groups that are run once, whatever the tasks; and once more for every task that is not ours."""
 
+DIVERGED = "runs to its end"
+"""Name of the check that fails where a simulation breaks down."""
 PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "scipy", "numba", "control", "gym-electric-motor")
 
 
@@ -125,9 +127,26 @@ def _certify(
             if isinstance(outcome, Skipped):
                 skips.append(dataclasses.replace(outcome, group=group, task=task))
             else:
-                found.append(dataclasses.replace(outcome, group=group, task=task))
+                made = dataclasses.replace(outcome, group=group, task=task)
+                found.append(made if made.passed else dataclasses.replace(made, fault=made.fault or _fault(made)))
     on_part(len(parts), len(parts), "done")
     return Certificate(subject, tuple(found), tuple(skips), quick, time.perf_counter() - started)
+
+
+_OWN = f"an `advance` or a function of your own has to depend on its arguments alone; if it does, {REPORT}"
+_RUN = f"if it passes on a gentler run in Task.trials, this one was too violent; if not, {REPORT}"
+_TWIN = "your model and your twin differ: compare masses, gravity and the integrator"
+_FAULTS = {"dynamics": _TWIN, "trajectories": _TWIN, "convergence": _RUN, "energy": _RUN}
+"""Whose fault it is if a check of somebody's own task or model fails, by its group."""
+
+
+def _fault(check: Check) -> str:
+    """Return whose fault a failed check is, as far as its task and group tell."""
+    if not check.task or check.task in [task.name for task in OURS]:
+        return REPORT
+    if check.name == DIVERGED or check.name.startswith("stable: "):
+        return "your model or motor is not stable at this step: shorten it, or slow down the motor's loop"
+    return _FAULTS.get(check.group, _OWN)
 
 
 def _to_the_end(outcomes: Outcomes) -> Outcomes:
@@ -137,7 +156,7 @@ def _to_the_end(outcomes: Outcomes) -> Outcomes:
         yield Skipped("the rest of the group", f"{error}: pip install 'codrl-mj[validate]'")
     except ArithmeticError as error:  # a SimulationDivergedError is one
         reason = f"{type(error).__name__}: {error}"
-        yield Check("runs to its end", "itself", 0.0, "", 1, math.inf, reason)
+        yield Check(DIVERGED, "itself", 0.0, "", 1, math.inf, reason)
 
 
 def validate(

@@ -20,6 +20,9 @@ ORDER_TOLERANCE = 0.1
 1; an error that does not vanish, such as a parameter off by 1 %, bends the line until its slope is near 0."""
 
 
+REPORT = "this is a fault of codrl_mj, or of this version of MuJoCo or Gymnasium; please report it"
+
+
 @dataclasses.dataclass(frozen=True)
 class Check:
     """A row of the table, whose name and oracle may hold words in braces; once it was made, what was found."""
@@ -44,6 +47,8 @@ class Check:
     """The task or model it was run on; empty where it needs none."""
     plots: tuple[Plot, ...] = ()
     """What to look at."""
+    fault: str = ""
+    """Of a check that failed: whose fault that is, and what to do."""
 
     @property
     def passed(self) -> bool:

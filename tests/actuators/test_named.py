@@ -257,8 +257,8 @@ def test_every_motor_has_its_own_variation_of_its_own_actuator():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (["paper"], "1 actuators for the 2 motors of pair: left, right"),
-        (["paper"] * 3, "3 actuators for the 2 motors of pair: left, right"),
+        (["paper"], r"1 actuators, but pair has 2 motors \(left, right\)"),
+        (["paper"] * 3, r"3 actuators, but pair has 2 motors \(left, right\)"),
         (["paper", Lag()], r"actuators of several families \(Actuator, Lag\)"),
     ],
 )

@@ -52,7 +52,7 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
         ),
         ({"timestep": 0.015}, "timestep = 0.015 s does not divide cartpole's environment step of 0.02 s"),
         ({"inner_steps": 2, "timestep": 0.01}, "inner_steps = 2 and timestep = 0.01: give one of them, not both"),
-        ({"centre_radius": 0.1}, "unknown option 'centre_radius' of cartpole: it has center_radius"),
+        ({"centre_radius": 0.1}, "'centre_radius' of cartpole: did you mean 'center_radius'? it has center_radius, "),
         ({"center_radius": -0.1}, "center_radius = -0.1: must be a number > 0"),
         ({"center_radius": NAN}, "center_radius = nan: must be a number > 0"),
         ({"center_radius": "0.1"}, "center_radius = '0.1': must be a number > 0"),

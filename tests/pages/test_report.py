@@ -29,6 +29,8 @@ from tests.pages.parsed import Parsed, check_alone
 
 RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
 PENDULUM = RUNS / "pendulum"
+MEDIAN = 1_000_001
+"""Seed of the lower of the two returns of its evaluation, of the seeds 1000000 and 1000001."""
 
 
 @pytest.fixture(scope="module")
@@ -50,14 +52,14 @@ def test_a_report_is_one_small_file_with_every_section(text):
     parsed = check_alone(text)
     assert {"learning", "evaluation", "episode", "loop", "settings"} <= set(parsed.ids)
     assert len(text) < 5_000_000
-    assert "seed 0" in parsed.text
+    assert f"seed {MEDIAN}" in parsed.text
     video = re.search(r'src="data:video/mp4;base64,([^"]+)"', text)[1]
     assert base64.b64decode(video[:64])[4:8] == b"ftyp"
 
 
 def test_the_plots_show_the_episode_that_the_film_shows(text):
     """The oracle: the same episode, run anew."""
-    (episode,) = run_episodes(load_policy(PENDULUM), load_config(PENDULUM).evaluation_env.make, 1, 0)
+    (episode,) = run_episodes(load_policy(PENDULUM), load_config(PENDULUM).evaluation_env.make, 1, MEDIAN)
     drawn = curves(text, "Torque at the shaft")
     arm = episode.actuator.arm_radius
     np.testing.assert_allclose(drawn["actual"][1][:-1], episode.trace["actual_force"] * arm, rtol=1e-6)
@@ -80,7 +82,7 @@ def test_the_papers_current_loop_has_its_margins_and_its_step(text):
     titles = {data["title"] for data in parsed.data}
     assert {"Bode: gain", "Bode: phase", "A small step of the current, the shaft held"} <= titles
     assert "phase margin" in parsed.text
-    assert "seed 0" in parsed.text.partition("An episode")[2]
+    assert f"seed {MEDIAN}" in parsed.text.partition("An episode")[2]
 
 
 def test_it_says_which_loops_it_leaves_out_and_why_there_is_none():
@@ -116,6 +118,42 @@ def test_without_opengl_there_is_no_film_and_everything_else(tmp_path, monkeypat
     assert "No film of pendulum: RenderingUnavailableError: cannot make an OpenGL context" in parsed.text
     assert "<video" not in text
     assert len(parsed.data) > 8
+
+
+def evaluated(run, returns, folder="."):
+    """Write an evaluation with these returns into a run."""
+    content = json.loads((PENDULUM / "evaluation.json").read_text())
+    content.pop("sha256", None)
+    conditions = {"env": load_config(PENDULUM).env.as_mapping(), "seed": 1_000_000}
+    changed = content | {"episode_returns": returns, "conditions": conditions}
+    (run / folder / "evaluation.json").write_text(json.dumps(changed))
+
+
+def test_the_episode_is_the_median_one_of_the_evaluation_or_says_how_rare_it_is(run):
+    evaluated(run, [-900.0, -200.0, -1500.0, -300.0, -1000.0])
+    assert "seed 1000000, return" in of(run).text  # the median, -900
+    text = of(run, seed=7).text
+    (episode,) = run_episodes(load_policy(run), load_config(run).evaluation_env.make, 1, 7)
+    worse = sum(one < episode.total for one in (-900.0, -200.0, -1500.0, -300.0, -1000.0))
+    assert "seed 7, return" in text
+    assert f"of 5 evaluated episodes {worse} returned less, the median -900 (seed 1000000)" in text
+    evaluated(run, [])
+    assert "seed 0, return" in of(run).text
+    assert "evaluated episodes" not in of(run).text
+
+
+def test_of_the_best_policy_it_is_the_median_of_its_own_evaluation(run, capsys):
+    (run / "best").mkdir()
+    for name in ("policy.json", "policy.safetensors"):
+        shutil.copy(PENDULUM / name, run / "best")
+    evaluated(run, [-1.0, -2.0, -3.0], "best")
+    assert "seed 1000001, return" in of(run, which="best").text
+    evaluated(run, [-7.0, -8.0, -9.0])
+    for which, median in (("best", "-2 (seed 1000001)"), ("last", "-8 (seed 1000001)")):
+        assert main(["replay", str(run), "--which", which, "--out", str(run / "r.html")]) == 0
+        assert f"returned less, the median {median}" in capsys.readouterr().out
+    assert main(["replay", str(run), "--actuator", "weaker", "--out", str(run / "r.html")]) == 0
+    assert "evaluated" not in capsys.readouterr().out  # another environment
 
 
 def test_an_unfinished_run_says_so_and_shows_what_there_is(run):

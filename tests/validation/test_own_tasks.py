@@ -1,0 +1,155 @@
+"""Of a task of one's own: checks whose conditions do not hold are left out, and a failed one says whose fault it is."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+import codrl_mj
+from codrl_mj.actuators import Actuator, CurrentLoop
+from codrl_mj.validation import validate, validate_model
+from codrl_mj.validation.mutations import wrong_model
+from codrl_mj.validation.table import REPORT
+from tests.motorised.models import arm
+
+XML = """
+<mujoco>
+  <option timestep="0.001" integrator="RK4"/>
+  <worldbody>
+    <body pos="0 0 .2">
+      <joint name="shaft" axis="0 0 1" damping="1e-5"/>
+      <geom type="capsule" fromto="0 0 0 .11 0 0" size=".005" mass=".04"/>
+      <body name="rod" pos=".11 0 0">
+        <joint name="hinge" axis="1 0 0" damping="1e-6"/>
+        <geom type="capsule" fromto="0 0 0 0 0 .16" size=".004" mass=".03"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="shaft"/></actuator>
+</mujoco>
+"""
+"""A small Furuta pendulum, as somebody measured it; 0.8 N m turn it through a radian in 30 ms."""
+COUNT = itertools.count()
+
+
+def furuta(folder, changes=(), **fields):
+    """A task of that model, in whose text parts are replaced."""
+    text = XML
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    number = next(COUNT)
+    (path := folder / f"furuta{number}.xml").write_text(text)
+    given = {
+        "name": f"own_furuta{number}",
+        "env_id": f"own/Furuta{number}-v0",
+        "asset": str(path),
+        "max_force": 0.8,
+        "step_duration": 0.02,
+        "motor_inner_steps": 20,
+        "ideal_inner_steps": 20,
+        "max_episode_steps": 250,
+        "integrators": ("rk4",),
+        "state_names": ("arm [rad]", "rod [rad]", "arm_dot [rad/s]", "rod_dot [rad/s]"),
+        "observation_names": ("arm", "rod"),
+        "initial_bounds": bounds,
+        "initial_state": start,
+        "observation": observation,
+        "reward": reward,
+        "terminated": terminated,
+    }
+    return codrl_mj.register(codrl_mj.Task(**given | fields))
+
+
+def bounds(options):
+    return np.array([-0.05, 3.09, -0.05, -0.05]), np.array([0.05, 3.19, 0.05, 0.05])
+
+
+def start(draws):
+    return draws[0], draws[1], draws[2], draws[3]
+
+
+def observation(state):
+    return state[0], state[1]
+
+
+def reward(state, force, next_state, options):
+    return -next_state[1]
+
+
+def terminated(state):
+    return np.abs(state[0]) > 9.0
+
+
+def judged(task):
+    return validate(task.name, quick=True, groups=("convergence", "energy"))
+
+
+RUBBING = ('damping="1e-6"', 'damping="1e-6" frictionloss="1e-4"')
+ALL = {"convergence: all checks", "energy: the balances of a whole run"}
+TWO = {f"energy: order, {name} balance, rk4" for name in ("mechanical", "whole")}
+CASES = {
+    # what is asked of the model -> which checks do not apply, and why
+    "tiny damping": ((), {}, set(), ""),
+    "none": ((('damping="1e-5"', ""), ('damping="1e-6"', "")), {}, set(), ""),
+    "Euler": (((' integrator="RK4"', ""),), {"integrators": ("euler",)}, set(), ""),
+    "friction": ((RUBBING,), {}, ALL, "friction or another constraint acts in the run"),
+    "gravity compensation": (
+        (('<body name="rod"', '<body name="rod" gravcomp="1"'),),
+        {},
+        TWO,
+        "the model has gravity compensation, whose energy no balance knows: leave that out",
+    ),
+    "another actuator": (
+        (("</actuator>", '<position joint="hinge" kp="0.1"/></actuator>'),),
+        {},
+        TWO,
+        "the model has actuators besides the task's motors, whose energy no balance knows",
+    ),
+    "quadratic drag": (
+        (('timestep="0.001"', 'timestep="0.001" density="1000" viscosity="0.001"'),),
+        {},
+        {"convergence: order, rk4, ideal actuator"},
+        "textbook steps: slope .*, where 4 was promised: the run is too violent for these steps, or not smooth",
+    ),
+}
+
+
+@pytest.mark.parametrize(("changes", "fields", "left_out", "reason"), CASES.values(), ids=CASES)
+def test_a_model_of_ones_own_fails_no_check_whose_conditions_it_does_not_meet(
+    tmp_path, changes, fields, left_out, reason
+):
+    found = judged(furuta(tmp_path, changes, **fields))
+    assert found.passed, [check.where for check in found.checks if not check.passed]
+    skips = {f"{one.group}: {one.name}": one.reason for one in found.skipped if "equations of motion" not in one.name}
+    assert skips.keys() == left_out
+    for text in skips.values():
+        with pytest.raises(ValueError, match=reason):
+            raise ValueError(text)
+
+
+def test_a_fault_of_ours_is_still_found_in_somebodys_task_and_said_to_be_ours(tmp_path):
+    task = furuta(tmp_path)
+    with wrong_model(("timestep", None, 1.001)):
+        found = judged(task)
+    failed = {check.name: check.fault for check in found.checks if not check.passed}
+    assert "textbook steps of that size have this order: " + REPORT in failed["order, rk4, ideal actuator"]
+    assert "gentler run in Task.trials" in failed["order, mechanical balance, rk4"]
+
+
+def test_an_unstable_motor_is_its_owners():
+    unstable = Actuator(controller=CurrentLoop(kp=200.0))
+    model = codrl_mj.motorise(arm("implicitfast"), {".*": unstable}, allow_unstable=True).compile()
+    found = validate_model(model, quick=True).checks
+    failed = [one.fault for one in found if one.name.startswith("stable: ")]
+    assert failed == ["your model or motor is not stable at this step: shorten it, or slow down the motor's loop"] * 2
+
+
+def test_of_our_tasks_nobody_else_is_to_blame():
+    with wrong_model(("body_mass", -1, 1.001)):
+        found = validate("pendulum", quick=True, groups=("dynamics",))
+    assert {check.fault for check in found.checks if not check.passed} == {REPORT}
+    assert {check.fault for check in found.checks if check.passed} <= {""}
+    assert REPORT in str(found.as_mapping()["checks"])
+    assert "fault" in {field.name for field in dataclasses.fields(found.checks[0])}
