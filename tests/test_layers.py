@@ -36,7 +36,7 @@ ALLOWED = {
         *("envs.worlds", "own_code", "tasks"),
     },
     "making": {"envs", "envs.config", "envs.worlds", "foreign"},
-    "suite": {"actuators", "envs", "envs.config", "physics", "tasks"},
+    "suite": {"actuators", "envs", "envs.config", "foreign", "physics", "tasks"},
     "agents": {"actuators", "envs", "envs.config", "fields", "kept", "own_code", "physics"},
     "runs": set(),
     "runs.files": set(),

@@ -313,8 +313,8 @@ def _related_family(family: str, kind: Any) -> Any:
     if not (issubclass(other, kind) or issubclass(kind, other)):
         raise ValueError(
             f"family = {family!r}: cannot be set over an actuator of the family {family_name(kind)!r}, whose fields "
-            f"are others. Name an actuator of a related family (a motor of `codrl-mj motor list` or a datasheet is a "
-            f"'drive', which can become a 'servo'), or give all fields of the {family!r} without a name"
+            f"are others. Name an actuator of a related family, or give all fields of the {family!r} without a name. "
+            "Motors of `codrl-mj motor list` and of datasheets are drives, which can become servos"
         )
     return other
 
