@@ -15,6 +15,7 @@ import mujoco
 from codrl_mj.physics import install_callbacks, motors
 from codrl_mj.tasks import OURS, TASKS, find_task
 from codrl_mj.validation import execution, own_model
+from codrl_mj.validation.compare import is_ours
 from codrl_mj.validation.table import REPORT, Check, Skipped
 
 GROUPS: dict[str, str] = {
@@ -142,7 +143,7 @@ _FAULTS = {"dynamics": _TWIN, "trajectories": _TWIN, "convergence": _RUN, "energ
 
 def _fault(check: Check) -> str:
     """Return whose fault a failed check is, as far as its task and group tell."""
-    if not check.task or check.task in [task.name for task in OURS]:
+    if not check.task or (check.task in TASKS and is_ours(TASKS[check.task])):
         return REPORT
     if check.name == DIVERGED or check.name.startswith("stable: "):
         return "your model or motor is not stable at this step: shorten it, or slow down the motor's loop"

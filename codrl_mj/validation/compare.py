@@ -33,6 +33,11 @@ def differences(task: Task, ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
     return gap / np.maximum(1.0, np.abs(oracle))
 
 
+def is_ours(task: Task) -> bool:
+    """Return True if the task comes with this package."""
+    return task.reward.__module__.startswith("codrl_mj.")
+
+
 def without_oracle(task: Task) -> str:
     """Why a task cannot be compared with Gymnasium step by step; empty if it can."""
     several = "it has several motors, and commands are made for one" if len(task.motors) > 1 else ""

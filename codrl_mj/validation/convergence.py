@@ -35,6 +35,7 @@ from codrl_mj.validation.compare import (
     actuators_of,
     forces_of,
     gymnasium_equations,
+    is_ours,
     physics_of,
 )
 from codrl_mj.validation.table import ORDER_TOLERANCE, REPORT, Case, Check, Family, Skipped, check, of_order, order
@@ -176,7 +177,7 @@ def analogues(task: Task) -> tuple[Actuator, ...]:
 def halvings(task: Task, most: int = 4) -> range:
     """Return how many times more the steps of a run are halved, in turn, until its errors show an order."""
     first = 2 if task.trials is None else 0  # in a run that nobody chose the first steps are finer
-    return range(first, first + (1 if task in OURS else most + 1), 2)
+    return range(first, first + (1 if is_ours(task) else most + 1), 2)
 
 
 def refined(task: Task, judged: Callable[[int], Case], most: int = 4) -> Case:
@@ -188,13 +189,13 @@ def refined(task: Task, judged: Callable[[int], Case], most: int = 4) -> Case:
     return case
 
 
-def blamed(task: Task, outcome: Check, promised: float, steps: np.ndarray, errors: Callable[[], list[float]]) -> Any:
+def blamed(task: Task, outcome: Check, judged: Callable[[int], tuple[float, str]], promised: float) -> Check | Skipped:
     """Return a failed check of somebody's task with whose fault it is: the run's, if textbook steps fail it as well."""
-    if outcome.passed or task in OURS:
+    if outcome.passed or is_ours(task):
         return outcome
-    distance, found = Family("textbook steps", steps, np.array(errors()), 1e-12).judged(promised)
+    distance, found = min(map(judged, halvings(task)))
     if distance <= ORDER_TOLERANCE:
-        return dataclasses.replace(outcome, fault=f"textbook steps of that size have this order: {REPORT}")
+        return dataclasses.replace(outcome, fault=f"textbook steps of such sizes have this order: {REPORT}")
     why = f"{found}, where {promised:g} was promised: the run is too violent for these steps, or not smooth"
     return Skipped(outcome.name, f"{why}. Name a gentler one in Task.trials, or a smaller max_force")
 
@@ -261,9 +262,10 @@ def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
     yield refined(task, judged)
 
 
-def _textbook(solved: Any, solution: np.ndarray, counts: np.ndarray) -> list[float]:
-    """Return errors of textbook steps of the same equations."""
-    return [_error(solved(int(count)), solution) for count in counts]
+def _textbook(task: Task, solved: Any, solution: np.ndarray, counts: Any, promised: float, finer: int) -> Any:
+    """Return how far textbook steps of the same equations are from the promised order, and the finding in words."""
+    errors = [_error(solved(int(count)), solution) for count in counts(finer)]
+    return Family("textbook steps", task.step_duration / counts(finer), np.array(errors), 1e-12).judged(promised)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
@@ -279,20 +281,15 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     else:
         equations, whose, named = gymnasium_equations(task), f"the equations of {task.oracle}", task.oracle
     start, forces, _ = free_run(task)
-    ideal, finest = actuators_named("ideal", task), halvings(task)[-1]
-    for case, actuators in (("ideal actuator", ideal), ("motor in the loop", analogues(task))):
+    for case, actuators in (("ideal actuator", actuators_named("ideal", task)), ("motor in the loop", analogues(task))):
         solved = functools.partial(solve, task, equations, start, forces, actuators)
         solution, motors = solved(), [one.motor for one in actuators if isinstance(one, Actuator)]
         said = whose if case == "ideal actuator" else f"{whose} and of the motor"
         for integrator in task.integrators:
             fourth = integrator == "rk4" and not motors
             promised, counts = 4.0 if fourth else 1.0, functools.partial(_counts, task, fourth, motors, quick=quick)
-
-            def errors(
-                solved: Any = solved, solution: Any = solution, counts: Any = counts, fourth: Any = fourth
-            ) -> Any:
-                return [_error(solved(int(count), fourth), solution) for count in counts(finest)]
-
+            steps = functools.partial(solved, fourth=fourth)
+            textbook = functools.partial(_textbook, task, steps, solution, counts, promised)
             for outcome in order_in_the_step(task, case, integrator, actuators, solution, counts, promised, whose=said):
-                yield blamed(task, outcome, promised, task.step_duration / counts(finest), errors)
+                yield blamed(task, outcome, textbook, promised)
     yield from rate_in_the_bandwidth(task, quick, whose=named)

@@ -32,8 +32,8 @@ from codrl_mj.actuators import Actuator, ActuatorModel, Motor
 from codrl_mj.own_code import asset_path
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.physics import Plant, SimulationDivergedError, hills, trace_names
-from codrl_mj.tasks import OURS, Task, find_task
-from codrl_mj.validation.compare import STAND_IN, actuators_named, forces_of, gymnasium_equations, physics_of
+from codrl_mj.tasks import Task, find_task
+from codrl_mj.validation.compare import STAND_IN, actuators_named, forces_of, gymnasium_equations, is_ours, physics_of
 from codrl_mj.validation.convergence import (
     analogues,
     free_run,
@@ -308,7 +308,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     if reason:
         yield Skipped("the balances of a whole run", reason)
         return
-    unknown = "" if task in OURS else unnamed(task)
+    unknown = "" if is_ours(task) else unnamed(task)
     for integrator in task.integrators:
         for outcome in balances(task, integrator, quick, unknown):
             yield Skipped(outcome.name, unknown) if unknown and "electrical" not in outcome.name else outcome

@@ -134,7 +134,7 @@ def test_a_fault_of_ours_is_still_found_in_somebodys_task_and_said_to_be_ours(tm
     with wrong_model(("timestep", None, 1.001)):
         found = judged(task)
     failed = {check.name: check.fault for check in found.checks if not check.passed}
-    assert "textbook steps of that size have this order: " + REPORT in failed["order, rk4, ideal actuator"]
+    assert "textbook steps of such sizes have this order: " + REPORT in failed["order, rk4, ideal actuator"]
     assert "gentler run in Task.trials" in failed["order, mechanical balance, rk4"]
 
 
