@@ -121,7 +121,7 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
         ("evaluate run --task pendulum", "run was trained for cartpole"),
         ("evaluate run --agent dqn", "run was trained by ppo: leave --agent out"),
         ("evaluate alone", "name its task with --task"),
-        ("evaluate alone --task pendulum", "Unexpected observation shape"),
+        ("evaluate alone --task pendulum", "observation_space: the policy was trained with Box"),
         ("evaluate alone --task cartpole --which best", "leave --which out"),
         # a zip does not say what it is, and is loaded only on trust
         ("evaluate model.zip --task cartpole --agent ppo", "Pass --trust if that author is you"),
