@@ -247,7 +247,9 @@ def _shaft_start(
         gain = per_volt
     else:
         start["torque_constant"] = gain / ratio
-    torque = max(drive * gain, 1e-9)
+    # Without an input, as in a free swing, what is known to pull says how large torques are.
+    held = max(known.get("mgl", 0.0), abs(known.get("constant_torque", 0.0)))
+    torque = max(drive * gain if drive * gain > 1e-3 * held else held, 1e-9)
     start |= {
         "inertia": factors["inertia"] * gain,
         "mgl": factors["mgl"] * gain,

@@ -239,8 +239,8 @@ def _completed(estimates: list[Estimate], given: Mapping[str, float], defaults: 
         status, why = whole.status, whole.why
         if status in USABLE and not high - value <= WIDEST * value:
             status = "refused"
-            why = f"of an inertia of {whole.value:.4g} kg*m^2 in all, {load:.4g} is said to be the load's"
-            why += ": too little is left"
+            share = 100.0 * (high - value) / max(value, 1e-300)
+            why = f"less the load's {load:.4g}, the inertia of {whole.value:.4g} kg*m^2 is known to {share:.3g} % only"
         ends = max(low, 0.0), max(high, 0.0)
         named["rotor_inertia"] = Estimate("rotor_inertia", max(value, 0.0), *ends, status, why)
     return [named[name] for name in PARAMETERS if name in named]

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from codrl_mj.identify import Log, identify, trust
 from codrl_mj.identify.estimate import Fit
@@ -171,6 +172,18 @@ def test_each_measurement_counts_once_whatever_its_name(fitted, held_out, left):
 def test_logs_that_are_all_held_out_are_refused(swings):
     with pytest.raises(ValueError, match="swing0, swing1: all are held out, too"):
         identify(swings, "pendulum", held_out=swings)
+
+
+def test_a_free_swing_of_a_known_weight_tells_its_inertia():
+    """Without any torque, by scipy: mgl/J is 64.1 1/s^2, and the damping 0.3 1/s of J."""
+    time = np.arange(0.0, 3.0, 2e-3)
+    swing = solve_ivp(
+        lambda _, y: (y[1], -64.1 * np.sin(y[0]) - 0.3 * y[1]), (0.0, 3.0), (1.0, 0.0), "RK45", time, rtol=1e-9
+    )
+    signals = {"position": np.round(swing.y[0] / 1e-3) * 1e-3, "torque": np.zeros(len(time))}
+    found = identify([Log("free", time, signals, {"position": 1e-3})], "pendulum", {"mgl": 3.6})
+    near(found, {"inertia": 3.6 / 64.1, "viscous_friction": 0.3 * 3.6 / 64.1}, 0.02)
+    assert found["inertia"].status == "identified"
 
 
 @pytest.mark.matrix
