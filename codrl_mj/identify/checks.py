@@ -7,13 +7,25 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.identify.balances import Balance, effort_lag, torque_balance, velocity_lag, voltage_balance
-from codrl_mj.identify.log import LONGEST_STEP, SIGNALS, Finding, Log, find_resolution, moves, replaced
+from codrl_mj.identify.log import (
+    LONGEST_STEP,
+    SIGNALS,
+    Finding,
+    Log,
+    counts_per_turn,
+    find_resolution,
+    moves,
+    obstacle,
+    replaced,
+    turn_jumps,
+)
 from codrl_mj.identify.parameters import PARAMETERS
 
 _DROPPED = 1.5  # median steps, from which on rows are missing
 _MOST_LISTED = 10
-_MOST = {"voltage": 1e3, "bus": 1e3, "current": 1e3, "velocity": 2e4, "torque": 1e4}
-"""In SI: beyond the largest motors of robots, and beyond 190,000 rpm."""
+_MOST = {"duty": 1.1, "voltage": 1e3, "bus": 1e3, "current": 1e3, "velocity": 2e4, "torque": 1e4}
+"""In SI: a share with its rounding; beyond the largest motors of robots, and beyond 190,000 rpm."""
+_MEASURED = "position", "velocity", "current", "torque"
 FACTORS = {
     "degrees for radians": 180.0 / math.pi,
     "rpm for rad/s": 30.0 / math.pi,
@@ -81,6 +93,13 @@ def name_of_factor(ratio: float, angle: bool = True) -> str:
 
 
 @_needs("")
+def _obstacle(seen: Seen) -> Iterator[Finding]:
+    """Find what a fit of this log alone would refuse."""
+    if found := obstacle([seen.log]):
+        yield found
+
+
+@_needs("")
 def _times(seen: Seen) -> Iterator[Finding]:
     """Gaps, dropped rows, jitter, and stamps in another unit."""
     log, usual, rows = seen.log, seen.log.step, seen.log.row_numbers
@@ -116,6 +135,8 @@ def _signals(seen: Seen) -> Iterator[Finding]:
     """Each signal by itself; only what a sensor sees is clipped or spoiled, others rest where they like."""
     for signal in seen.log.signals:
         yield from _resolution(seen.log, signal)
+        if signal in _MEASURED:
+            yield from _repeated(seen.log, signal)
         if signal in ("current", "torque", "velocity"):
             yield from _saturation(seen.log, signal)
             yield from _outliers(seen.log, signal)
@@ -135,6 +156,22 @@ def _resolution(log: Log, signal: str) -> Iterator[Finding]:
         }
         remedy = remedies.get(signal, "measure in a smaller range, or drive harder")
         yield Finding("warning", "resolution", None, text, remedy)
+
+
+def _repeated(log: Log, signal: str) -> Iterator[Finding]:
+    """Find a signal that is read less often than rows are written, so that rows repeat what was read before."""
+    steps = np.diff(log.signals[signal])
+    changes = np.flatnonzero(steps)
+    if len(changes) < 20:
+        return
+    # A coarse sensor repeats its value too, but then moves on by a step or two of its resolution.
+    every, size = float(np.median(np.diff(changes))), float(np.median(np.abs(steps[changes])))
+    if every >= 2.0 and size > 2.5 * log.resolution.get(signal, 0.0):
+        text = (
+            f"{signal} changes in every {every:.0f}th row only, by {size:.3g} {SIGNALS[signal]}: rows repeat old values"
+        )
+        remedy = "log a row when a value is read, or leave out the rows that repeat it"
+        yield Finding("warning", "repeated", int(log.row_numbers[changes[0] + 1]), text, remedy)
 
 
 def _saturation(log: Log, signal: str) -> Iterator[Finding]:
@@ -181,9 +218,8 @@ def _outliers(log: Log, signal: str) -> Iterator[Finding]:
 @_needs("position")
 def _wrapped(seen: Seen) -> Iterator[Finding]:
     """A position that jumps by a turn."""
-    steps = np.diff(seen.log.signals["position"])
-    jumps = np.flatnonzero(np.abs(np.abs(steps) - 2.0 * np.pi) < 0.1 * 2.0 * np.pi)
-    if jumps.size and np.mean(np.abs(steps) > np.pi / 2.0) <= 0.2:
+    jumps = turn_jumps(seen.log.signals["position"], 2.0 * math.pi)
+    if jumps.size:
         text = f"the position jumps by a turn, {jumps.size} times, first here"
         remedy = "write position=unwrap(column, 2*pi):rad, or unwrap(column, 360):deg"
         yield Finding("error", "wrapped", int(seen.log.row_numbers[jumps[0] + 1]), text, remedy)
@@ -196,7 +232,8 @@ def _sizes(seen: Seen) -> Iterator[Finding]:
         largest, unit = float(np.quantile(np.abs(seen.log.signals[signal]), 0.99)), SIGNALS[signal]  # not an outlier
         if largest > _MOST[signal]:
             text = f"the {signal} is up to {largest:.4g} {unit}, must be at most {_MOST[signal]:g} {unit} on a bench"
-            yield Finding("error", "unit", None, text, f"correct its unit, such as {signal}=column:m{unit}")
+            remedy = f"correct its unit, such as {signal}=column:{f'm{unit}' if unit else 'percent'}"
+            yield Finding("error", "unit", None, text, remedy)
     if not seen.log.has("voltage"):
         return
     log, voltage = seen.log, np.abs(seen.log.signals["voltage"])
@@ -231,9 +268,7 @@ def _degrees(seen: Seen) -> Iterator[Finding]:
         count, of_radians = round(turns), 2.0 * math.pi / step
         if abs(turns - count) < 1e-6 * turns and abs(of_radians - round(of_radians)) > 1e-3:
             text = f"the position's steps of {step:.4g} are 1/{count} of 360, not of 2 pi: is it in degrees?"
-            decimal = round(step / 10.0 ** math.floor(math.log10(step)), 5) in (1.0, 2.0, 2.5, 5.0)
-            encoder = not decimal and (count % 100 == 0 or count & (count - 1) == 0)
-            yield Finding("error" if encoder else "warning", "unit", None, text, remedy)
+            yield Finding("error" if counts_per_turn(step, 360.0) else "warning", "unit", None, text, remedy)
 
 
 @_needs("position velocity moves")

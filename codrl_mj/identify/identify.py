@@ -10,16 +10,13 @@ import numpy as np
 
 from codrl_mj.fields import check_names
 from codrl_mj.identify.estimate import Fit, fitted, refit, refitted, search
-from codrl_mj.identify.log import SEGMENT, Log, moves, shifted
+from codrl_mj.identify.log import SEGMENT, Log, moves, obstacle, shifted, usage
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import ESTIMABLE, OF_RIG, PARAMETERS
 from codrl_mj.identify.result import Identified, Prediction, fitted_traces, missing, predict
 from codrl_mj.identify.trust import correlations, judged
 
-INPUTS = "torque", "current", "voltage"  # what drives the shaft: the nearest to it that all logs that move have
-OUTPUTS = "position", "velocity"  # what a simulation is compared with
 STEPS_OF_A_PART = 8 + 4
-RAREST = 0.05  # rows that are farther apart [s] say too little within the time that is foretold
 
 
 def identify(
@@ -56,7 +53,7 @@ def identify(
     """
     given = checked(logs, rig, known or {}, friction, estimated, segment, base)
     rig = rig or ("pendulum" if "mgl" in given else "free")
-    electrical, moving, driven_by, output = _uses(logs)
+    electrical, moving, driven_by, output = usage(logs)
     total = STEPS_OF_A_PART * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (friction == "auto")
     done = itertools.count(1)
 
@@ -122,7 +119,7 @@ def checked(
     # of a motor with a gear that too: otherwise its numbers would be those of the output
     ratio = drive.motor.gear_ratio if isinstance(drive, Drive) else 1.0
     known = {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **(known or {})}
-    electrical, moving, driven_by, output = _uses(logs)
+    _, moving, driven_by, output = usage(logs)
     if not segment >= 0.05:
         raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
     if not logs:
@@ -138,12 +135,9 @@ def checked(
                 f"known {name} = {value!r}: must be from {parameter.least:g} to {parameter.most:g} "
                 f"{parameter.unit}; give {parameter.what}".strip()
             )
-    if not electrical and driven_by is None:
+    if found := obstacle(logs):
         have = "; ".join(f"{log.name}: {', '.join(log.signals) or 'nothing'}" for log in logs)
-        raise ValueError(
-            f"logs tell nothing ({have}): give voltage and current for the winding, or torque, current or voltage with "
-            "a position or velocity that moves for the shaft"
-        )
+        raise ValueError(f"{found.message}; {found.remedy} (logs and their signals: {have})")
     twice = sorted({*known} & {*estimated})
     if twice:
         raise ValueError(f"{', '.join(twice)}: both known and estimated, must be one of them; leave the other out")
@@ -153,11 +147,6 @@ def checked(
     if moving and not output:
         have = "; ".join(f"{log.name}: {'position' if log.has('position') else 'velocity'}" for log in moving)
         raise ValueError(f"logs tell different things ({have}): give all that move a position, or all a velocity")
-    rare = [log for log in moving if log.step > RAREST]
-    if rare:
-        raise ValueError(
-            f"log {rare[0].name}: a row every {rare[0].step:.3g} s, must be at most {RAREST:g} s; log more often"
-        )
     if rig is None and "mgl" not in known and driven_by is not None:
         raise ValueError(
             "rig is not given (--rig on the command line, rig= in Python): what the output moves decides what is "
@@ -168,7 +157,7 @@ def checked(
 
 def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None) -> str | None:
     """What will be missing for an actuator however well logs are fitted, by their signals; None: nothing."""
-    electrical, moving, driven_by, _ = _uses(logs)
+    electrical, moving, driven_by, _ = usage(logs)
     names = {*known, *(("resistance", "inductance") if electrical else ())}
     names |= {"resistance"} if driven_by == "voltage" else set()
     constants = {"torque_constant", "back_emf_constant"}
@@ -177,16 +166,6 @@ def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str,
     if "load_inertia" in known and driven_by is not None:
         names |= {"rotor_inertia"}
     return missing(names, base)
-
-
-def _uses(logs: Sequence[Log]) -> tuple[list[Log], list[Log], str | None, str]:
-    """Logs that tell the winding, logs that tell the shaft; by which input, and by which output if they have one."""
-    moving = [log for log in logs if moves(log)]
-    driven_by, output = (
-        next((name for name in names if moving and all(log.has(name) for log in moving)), None)
-        for names in (INPUTS, OUTPUTS)
-    )
-    return [log for log in logs if log.has("voltage", "current")], moving, driven_by, output or ""
 
 
 def _foretold(shaft: Fit | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
