@@ -244,9 +244,10 @@ def _sizes(seen: Seen) -> Iterator[Finding]:
             text = f"the voltage is up to {excess[row]:.3g} times that of the supply"
             remedy = "correct the scale of the duty, or of the bus"
             yield Finding("error", "unit", int(log.row_numbers[row]), text, remedy)
-    elif seen.motor is None and 0.0 < voltage.max() <= 1.0:
-        text = f"the voltage is at most {voltage.max():.3g} V: is it a duty?"
-        remedy = "if so, multiply it by that of the supply: voltage=column*24:V"
+    elif seen.motor is None and (0.0 < voltage.max() <= 1.0 or voltage.max() > 100.0):
+        of = "a duty" if voltage.max() <= 1.0 else "of a duty in percent, or in mV"
+        text = f"the voltage is at most {voltage.max():.3g} V: is it {of}?"
+        remedy = "if so, write voltage=duty*24:V, with a duty from -1 to 1 and the volts of the supply"
         yield Finding("warning", "unit", None, text, remedy)
 
 

@@ -129,7 +129,7 @@ class Column:
                 return lambda table: table[name], {name}
             case ast.Subscript(
                 value=ast.Name(id=column) | ast.Constant(value=str(column)),
-                slice=ast.Name(id=entry) | ast.Constant(value=entry),
+                slice=ast.Name(id=entry) | ast.Constant(value=int(entry) | str(entry)),
             ):
                 name = f"{column}[{entry}]"
                 return lambda table: table[name], {name}

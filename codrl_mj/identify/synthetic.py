@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from codrl_mj.actuators import Drive
-from codrl_mj.fields import Checked, check_names, real
+from codrl_mj.fields import Checked, check_memory, check_names, real
 from codrl_mj.identify.columns import KINDS
 from codrl_mj.identify.log import Log
 from codrl_mj.runs.files import writing
@@ -94,6 +94,7 @@ class Load(Checked):
 
 FREE = Load()  # nothing but the rotor
 SEEN = "current", "position", "velocity", "torque", "bus", "voltage", "duty"  # what a simulated log has
+_SAMPLE_SIZE, _ROW_SIZE = 80, 200  # memory [bytes] of a drive's sample, and of a row until it is written, as measured
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,8 +169,19 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
 
 def sample_times(drive: Drive, duration: float) -> np.ndarray:
     """The times [s] of the drive's samples from 0 to a duration, shape (n + 1,)."""
+    _check_size(drive, duration)
     period = 1.0 / drive.controller.sample_rate
     return period * np.arange(math.ceil(duration / period - 1e-9) + 1)
+
+
+def _check_size(drive: Drive, duration: float, rate: float = 0.0) -> None:
+    """Refuse a simulation, and rows of a rate [Hz] of it, that memory does not hold."""
+    samples, rows = duration * drive.controller.sample_rate, duration * rate
+    what, remedy = f"{duration:,g} s are {samples:,.0f} samples of the drive", "shorten the duration (--duration)"
+    if rate:
+        what += f" and {rows:,.0f} rows"
+        remedy += ", or lower the rate (--rate)"
+    check_memory(_SAMPLE_SIZE * samples + _ROW_SIZE * rows, what, remedy)
 
 
 def simulate(
@@ -186,6 +198,10 @@ def simulate(
 
     Signals without a sensor show what is. The voltage is the one asked for, without sag; the torque n*kT*i.
     """
+    seconds = (
+        excitation.duration if isinstance(excitation, Excitation) else len(excitation) / drive.controller.sample_rate
+    )
+    _check_size(drive, seconds, sampler.rate)
     course = run(drive, excitation, load, position)
     check_names(sensors or {}, SEEN, "signal")
     random = np.random.default_rng(seed)
