@@ -147,9 +147,7 @@ def check_memory(size: float, what: str, remedy: str) -> None:
         remedy: what to change.
     """
     if (room := free_memory()) is not None and size > room:
-        raise ValueError(
-            f"{what}: about {size / 1e9:,.3g} GB of memory, of which {room / 1e9:.3g} are free; {remedy}"
-        )
+        raise ValueError(f"{what}: about {size / 1e9:,.3g} GB of memory, of which {room / 1e9:.3g} are free; {remedy}")
 
 
 def check_names(

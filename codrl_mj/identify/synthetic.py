@@ -169,18 +169,16 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
 
 def sample_times(drive: Drive, duration: float) -> np.ndarray:
     """The times [s] of the drive's samples from 0 to a duration, shape (n + 1,)."""
-    _check_size(drive, duration)
+    check_size(drive, duration, 0.0)
     period = 1.0 / drive.controller.sample_rate
     return period * np.arange(math.ceil(duration / period - 1e-9) + 1)
 
 
-def _check_size(drive: Drive, duration: float, rate: float = 0.0) -> None:
-    """Refuse a simulation, and rows of a rate [Hz] of it, that memory does not hold."""
+def check_size(drive: Drive, duration: float, rate: float) -> None:
+    """Refuse a simulation of a duration [s], with rows at a rate [Hz], that memory does not hold."""
     samples, rows = duration * drive.controller.sample_rate, duration * rate
-    what, remedy = f"{duration:,g} s are {samples:,.0f} samples of the drive", "shorten the duration (--duration)"
-    if rate:
-        what += f" and {rows:,.0f} rows"
-        remedy += ", or lower the rate (--rate)"
+    what = f"{duration:,g} s are {samples:,.0f} samples of the drive and {rows:,.0f} rows"
+    remedy = "shorten the duration (--duration), or lower the rate of the rows"
     check_memory(_SAMPLE_SIZE * samples + _ROW_SIZE * rows, what, remedy)
 
 
@@ -198,10 +196,8 @@ def simulate(
 
     Signals without a sensor show what is. The voltage is the one asked for, without sag; the torque n*kT*i.
     """
-    seconds = (
-        excitation.duration if isinstance(excitation, Excitation) else len(excitation) / drive.controller.sample_rate
-    )
-    _check_size(drive, seconds, sampler.rate)
+    if isinstance(excitation, Excitation):
+        check_size(drive, excitation.duration, sampler.rate)
     course = run(drive, excitation, load, position)
     check_names(sensors or {}, SEEN, "signal")
     random = np.random.default_rng(seed)
