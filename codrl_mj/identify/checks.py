@@ -14,6 +14,7 @@ from codrl_mj.identify.log import (
     Log,
     counts_per_turn,
     find_resolution,
+    is_supply,
     moves,
     obstacle,
     replaced,
@@ -229,14 +230,24 @@ def _wrapped(seen: Seen) -> Iterator[Finding]:
 def _sizes(seen: Seen) -> Iterator[Finding]:
     """Values that no bench has: more voltage than the supply has, too, and what looks like a duty."""
     for signal in _MOST.keys() & seen.log.signals.keys():
-        largest, unit = float(np.quantile(np.abs(seen.log.signals[signal]), 0.99)), SIGNALS[signal]  # not an outlier
+        largest, unit = (
+            float(np.quantile(np.abs(seen.log.signals[signal]), 0.99)),
+            SIGNALS[signal] or "of 1",
+        )  # not an outlier
         if largest > _MOST[signal]:
             text = f"the {signal} is up to {largest:.4g} {unit}, must be at most {_MOST[signal]:g} {unit} on a bench"
-            remedy = f"correct its unit, such as {signal}=column:{f'm{unit}' if unit else 'percent'}"
-            yield Finding("error", "unit", None, text, remedy)
+            other = "percent" if signal == "duty" else f"m{unit}"
+            yield Finding("error", "unit", None, text, f"correct its unit, such as {signal}=column:{other}")
     if not seen.log.has("voltage"):
         return
     log, voltage = seen.log, np.abs(seen.log.signals["voltage"])
+    others = [log.signals[one] for one in ("current", "torque", "velocity") if log.has(one)]
+    if log.has("position"):  # over many rows, in which an encoder's flicker is nothing
+        rows, position = max(len(log.time) // 20, 1), log.signals["position"]
+        others.append(position[rows:] - position[:-rows])
+    if is_supply(log.signals["voltage"], others):
+        text = f"the voltage stays near {np.median(voltage):.3g} V while the motor goes both ways: it is the supply's"
+        yield Finding("error", "voltage", None, text, "write bus=column:V, and log the motor's own voltage or its duty")
     if log.has("bus"):
         excess = voltage / np.maximum(np.abs(log.signals["bus"]), 1e-9)
         row = int(np.argmax(excess))

@@ -128,11 +128,12 @@ class Column:
             case ast.Constant(value=str(name)) | ast.Name(id=name):
                 return lambda table: table[name], {name}
             case ast.Subscript(
-                value=ast.Name(id=column) | ast.Constant(value=str(column)),
-                slice=ast.Name(id=entry) | ast.Constant(value=int(entry) | str(entry)),
+                value=ast.Name() | ast.Attribute() | ast.Constant(value=str()) as column,
+                slice=ast.Name() | ast.Attribute() | ast.Constant(value=int() | str()) as entry,
             ):
-                name = f"{column}[{entry}]"
-                return lambda table: table[name], {name}
+                parts = (str(x.value) if isinstance(x, ast.Constant) else ast.unparse(x) for x in (column, entry))
+                listed = "{}[{}]".format(*parts)
+                return lambda table: table[listed], {listed}
             case ast.Constant(value=number):
                 return lambda _: number, set()
             case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=inner):

@@ -153,6 +153,12 @@ def counts_per_turn(step: float, period: float) -> int | None:
     return count if is_usual and abs(period / step - count) < 0.02 else None
 
 
+def is_supply(volts: np.ndarray, others: Sequence[np.ndarray]) -> bool:
+    """Return True if a voltage hardly changes although the motor is driven or turns both ways, as only a supply's."""
+    reverses = any(one.size and float(one.min()) < -0.2 * float(np.abs(one).max()) < 0.0 < one.max() for one in others)
+    return bool(volts.size) and 0.0 < float(volts.max()) <= 1.3 * float(volts.min()) and reverses
+
+
 # -- whether a fit can use it ---------------------------------------------------------------------------------------
 
 INPUTS = "torque", "current", "voltage"  # what drives the shaft: the nearest to it that all logs that move have

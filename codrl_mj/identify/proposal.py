@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from codrl_mj.identify.columns import EXAMPLES, KINDS, OPEN_UNIT, Column, parse_columns
-from codrl_mj.identify.log import counts_per_turn, find_resolution, obstacle, turn_jumps
+from codrl_mj.identify.log import counts_per_turn, find_resolution, is_supply, obstacle, turn_jumps
 from codrl_mj.identify.reading import STAMP, Cells, read_table, to_log
 
 _NAMES = {
@@ -217,20 +217,14 @@ def _time_units(values: np.ndarray) -> list[str]:
 
 
 def _add_voltage(entries: dict[str, _Entry], table: Cells) -> list[str]:
-    """Add the voltage that a duty makes of the supply's, and return what is to be seen to.
-
-    A voltage that hardly changes is the supply's if there is a duty, or if the motor turns or is driven both ways.
-    """
+    """Tell the motor's voltage from the supply's, of which a duty makes it, and return what is to be seen to."""
     doubts = []
-    voltage = entries.get("voltage")
-    values = _numbers(voltage.column, table) if voltage and "bus" not in entries else np.empty(0)
-    if voltage and values.size and 0.0 < values.max() <= 1.3 * values.min():
+    if "voltage" in entries and "bus" not in entries:
+        name, values = entries["voltage"].column, _numbers(entries["voltage"].column, table)
         others = [_numbers(entries[one].column, table) for one in ("current", "torque", "velocity") if one in entries]
-        if "duty" in entries or any(one.size and one.min() < -0.2 * np.abs(one).max() for one in others):
+        if is_supply(values, [*others, np.array([-1.0, 1.0])] if "duty" in entries else others):
             entries["bus"] = entries.pop("voltage")
-            doubts.append(f"{voltage.column}: hardly changes, taken as the supply's voltage")
-        else:
-            doubts.append(f"{voltage.column}: hardly changes; write bus= if it is the supply's voltage")
+            doubts.append(f"{name}: hardly changes, taken as the supply's voltage")
     if "voltage" not in entries and {"duty", "bus"} <= entries.keys() and entries["duty"].unit != OPEN_UNIT:
         duty, bus = entries["duty"], entries["bus"]
         part = "/100" if duty.unit == "percent" else ""
