@@ -23,7 +23,8 @@ Columns = Annotated[
         metavar="SIGNAL=COLUMN:UNIT,...",
         help="What the columns are, as time=t:s,voltage=duty*vbus:V,current=i:mA,position=q:deg. Signals are voltage, "
         "current, position, velocity, torque, bus, duty, temperature and command; formulas have + - * /, "
-        "twos_complement(column,16), unwrap(column,360), atan2(y,x), abs, sign, sqrt: docs/identify_logs.md.",
+        "twos_complement(column,16), sign_magnitude(column,11), unwrap(column,360), atan2(y,x), abs, sign, sqrt, "
+        "column[0] of a list: docs/identify_logs.md.",
     ),
 ]
 """Type of a verb's flag `--columns`."""
@@ -397,7 +398,8 @@ class ProposeColumns:
             rig = " --rig free --known load_inertia=0"
         how = ", with its unit for each UNIT" if is_open else ""
         out = "" if "check" in verb else " --out motor"
-        print(f"next{how} (--rig pendulum if one hangs at position 0, load if it lifts one):" if rig else f"next{how}:")
+        alone = ", of a motor on its own (else --rig pendulum if one hangs at position 0, load if it lifts one)"
+        say(f"next{how}{alone if rig else ''}:")
         print(f"codrl-mj {verb} {shlex.quote(str(self.log))} --columns {shlex.quote(found.columns)}{rig}{out}")
         return 0, found
 

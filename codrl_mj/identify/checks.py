@@ -12,7 +12,6 @@ from codrl_mj.identify.log import (
     SIGNALS,
     Finding,
     Log,
-    counts_per_turn,
     find_resolution,
     is_supply,
     moves,
@@ -280,7 +279,9 @@ def _degrees(seen: Seen) -> Iterator[Finding]:
         count, of_radians = round(turns), 2.0 * math.pi / step
         if abs(turns - count) < 1e-6 * turns and abs(of_radians - round(of_radians)) > 1e-3:
             text = f"the position's steps of {step:.4g} are 1/{count} of 360, not of 2 pi: is it in degrees?"
-            yield Finding("error" if counts_per_turn(step, 360.0) else "warning", "unit", None, text, remedy)
+            decimal = round(step / 10.0 ** math.floor(math.log10(step)), 5) in (1.0, 2.0, 2.5, 5.0)
+            encoder = not decimal and (count % 100 == 0 or count & (count - 1) == 0)
+            yield Finding("error" if encoder else "warning", "unit", None, text, remedy)
 
 
 @_needs("position velocity moves")

@@ -21,6 +21,7 @@ SIGNALS = {
 }
 """What a log may hold -> its SI unit; None: any."""
 LONGEST_STEP = 5.0  # a longer step, in median steps, is a gap, across which nothing is simulated
+_ROUND = {*(tenths / 10 for tenths in range(10, 100)), 1.25, 2.25}  # leading digits of a step that a file rounds to
 _MOST_LEVELS = 1_000_000  # of a converter: what has more is as good as continuous
 
 
@@ -146,7 +147,7 @@ def turn_jumps(values: np.ndarray, period: float) -> np.ndarray:
 
 def counts_per_turn(step: float, period: float) -> int | None:
     """Return the counts of an encoder whose step is a part of a turn; None if it is as likely a file's rounding."""
-    if step <= 0.0 or round(step / 10.0 ** math.floor(math.log10(step)), 5) in (1.0, 2.0, 2.5, 5.0):
+    if step <= 0.0 or round(step / 10.0 ** math.floor(math.log10(step)), 5) in _ROUND:
         return None
     count = round(period / step)
     is_usual = count >= 100 and (count % 100 == 0 or count & (count - 1) == 0)

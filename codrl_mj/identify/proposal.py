@@ -31,21 +31,9 @@ _NAMES = {
 _READINGS = {"present", "feedback", "measured", "actual", "state"}  # of a signal that only a unit tells, or a position
 _NO_SIGNALS = {"error", "err", "limit", "max", "mode", "status", "fault", "gain", "integrator", "d"}  # d: of the d axis
 _INPUTS = {"input", "in", "dc"}  # of a servo or an inverter, not of the motor
-_UNITS = {
-    "°": "deg",
-    "º": "deg",
-    "degrees": "deg",
-    "dps": "deg/s",
-    "radians": "rad",
-    "rev": "turn",
-    "revs": "turn",
-    "rev/s": "turn/s",
-    "sec": "s",
-    "seconds": "s",
-    "millis": "ms",
-    "micros": "us",
-    "%": "percent",
-}
+_SPELLINGS = {"deg": "° º degrees", "deg/s": "dps", "rad": "radians", "turn": "rev revs", "turn/s": "rev/s"}
+_SPELLINGS |= {"s": "sec seconds", "ms": "millis", "us": "micros", "percent": "%"}
+_UNITS = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split()}
 """How files spell a unit -> as the mapping takes it."""
 _TURNS = {"deg": 360.0, "rad": 2.0 * math.pi, "turn": 1.0}  # unit of an angle -> a turn
 _STEPS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # unit of time -> [s]
@@ -90,7 +78,7 @@ def propose_columns(path: Path | str) -> Proposal:
     table, entries, doubts = read_table(path), dict[str, _Entry](), list[str]()
     for name in table.columns:
         listed = re.fullmatch(r"(.*)\[(\d+)\]", name)
-        if listed and listed[2] != "0":
+        if (listed and listed[2] != "0") or re.sub("nanosec$", "sec", name) in {*table.columns} - {name}:
             continue
         signal, unit, doubt = _signal(name, table, entries)
         if signal:
@@ -116,7 +104,7 @@ def _signal(name: str, table: Cells, taken: Collection[str]) -> tuple[str | None
     stated = [table.units.get(name, "").strip("[]() "), *([bracket[1]] if bracket else [])]
     pairs = [f"{ends[-2]}{sign}{ends[-1]}" for sign in "/*"] if len(ends) > 2 else []  # deg_s, N_m
     inner = [one for one in (*reversed(ends[1:-1]), *reversed(words)) if len(one) > 1]  # letters there are of a name
-    loose = [*stated, *pairs, *(one for one in ends[1:][-1:]), *inner]
+    loose = [*stated, *pairs, *ends[1:][-1:], *inner]
     units = {one: next((unit for text in loose if (unit := _valid(one, text))), None) for one in _NAMES}
     if {*words} & _NO_SIGNALS or ("state" in words and "observation" not in words):
         return None, None, "by its name no signal that a fit needs, left out"
@@ -235,8 +223,7 @@ def _add_voltage(entries: dict[str, _Entry], table: Cells) -> list[str]:
 
 def _problem(name: str, table: Cells, entries: dict[str, _Entry]) -> str | None:
     """Return why a fit cannot use these columns, whichever units are filled in; None if it can."""
-    stand_ins = {signal: KINDS[signal] or "1" for signal in entries}
-    units = {signal: stand_ins[signal] if one.unit == OPEN_UNIT else one.unit for signal, one in entries.items()}
+    units = {one: KINDS[one] or "1" if entry.unit == OPEN_UNIT else entry.unit for one, entry in entries.items()}
     try:
         log = to_log(name, table, parse_columns({one: f"{entries[one].formula}:{unit}" for one, unit in units.items()}))
     except ValueError as error:
