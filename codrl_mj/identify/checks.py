@@ -167,9 +167,8 @@ def _repeated(log: Log, signal: str) -> Iterator[Finding]:
     # A coarse sensor repeats its value too, but then moves on by a step or two of its resolution.
     every, size = float(np.median(np.diff(changes))), float(np.median(np.abs(steps[changes])))
     if every >= 2.0 and size > 2.5 * log.resolution.get(signal, 0.0):
-        text = (
-            f"{signal} changes in every {every:.0f}th row only, by {size:.3g} {SIGNALS[signal]}: rows repeat old values"
-        )
+        unit = SIGNALS[signal]
+        text = f"{signal} changes in every {every:.0f}th row only, by {size:.3g} {unit}: rows repeat old values"
         remedy = "log a row when a value is read, or leave out the rows that repeat it"
         yield Finding("warning", "repeated", int(log.row_numbers[changes[0] + 1]), text, remedy)
 
@@ -229,10 +228,8 @@ def _wrapped(seen: Seen) -> Iterator[Finding]:
 def _sizes(seen: Seen) -> Iterator[Finding]:
     """Values that no bench has: more voltage than the supply has, too, and what looks like a duty."""
     for signal in _MOST.keys() & seen.log.signals.keys():
-        largest, unit = (
-            float(np.quantile(np.abs(seen.log.signals[signal]), 0.99)),
-            SIGNALS[signal] or "of 1",
-        )  # not an outlier
+        largest = float(np.quantile(np.abs(seen.log.signals[signal]), 0.99))  # not an outlier
+        unit = SIGNALS[signal] or "of 1"
         if largest > _MOST[signal]:
             text = f"the {signal} is up to {largest:.4g} {unit}, must be at most {_MOST[signal]:g} {unit} on a bench"
             other = "percent" if signal == "duty" else f"m{unit}"

@@ -81,6 +81,8 @@ def propose_columns(path: Path | str) -> Proposal:
         if (listed and listed[2] != "0") or re.sub("nanosec$", "sec", name) in {*table.columns} - {name}:
             continue
         signal, unit, doubt = _signal(name, table, entries)
+        if signal and not _numbers(name, table).size:
+            signal, doubt = None, "holds no numbers, left out"
         if signal:
             entries[signal], doubt = _entry(signal, name, unit, table)
         if signal and listed:

@@ -132,6 +132,7 @@ PROPOSED = {
     "T_S,VOLTAGE_KV,I_UA,Größe der Position\n0,1,2,3\n1,2,3,4": (
         'time=T_S:s,voltage=VOLTAGE_KV:kV,current=I_UA:uA,position="Größe der Position":UNIT | rad, deg or turn'
     ),
+    "t_s,enable,i_A\n0,on,1\n1,off,2": "time=t_s:s,current=i_A:A | enable: holds no numbers, left out",
     "t,i,,\n0,1,,\n0.01,2,,\n": "time=t:s,current=i:UNIT | : not known",
     "t_ms,i_A,bus_current_A,current_limit,goal_current_A,goal_position\n0,1,2,3,4,5\n1,2,3,4,5,6": (
         "time=t_ms:ms,current=i_A:A,command=goal_current_A:A | bus_current_A: by its name the supply's current"
