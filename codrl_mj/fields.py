@@ -14,6 +14,7 @@ import textwrap
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 
@@ -129,6 +130,25 @@ class Checked:
                 raise ValueError(f"{type(self).__name__}.{field.name} = {value!r}: must be {text}{none}")
             if kind is not None:
                 object.__setattr__(self, field.name, kind(value))
+
+
+def free_memory() -> int | None:
+    """Return the memory [bytes] that is free; None where the system does not say, as others than Linux."""
+    meminfo = Path("/proc/meminfo")
+    free = re.search(r"MemAvailable:\s*(\d+) kB", meminfo.read_text() if meminfo.exists() else "")
+    return 1024 * int(free[1]) if free else None
+
+
+def check_memory(size: float, what: str, remedy: str) -> None:
+    """Refuse what takes more memory than is free.
+
+    Args:
+        size: of the memory [bytes].
+        what: it is for, with how many, for the message.
+        remedy: what to change.
+    """
+    if (room := free_memory()) is not None and size > room:
+        raise ValueError(f"{what}: about {size / 1e9:,.3g} GB of memory, of which {room / 1e9:.3g} are free; {remedy}")
 
 
 def check_names(

@@ -44,7 +44,7 @@ ALLOWED = {
     "runs.policies": {"actuators", "agents", "envs.config", "runs.files", "runs"},
     "evaluation.measures": set(),
     "evaluation": {
-        *("actuators", "envs", "envs.config", "envs.worlds", "evaluation.measures", "physics", "runs.files"),
+        *("actuators", "envs", "envs.config", "envs.worlds", "evaluation.measures", "fields", "physics", "runs.files"),
         *("runs.policies", "tasks"),
     },
     "deploy": {

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.fields import Checked, check_names, factors
+from codrl_mj.fields import Checked, check_memory, check_names, factors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +72,12 @@ class AgentConfig(Checked):
         """
         check_names(mapping, (field.name for field in dataclasses.fields(cls)), "key", "agent.")
         return cls(**mapping)
+
+
+def check_buffer(name: str, steps: int, env: Any, observations: int) -> None:
+    """Refuse a buffer of steps, each with one or two observations, that memory does not hold; `name` is its field's."""
+    numbers = observations * spaces.flatdim(env.observation_space) + spaces.flatdim(env.action_space)
+    check_memory(4.0 * numbers * steps, f"{name} = {steps:,}", "lower it")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.agents.base import DeepAgentConfig
+from codrl_mj.agents.base import DeepAgentConfig, check_buffer
 from codrl_mj.fields import flag, integer, real, units
 
 
@@ -40,6 +40,7 @@ class OffPolicyConfig(DeepAgentConfig):
                 f"{type(self).__name__}.train_every = None: training at the end of every episode needs num_envs = 1, "
                 f"not {env.num_envs}; set train_every to a number of steps"
             )
+        check_buffer(f"{type(self).__name__}.buffer_size", self.buffer_size, env, observations=2)
         from codrl_mj.agents import models
 
         return getattr(models, self.algorithm)(

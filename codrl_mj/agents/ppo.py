@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Literal
 
 from gymnasium import spaces
 
-from codrl_mj.agents.base import DeepAgentConfig
+from codrl_mj.agents.base import DeepAgentConfig, check_buffer
 from codrl_mj.fields import choice, flag, integer, real, units
 
 
@@ -86,6 +86,7 @@ class PPOConfig(DeepAgentConfig):
                 raise ValueError(
                     f"PPOConfig.rollout_steps = {self.rollout_steps}: must be a multiple of {name} = {size}"
                 )
+        check_buffer("PPOConfig.rollout_steps", self.rollout_steps, env, observations=1)
         arguments: dict[str, Any] = {
             "learning_rate": self.learning_rate,
             "n_steps": self.rollout_steps // env.num_envs,

@@ -23,7 +23,8 @@ Columns = Annotated[
         metavar="SIGNAL=COLUMN:UNIT,...",
         help="What the columns are, as time=t:s,voltage=duty*vbus:V,current=i:mA,position=q:deg. Signals are voltage, "
         "current, position, velocity, torque, bus, duty, temperature and command; formulas have + - * /, "
-        "twos_complement(column,16), unwrap(column,360), atan2(y,x), abs, sign, sqrt: docs/identify_logs.md.",
+        "twos_complement(column,16), sign_magnitude(column,11), unwrap(column,360), atan2(y,x), abs, sign, sqrt, "
+        "column[0] of a list: docs/identify_logs.md.",
     ),
 ]
 """Type of a verb's flag `--columns`."""
@@ -377,7 +378,8 @@ def _sensors(texts: Sequence[str]) -> dict[str, Any]:
 class ProposeColumns:
     """Propose the --columns of a log, by its names, units and values, and print what to type next.
 
-    Example: codrl-mj identify columns log.csv
+    A unit that neither the file nor its values tell stays open: replace each UNIT. Exit status 1 if nothing can be
+    identified from the columns. Example: codrl-mj identify columns log.csv
     """
 
     log: Annotated[tyro.conf.Positional[Path], _FILE]
@@ -385,12 +387,31 @@ class ProposeColumns:
 
     def run(self) -> tuple[int, Any]:
         """Print the mapping, what could not be told, and the next line."""
-        from codrl_mj.identify.reading import propose_columns
+        from codrl_mj.identify.columns import OPEN_UNIT
+        from codrl_mj.identify.proposal import propose_columns
 
         found = propose_columns(self.log)
         for doubt in found.doubts:
             say(f"to be checked: {doubt}")
-        rig = " --rig free --known load_inertia=0" if re.search("(position|velocity)=", found.columns) else ""
-        print("next (--rig pendulum if one hangs at position 0, load if it lifts one):" if rig else "next:")
-        print(f"codrl-mj identify {shlex.quote(str(self.log))} --columns {shlex.quote(found.columns)}{rig} --out motor")
+        if found.problem:
+            say(found.problem, style="yellow")
+            print(f"--columns {shlex.quote(found.columns)}")
+            return 1, found
+        is_open, verb, rig = f":{OPEN_UNIT}" in found.columns, "identify", ""
+        if not is_open and self._has_errors(found.columns):
+            verb = "identify check"
+        elif re.search("(position|velocity)=", found.columns):
+            rig = " --rig free --known load_inertia=0"
+        how = ", with its unit for each UNIT" if is_open else ""
+        out = "" if "check" in verb else " --out motor"
+        alone = ", of a motor on its own (else --rig pendulum if one hangs at position 0, load if it lifts one)"
+        say(f"next{how}{alone if rig else ''}:")
+        print(f"codrl-mj {verb} {shlex.quote(str(self.log))} --columns {shlex.quote(found.columns)}{rig}{out}")
         return 0, found
+
+    def _has_errors(self, columns: str) -> bool:
+        """Return True if the checks find errors, with which a fit would be refused."""
+        from codrl_mj.identify.checks import check
+        from codrl_mj.identify.reading import read_log
+
+        return any(one.severity == "error" for one in check(read_log(self.log, columns), rig="free"))

@@ -16,8 +16,10 @@ import numpy as np
 from codrl_mj.actuators import Actuator, Drive, Inputs, parameters_type
 from codrl_mj.actuators.sampled import designed_gains
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
+from codrl_mj.fields import check_memory
 
 Looped = Drive | Actuator
+_SAMPLE_SIZE = 500  # memory [bytes] of a sample in the responses to a step, with each kind of anti-windup
 RATES = (10e3, 20e3, 40e3)
 """Sample rates [Hz] that drives commonly have."""
 
@@ -313,6 +315,9 @@ def step(drive: Drive) -> Steps:
     loop = drive.controller
     if loop.sample_rate < 1e3:
         raise ValueError(f"SampledLoop.sample_rate = {loop.sample_rate:g}: must be >= 1000 Hz, to see a step; raise it")
+    samples = (_UNREACHABLE + _AFTER) * loop.sample_rate
+    what = f"SampledLoop.sample_rate = {loop.sample_rate:g}: {samples:,.0f} samples of a step"
+    check_memory(_SAMPLE_SIZE * samples, what, "lower it")
     drive.check(1.0 / loop.sample_rate)
     motor, voltage = drive.motor, drive.voltage_limit
     speed, unreachable = 0.0, min(1.8 * voltage / motor.resistance, loop.max_current)

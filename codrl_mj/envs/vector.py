@@ -1,9 +1,7 @@
 """Thousands of environments as one, stepped together by compiled code: Gymnasium's `VectorEnv`."""
 
 import functools
-import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -16,6 +14,7 @@ from codrl_mj.envs.compiled import Kernels, VectorStep, compiled_kernels
 from codrl_mj.envs.randomization import Draws, put_into_batch
 from codrl_mj.envs.setup import set_up_many
 from codrl_mj.envs.snapshots import check_snapshot
+from codrl_mj.fields import free_memory
 from codrl_mj.physics import Signals
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.physics.offscreen import OffscreenRenderer, check_view
@@ -393,9 +392,7 @@ def check_counts(num_envs: int, max_episode_steps: int | None, each: int = 3_000
     for name, count in {"num_envs": num_envs, **limit}.items():
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise ValueError(f"{name} = {count!r}: must be an integer >= 1")
-    meminfo = Path("/proc/meminfo")  # on Linux; others find out
-    free = re.search(r"MemAvailable:\s*(\d+) kB", meminfo.read_text() if meminfo.exists() else "")
-    if free and num_envs * each > (room := 1024 * int(free[1])):
+    if (room := free_memory()) is not None and num_envs * each > room:
         raise ValueError(
             f"num_envs = {num_envs}: takes about {num_envs * each / 1e9:.3g} GB of memory, of which {room / 1e9:.3g} "
             f"are free: must be <= {room // each}"

@@ -3,6 +3,7 @@
 from codrl_mj.evaluation.episodes import (
     Episode,
     RandomPolicy,
+    check_episodes,
     load_episode,
     run_episodes,
     save_episode,
@@ -18,6 +19,7 @@ __all__ = [
     "Quartiles",
     "RandomPolicy",
     "bootstrap_mean",
+    "check_episodes",
     "evaluate",
     "load_episode",
     "run_episodes",

@@ -16,6 +16,7 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import IDEAL, actuator_from_mapping, mapping_of, trusting
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.fields import check_memory
 from codrl_mj.runs.files import below, writing
 from codrl_mj.runs.policies import Policy
 
@@ -172,6 +173,17 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
         raise ValueError(f"{path} is not the trajectory of an episode: {error}") from None
 
 
+_EPISODE_SIZE = 100_000  # memory [bytes] of an environment that stands still; the tasks' have three to seven times that
+_STEPS_BETWEEN_CHECKS = 10_000
+
+
+def check_episodes(episodes: int, name: str = "episodes") -> None:
+    """Refuse a number of episodes that is below 1, or whose environments memory does not hold."""
+    if episodes < 1:
+        raise ValueError(f"{name} = {episodes}: must be >= 1")
+    check_memory(_EPISODE_SIZE * episodes, f"{name} = {episodes:,}, which run side by side", "run fewer")
+
+
 class _Recording:
     """One environment, and what has happened in it since the reset."""
 
@@ -197,6 +209,9 @@ class _Recording:
         self._rewards.append(float(reward))
         self._traces.append(self._recorder.trace)
         self._signals.append(info)
+        if (steps := len(self._traces)) % _STEPS_BETWEEN_CHECKS == 0:  # what is recorded is copied in the end
+            what = f"an episode of {steps:,} steps, which does not end"
+            check_memory(steps * self._traces[-1].nbytes, what, "lower max_episode_steps")
         return self._terminated or truncated
 
     def episode(self) -> Episode:
@@ -247,8 +262,7 @@ def run_episodes(
         ValueError: `episodes` is below 1, or `seed` below 0.
         SimulationDivergedError: a simulation left the finite numbers.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes = {episodes}: must be >= 1")
+    check_episodes(episodes)
     if seed < 0:
         raise ValueError(f"seed = {seed}: must be >= 0")
     recordings = [_Recording(make(), seed + index) for index in range(episodes)]

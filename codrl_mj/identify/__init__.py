@@ -4,7 +4,8 @@ from codrl_mj.identify.checks import check
 from codrl_mj.identify.identify import identify
 from codrl_mj.identify.log import Finding, Log
 from codrl_mj.identify.parameters import PARAMETERS
-from codrl_mj.identify.reading import Proposal, propose_columns, read_log
+from codrl_mj.identify.proposal import Proposal, propose_columns
+from codrl_mj.identify.reading import read_log
 from codrl_mj.identify.result import Estimate, Identified, Prediction
 
 __all__ = [

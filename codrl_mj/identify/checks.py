@@ -7,13 +7,25 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.identify.balances import Balance, effort_lag, torque_balance, velocity_lag, voltage_balance
-from codrl_mj.identify.log import LONGEST_STEP, SIGNALS, Finding, Log, find_resolution, moves, replaced
+from codrl_mj.identify.log import (
+    LONGEST_STEP,
+    SIGNALS,
+    Finding,
+    Log,
+    find_resolution,
+    is_supply,
+    moves,
+    obstacle,
+    replaced,
+    turn_jumps,
+)
 from codrl_mj.identify.parameters import PARAMETERS
 
 _DROPPED = 1.5  # median steps, from which on rows are missing
 _MOST_LISTED = 10
-_MOST = {"voltage": 1e3, "bus": 1e3, "current": 1e3, "velocity": 2e4, "torque": 1e4}
-"""In SI: beyond the largest motors of robots, and beyond 190,000 rpm."""
+_MOST = {"duty": 1.1, "voltage": 1e3, "bus": 1e3, "current": 1e3, "velocity": 2e4, "torque": 1e4}
+"""In SI: a share with its rounding; beyond the largest motors of robots, and beyond 190,000 rpm."""
+_MEASURED = "position", "velocity", "current", "torque"
 FACTORS = {
     "degrees for radians": 180.0 / math.pi,
     "rpm for rad/s": 30.0 / math.pi,
@@ -81,6 +93,13 @@ def name_of_factor(ratio: float, angle: bool = True) -> str:
 
 
 @_needs("")
+def _obstacle(seen: Seen) -> Iterator[Finding]:
+    """Find what a fit of this log alone would refuse."""
+    if found := obstacle([seen.log]):
+        yield found
+
+
+@_needs("")
 def _times(seen: Seen) -> Iterator[Finding]:
     """Gaps, dropped rows, jitter, and stamps in another unit."""
     log, usual, rows = seen.log, seen.log.step, seen.log.row_numbers
@@ -116,6 +135,8 @@ def _signals(seen: Seen) -> Iterator[Finding]:
     """Each signal by itself; only what a sensor sees is clipped or spoiled, others rest where they like."""
     for signal in seen.log.signals:
         yield from _resolution(seen.log, signal)
+        if signal in _MEASURED:
+            yield from _repeated(seen.log, signal)
         if signal in ("current", "torque", "velocity"):
             yield from _saturation(seen.log, signal)
             yield from _outliers(seen.log, signal)
@@ -135,6 +156,21 @@ def _resolution(log: Log, signal: str) -> Iterator[Finding]:
         }
         remedy = remedies.get(signal, "measure in a smaller range, or drive harder")
         yield Finding("warning", "resolution", None, text, remedy)
+
+
+def _repeated(log: Log, signal: str) -> Iterator[Finding]:
+    """Find a signal that is read less often than rows are written, so that rows repeat what was read before."""
+    steps = np.diff(log.signals[signal])
+    changes = np.flatnonzero(steps)
+    if len(changes) < 20:
+        return
+    # A coarse sensor repeats its value too, but then moves on by a step or two of its resolution.
+    every, size = float(np.median(np.diff(changes))), float(np.median(np.abs(steps[changes])))
+    if every >= 2.0 and size > 2.5 * log.resolution.get(signal, 0.0):
+        unit = SIGNALS[signal]
+        text = f"{signal} changes in every {every:.0f}th row only, by {size:.3g} {unit}: rows repeat old values"
+        remedy = "log a row when a value is read, or leave out the rows that repeat it"
+        yield Finding("warning", "repeated", int(log.row_numbers[changes[0] + 1]), text, remedy)
 
 
 def _saturation(log: Log, signal: str) -> Iterator[Finding]:
@@ -181,9 +217,8 @@ def _outliers(log: Log, signal: str) -> Iterator[Finding]:
 @_needs("position")
 def _wrapped(seen: Seen) -> Iterator[Finding]:
     """A position that jumps by a turn."""
-    steps = np.diff(seen.log.signals["position"])
-    jumps = np.flatnonzero(np.abs(np.abs(steps) - 2.0 * np.pi) < 0.1 * 2.0 * np.pi)
-    if jumps.size and np.mean(np.abs(steps) > np.pi / 2.0) <= 0.2:
+    jumps = turn_jumps(seen.log.signals["position"], 2.0 * math.pi)
+    if jumps.size:
         text = f"the position jumps by a turn, {jumps.size} times, first here"
         remedy = "write position=unwrap(column, 2*pi):rad, or unwrap(column, 360):deg"
         yield Finding("error", "wrapped", int(seen.log.row_numbers[jumps[0] + 1]), text, remedy)
@@ -193,13 +228,22 @@ def _wrapped(seen: Seen) -> Iterator[Finding]:
 def _sizes(seen: Seen) -> Iterator[Finding]:
     """Values that no bench has: more voltage than the supply has, too, and what looks like a duty."""
     for signal in _MOST.keys() & seen.log.signals.keys():
-        largest, unit = float(np.quantile(np.abs(seen.log.signals[signal]), 0.99)), SIGNALS[signal]  # not an outlier
+        largest = float(np.quantile(np.abs(seen.log.signals[signal]), 0.99))  # not an outlier
+        unit = SIGNALS[signal] or "of 1"
         if largest > _MOST[signal]:
             text = f"the {signal} is up to {largest:.4g} {unit}, must be at most {_MOST[signal]:g} {unit} on a bench"
-            yield Finding("error", "unit", None, text, f"correct its unit, such as {signal}=column:m{unit}")
+            other = "percent" if signal == "duty" else f"m{unit}"
+            yield Finding("error", "unit", None, text, f"correct its unit, such as {signal}=column:{other}")
     if not seen.log.has("voltage"):
         return
     log, voltage = seen.log, np.abs(seen.log.signals["voltage"])
+    others = [log.signals[one] for one in ("current", "torque", "velocity") if log.has(one)]
+    if log.has("position"):  # over many rows, in which an encoder's flicker is nothing
+        rows, position = max(len(log.time) // 20, 1), log.signals["position"]
+        others.append(position[rows:] - position[:-rows])
+    if is_supply(log.signals["voltage"], others):
+        text = f"the voltage stays near {np.median(voltage):.3g} V while the motor goes both ways: it is the supply's"
+        yield Finding("error", "voltage", None, text, "write bus=column:V, and log the motor's own voltage or its duty")
     if log.has("bus"):
         excess = voltage / np.maximum(np.abs(log.signals["bus"]), 1e-9)
         row = int(np.argmax(excess))
@@ -207,9 +251,10 @@ def _sizes(seen: Seen) -> Iterator[Finding]:
             text = f"the voltage is up to {excess[row]:.3g} times that of the supply"
             remedy = "correct the scale of the duty, or of the bus"
             yield Finding("error", "unit", int(log.row_numbers[row]), text, remedy)
-    elif seen.motor is None and 0.0 < voltage.max() <= 1.0:
-        text = f"the voltage is at most {voltage.max():.3g} V: is it a duty?"
-        remedy = "if so, multiply it by that of the supply: voltage=column*24:V"
+    elif seen.motor is None and (0.0 < voltage.max() <= 1.0 or voltage.max() > 100.0):
+        of = "a duty" if voltage.max() <= 1.0 else "of a duty in percent, or in mV"
+        text = f"the voltage is at most {voltage.max():.3g} V: is it {of}?"
+        remedy = "if so, write voltage=duty*24:V, with a duty from -1 to 1 and the volts of the supply"
         yield Finding("warning", "unit", None, text, remedy)
 
 

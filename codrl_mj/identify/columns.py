@@ -14,6 +14,22 @@ from codrl_mj.fields import check_names
 from codrl_mj.identify.log import SIGNALS
 
 KINDS: dict[str, str | None] = {"time": "s", **SIGNALS, "only": ""}  # what columns may be -> its SI unit; None: any
+OPEN_UNIT = "UNIT"
+"""Stands for the unit that a person has to fill in, in a proposal."""
+EXAMPLES = {
+    "time": "s, ms or us",
+    "voltage": "V or mV",
+    "bus": "V or mV",
+    "current": "A or mA",
+    "position": "rad, deg or turn",
+    "velocity": "rad/s, deg/s, rpm or turn/s",
+    "torque": "N*m, mN*m or kgf*cm",
+    "duty": "1 (a share) or percent",
+    "temperature": "degC or K",
+    "command": "rad, deg or turn",
+    "only": "1",
+}
+"""Signal -> units that its columns often have."""
 _EXAMPLE = "time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad"
 
 
@@ -23,8 +39,15 @@ def twos_complement(values: Any, bits: Any) -> Any:
     return (np.asarray(values) + whole / 2.0) % whole - whole / 2.0
 
 
+def sign_magnitude(values: Any, bits: Any) -> Any:
+    """Return whole numbers of which the highest bit is the sign, with it: 1324 of 11 bits is -300."""
+    half = 2.0 ** (float(bits) - 1.0)
+    return np.where(np.asarray(values) >= half, half - np.asarray(values), values)
+
+
 FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "twos_complement": (2, twos_complement),
+    "sign_magnitude": (2, sign_magnitude),
     "unwrap": (2, lambda values, period: np.unwrap(values, period=float(period))),
     "atan2": (2, np.arctan2),
     "abs": (1, np.abs),
@@ -46,7 +69,7 @@ class Column:
     """A signal as a formula of a file's columns."""
 
     signal: str  # `time`, one of `SIGNALS`, or `only`: rows where it is 0 are left out
-    formula: str  # columns (one with spaces in quotes), numbers, `pi`, + - * / and `FUNCTIONS`
+    formula: str  # columns (one with spaces in quotes, column[0] of a list), numbers, `pi`, + - * / and `FUNCTIONS`
     unit: str | None  # of the formula's value; None: SI, which only a formula of more than a name may leave out
     mean: bool = False  # of a voltage: whether it is the mean from its row to the next, not what holds from its row on
 
@@ -55,6 +78,9 @@ class Column:
         check_names([self.signal], KINDS, "signal")
         bare = self._formula[2]
         kind = KINDS[self.signal]
+        if self.unit == OPEN_UNIT:
+            remedy = f"write the column's own, such as {EXAMPLES[self.signal]}"
+            raise self._wrong(f"the unit is not filled in; {remedy}. The file does not state it")
         if self.unit is not None:
             self._quantity(1.0)
         elif kind and bare:
@@ -76,6 +102,9 @@ class Column:
 
     def value(self, table: Mapping[str, Any]) -> Any:
         """The signal in SI, by a table of columns and constants."""
+        for name in sorted(self.names - table.keys()):
+            if width := sum(bool(re.fullmatch(re.escape(name) + r"\[\d+\]", known)) for known in table):
+                raise self._wrong(f"{name} holds lists of {width} numbers; write the one you want, such as {name}[0]")
         check_names(self.names, table, "column")
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._quantity(self._formula[0]({"pi": math.pi, **table}))
@@ -91,13 +120,20 @@ class Column:
                 f"it has spaces, as in {_EXAMPLE}"
             ) from None
         value, names = self._made(body)
-        return value, names - {"pi"}, isinstance(body, ast.Name | ast.Constant)
+        return value, names - {"pi"}, isinstance(body, ast.Name | ast.Constant | ast.Subscript)
 
     def _made(self, node: ast.AST) -> tuple[_Value, set[str]]:
         """A part of the formula: its value by a table, and the names that it reads."""
         match node:
             case ast.Constant(value=str(name)) | ast.Name(id=name):
                 return lambda table: table[name], {name}
+            case ast.Subscript(
+                value=ast.Name() | ast.Attribute() | ast.Constant(value=str()) as column,
+                slice=ast.Name() | ast.Attribute() | ast.Constant(value=int() | str()) as entry,
+            ):
+                parts = (str(x.value) if isinstance(x, ast.Constant) else ast.unparse(x) for x in (column, entry))
+                listed = "{}[{}]".format(*parts)
+                return lambda table: table[listed], {listed}
             case ast.Constant(value=number):
                 return lambda _: number, set()
             case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=inner):
@@ -164,8 +200,8 @@ def _split(text: str, separator: str) -> list[str]:
             quote = "" if letter == quote else quote
         elif letter in "'\"":
             quote = letter
-        elif letter in "()":
-            depth += 1 if letter == "(" else -1
+        elif letter in "()[]":
+            depth += 1 if letter in "([" else -1
         if letter == separator and depth == 0 and not quote:
             pieces.append("")
         else:

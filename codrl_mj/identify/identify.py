@@ -12,7 +12,7 @@ import numpy as np
 from codrl_mj.fields import check_names
 from codrl_mj.identify.estimate import Fit, fitted, refitted
 from codrl_mj.identify.friction import choose_friction, load_hint
-from codrl_mj.identify.log import SEGMENT, Log, moves, shifted
+from codrl_mj.identify.log import SEGMENT, Log, moves, obstacle, shifted, usage
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import DEFAULTS, ESTIMABLE, OF_LOSS, OF_RIG, OF_WINDING, PARAMETERS
 from codrl_mj.identify.result import (
@@ -28,10 +28,7 @@ from codrl_mj.identify.result import (
 )
 from codrl_mj.identify.trust import correlations, judged
 
-INPUTS = "torque", "current", "voltage"  # what drives the shaft: the nearest to it that all logs that move have
-OUTPUTS = "position", "velocity"  # what a simulation is compared with
 STEPS_OF_A_PART = 8 + 4
-RAREST = 0.05  # rows that are farther apart [s] say too little within the time that is foretold
 
 
 def identify(
@@ -70,7 +67,7 @@ def identify(
     given, motor = checked(logs, rig, known or {}, friction, estimated, segment, base), motor_of(base)
     defaults = DEFAULTS | {name: getattr(motor, name) for name in OF_LOSS if motor is not None}
     rig = rig or ("pendulum" if "mgl" in given else "free")
-    electrical, moving, driven_by, output = _uses(logs)
+    electrical, moving, driven_by, output = usage(logs)
     total = STEPS_OF_A_PART * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (friction == "auto")
     done = itertools.count(1)
 
@@ -239,7 +236,7 @@ def checked(
     # of a motor with a gear that too: otherwise its numbers would be those of the output
     ratio = 1.0 if motor is None else motor.gear_ratio
     known = {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **(known or {})}
-    electrical, moving, driven_by, output = _uses(logs)
+    _, moving, driven_by, output = usage(logs)
     if not segment >= 0.05:
         raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
     if not logs:
@@ -255,12 +252,9 @@ def checked(
                 f"known {name} = {value!r}: must be from {parameter.least:g} to {parameter.most:g} "
                 f"{parameter.unit}; give {parameter.what}".strip()
             )
-    if not electrical and driven_by is None:
+    if found := obstacle(logs):
         have = "; ".join(f"{log.name}: {', '.join(log.signals) or 'nothing'}" for log in logs)
-        raise ValueError(
-            f"logs tell nothing ({have}): give voltage and current for the winding, or torque, current or voltage with "
-            "a position or velocity that moves for the shaft"
-        )
+        raise ValueError(f"{found.message}; {found.remedy} (logs and their signals: {have})")
     twice = sorted({*known} & {*estimated})
     if twice:
         raise ValueError(f"{', '.join(twice)}: both known and estimated, must be one of them; leave the other out")
@@ -270,11 +264,6 @@ def checked(
     if moving and not output:
         have = "; ".join(f"{log.name}: {'position' if log.has('position') else 'velocity'}" for log in moving)
         raise ValueError(f"logs tell different things ({have}): give all that move a position, or all a velocity")
-    rare = [log for log in moving if log.step > RAREST]
-    if rare:
-        raise ValueError(
-            f"log {rare[0].name}: a row every {rare[0].step:.3g} s, must be at most {RAREST:g} s; log more often"
-        )
     if rig is None and "mgl" not in known and driven_by is not None:
         raise ValueError(
             "rig is not given (--rig on the command line, rig= in Python): what the output moves decides what is "
@@ -285,7 +274,7 @@ def checked(
 
 def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None) -> str | None:
     """What will be missing for an actuator however well logs are fitted, by their signals; None: nothing."""
-    electrical, moving, driven_by, _ = _uses(logs)
+    electrical, moving, driven_by, _ = usage(logs)
     names = {*known, *(("resistance", "inductance") if electrical else ())}
     names |= {"resistance"} if driven_by == "voltage" else set()
     constants = {"torque_constant", "back_emf_constant"}
@@ -295,16 +284,6 @@ def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str,
         names |= {"rotor_inertia"}
     names |= set() if driven_by is None else {"inertia"}
     return missing(names, base)
-
-
-def _uses(logs: Sequence[Log]) -> tuple[list[Log], list[Log], str | None, str]:
-    """Logs that tell the winding, logs that tell the shaft; by which input, and by which output if they have one."""
-    moving = [log for log in logs if moves(log)]
-    driven_by, output = (
-        next((name for name in names if moving and all(log.has(name) for log in moving)), None)
-        for names in (INPUTS, OUTPUTS)
-    )
-    return [log for log in logs if log.has("voltage", "current")], moving, driven_by, output or ""
 
 
 def _foretold(shaft: Fit | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:

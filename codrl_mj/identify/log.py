@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ SIGNALS = {
 }
 """What a log may hold -> its SI unit; None: any."""
 LONGEST_STEP = 5.0  # a longer step, in median steps, is a gap, across which nothing is simulated
+_ROUND = {*(tenths / 10 for tenths in range(10, 100)), 1.25, 2.25}  # leading digits of a step that a file rounds to
 _MOST_LEVELS = 1_000_000  # of a converter: what has more is as good as continuous
 
 
@@ -135,6 +136,94 @@ def find_resolution(values: np.ndarray) -> float:
         if count < _MOST_LEVELS and float(np.abs(grid - np.round(grid)).max()) < 0.1:
             return spread / count
     return 0.0
+
+
+def turn_jumps(values: np.ndarray, period: float) -> np.ndarray:
+    """Return the rows after which an angle jumps by a turn, `period` in its unit; none if it mostly moves that fast."""
+    steps = np.abs(np.diff(values))
+    jumps = np.flatnonzero(np.abs(steps - period) < 0.1 * period)
+    return jumps if jumps.size and np.mean(steps > 0.25 * period) <= 0.2 else jumps[:0]
+
+
+def counts_per_turn(step: float, period: float) -> int | None:
+    """Return the counts of an encoder whose step is a part of a turn; None if it is as likely a file's rounding."""
+    if step <= 0.0 or round(step / 10.0 ** math.floor(math.log10(step)), 5) in _ROUND:
+        return None
+    count = round(period / step)
+    is_usual = count >= 100 and (count % 100 == 0 or count & (count - 1) == 0)
+    return count if is_usual and abs(period / step - count) < 0.02 else None
+
+
+def is_supply(volts: np.ndarray, others: Sequence[np.ndarray]) -> bool:
+    """Return True if a voltage hardly changes although the motor is driven or turns both ways, as only a supply's."""
+    reverses = any(one.size and float(one.min()) < -0.2 * float(np.abs(one).max()) < 0.0 < one.max() for one in others)
+    return bool(volts.size) and 0.0 < float(volts.max()) <= 1.3 * float(volts.min()) and reverses
+
+
+# -- whether a fit can use it ---------------------------------------------------------------------------------------
+
+INPUTS = "torque", "current", "voltage"  # what drives the shaft: the nearest to it that all logs that move have
+OUTPUTS = "position", "velocity"  # what a simulation is compared with
+MAX_STEP = 0.05  # rows that are farther apart [s] say too little within the time that is predicted
+MIN_ROWS = 20  # of the longest stretch without a gap: a shaft has up to five parameters and two states
+MIN_DURATION = 0.04  # of that stretch [s], if the shaft moves: the first 0.03 s only tell the state it begins from
+
+
+class Usage(NamedTuple):
+    """The part of a fit that each of some logs is for."""
+
+    electrical: list[Log]  # tell the winding
+    moving: list[Log]  # tell the shaft
+    driven_by: str | None  # the shaft's input in the fit; None if the moving logs have none in common
+    output: str  # the motion that the fit compares; empty if the moving logs have none in common
+
+
+def usage(logs: Sequence[Log]) -> Usage:
+    """Return which logs tell the winding and which the shaft, by which input and output."""
+    moving = [log for log in logs if moves(log)]
+    driven_by, output = (
+        next((name for name in names if moving and all(log.has(name) for log in moving)), None)
+        for names in (INPUTS, OUTPUTS)
+    )
+    return Usage([log for log in logs if log.has("voltage", "current")], moving, driven_by, output or "")
+
+
+def obstacle(logs: Sequence[Log]) -> Finding | None:
+    """Return the reason why logs cannot be fitted together, as `check` and `identify` report it; None if they can."""
+    electrical, moving, driven_by, _ = usage(logs)
+    if not electrical and driven_by is None:
+        return _no_signals(logs, bool(moving))
+    for log in moving:
+        if log.step > MAX_STEP:
+            text = f"log {log.name}: a row every {log.step:.3g} s, must be at most {MAX_STEP:g} s"
+            remedy = "log more often; or correct the unit of time"
+            return Finding("error", "rows", None, text, remedy)
+    for log in [*electrical, *moving]:
+        rows = max(usable(log), key=lambda stretch: stretch.stop - stretch.start, default=slice(0, 1))
+        count, seconds = rows.stop - rows.start, float(log.time[rows.stop - 1] - log.time[rows.start])
+        is_moving = any(log is one for one in moving)
+        if count < MIN_ROWS or (is_moving and seconds < MIN_DURATION):
+            text = f"log {log.name}: {count} rows in {seconds:.3g} s without a gap, must be at least {MIN_ROWS}"
+            text += f" in {MIN_DURATION:g} s" if is_moving else ""
+            return Finding("error", "rows", None, text, "log for longer, without gaps")
+    return None
+
+
+def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
+    """Return which signals are missing for a fit, and how to get them."""
+    signals = set().union(*(log.signals for log in logs))
+    if not signals & {*INPUTS}:
+        lacking, remedy = "no voltage, current or torque", "log one of them"
+        if "duty" in signals:
+            remedy = "write voltage=duty*bus:V with the columns of both, or voltage=duty*12:V if the supply has 12 V"
+        elif "command" in signals:
+            remedy += "; of a servo also the duty (Feetech: Present Load, Dynamixel: Present PWM) and the input voltage"
+    elif is_moving:
+        lacking, remedy = "no torque, current or voltage in all logs that move", "fit alike logs together"
+    else:
+        lacking, remedy = "no position or velocity that moves", "log the motion, or both voltage and current"
+    who, them = ("this log has", "it") if len(logs) == 1 else ("these logs have", "them")
+    return Finding("error", "signals", None, f"{who} {lacking}: nothing can be identified from {them}", remedy)
 
 
 # -- cut into segments, each simulated from an initial state of its own ----------------------------------------------

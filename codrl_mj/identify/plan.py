@@ -20,7 +20,17 @@ from codrl_mj.identify.estimate import Model, refit
 from codrl_mj.identify.log import Log, Segment
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, OF_LOSS, PARAMETERS
-from codrl_mj.identify.synthetic import EXCITATIONS, FREE, Excitation, Load, Sampler, run, sample_times, simulate
+from codrl_mj.identify.synthetic import (
+    EXCITATIONS,
+    FREE,
+    Excitation,
+    Load,
+    Sampler,
+    check_size,
+    run,
+    sample_times,
+    simulate,
+)
 from codrl_mj.runs.files import writing
 
 GOALS = {
@@ -99,6 +109,7 @@ def plan(
     motor, fastest = drive.motor, drive.controller.sample_rate
     rates = [rate for rate in RATES if rate <= fastest] or [fastest]
     truth = {**vars(motor), "inertia": motor.rotor_inertia * motor.gear_ratio**2 + load.inertia}
+    check_size(drive, duration, rates[-1])
     options = [
         _option(drive, kind, rate, duration, load, sensing or Sensing(), (limit, continuous_current), truth)
         for kind in EXCITATIONS

@@ -1,4 +1,4 @@
-"""Logs from files: CSV (also .gz), JSON and, where pyarrow is installed, Parquet; which columns are which signals."""
+"""Logs from files: CSV (also .gz), JSON and, where pyarrow is installed, Parquet."""
 
 import collections
 import csv
@@ -6,7 +6,6 @@ import datetime
 import gzip
 import importlib
 import json
-import keyword
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,11 +13,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.columns import KINDS, Column, parse_columns
+from codrl_mj.identify.columns import Column, parse_columns
 from codrl_mj.identify.log import SIGNALS, Finding, Log, find_resolution
 
 _WORDS = {"": np.nan, "nan": np.nan, "none": np.nan, "null": np.nan, "na": np.nan, "true": 1.0, "false": 0.0}
 STAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d")  # seconds since 1970, or since midnight
+_SIGN_BITS = {
+    **dict.fromkeys(("duty", "voltage", "torque"), ((11, 1000.0), (16, 8192.0))),
+    **dict.fromkeys(("current", "velocity"), ((16, 8192.0),)),
+}
+"""Signal -> bits and largest numbers of registers that servos (Feetech's) give a bit for the sign in."""
 _MOST_UNUSABLE = 0.2  # share of rows that may be left out as unreadable or out of order
 
 
@@ -31,6 +35,13 @@ class Cells(NamedTuple):
     lines: Sequence[int] = ()  # of the file, of each row
     units: Mapping[str, str] = {}  # by column, where a line states them
     commas: bool = False  # whether a number may have a decimal comma
+    entries: Mapping[str, list[str]] = {}  # names of the entries of columns that held lists, such as joints
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """Columns by the names of their entries: action[elbow] -> action[1]."""
+        pairs = ((name, *pair) for name, entries in self.entries.items() for pair in enumerate(entries))
+        return {f"{name}[{entry}]": f"{name}[{place}]" for name, place, entry in pairs}
 
     def numbers(self, name: str) -> np.ndarray:
         """A column as numbers, NaN where it is empty."""
@@ -66,7 +77,9 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
             semicolon, tab or blanks between values; lines that begin with # or hold one cell are no rows, one without a
             number under the names is of units. Decimal commas, times of day (ISO 8601) and Latin-1 are read.
             JSON is a list of rows, or an object with one such list, such as `entries`, and numbers beside it,
-            which formulas can use, or an object of columns.
+            which formulas can use, or an object of columns. Of a column that holds lists, `column[0]` is the first
+            entry, and `column[elbow]` the one of that name: by `features` in the file, or in meta/info.json of the
+            data set that the file lies in.
         columns: `signal=formula:unit` separated by commas, or a mapping of signals to `formula:unit`. The voltage is
             what holds from its row to the next, or `mean(formula)`: the mean in between. `only=formula` leaves out the
             rows where it is 0.
@@ -79,16 +92,20 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
     if not path.is_file():
         raise FileNotFoundError(f"no log at {path}")
     try:
-        return _log(path.name.removesuffix(".gz").rpartition(".")[0], read_table(path), mapping)
+        return to_log(path.name.removesuffix(".gz").rpartition(".")[0], read_table(path), mapping)
     except (ValueError, UnicodeDecodeError, gzip.BadGzipFile, EOFError) as error:
         raise ValueError(f"log {path}: {error}") from None
 
 
-def _log(name: str, table: Cells, mapping: Mapping[str, Column]) -> Log:
+def to_log(name: str, table: Cells, mapping: Mapping[str, Column]) -> Log:
+    """Return the log that a file's columns are by a mapping, as `read_log` does."""
     count = len(next(iter(table.columns.values()), ()))
     numbers = np.setdiff1d(np.arange(1, count + len(table.ragged) + 1), table.ragged)  # of the rows, in the file
-    needed = set().union(*(one.names for one in mapping.values())) & table.columns.keys()
+    labels = table.labels
+    used = set().union(*(one.names for one in mapping.values()))
+    needed = {labels.get(name, name) for name in used} & table.columns.keys()
     read = {**dict.fromkeys(table.columns), **table.constants, **{one: table.numbers(one) for one in needed}}
+    read |= {label: read[column] for label, column in labels.items() if column in read}
     signals = {one: np.broadcast_to(np.asarray(made.value(read), float), (count,)) for one, made in mapping.items()}
     time, wanted = signals.pop("time"), signals.pop("only", np.ones(count)) != 0.0
     finite = np.isfinite(time) & np.all([np.isfinite(values) for values in signals.values()], axis=0)
@@ -124,9 +141,9 @@ def _log(name: str, table: Cells, mapping: Mapping[str, Column]) -> Log:
 
 
 def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column], numbers: np.ndarray) -> Iterator[Finding]:
-    """Columns that look like registers with a sign that is read without it: the highest and lowest quarter are used."""
-    unsigned = (one for one in mapping.values() if "twos_complement" not in one.formula)
-    for name in sorted(set().union(*(one.names for one in unsigned))):
+    """Find columns that look like registers whose sign is read as part of the number."""
+    unsigned = (one for one in mapping.values() if not re.search("twos_complement|sign_magnitude", one.formula))
+    for name, signal in sorted({(name, one.signal) for one in unsigned for name in one.names}):
         column = np.asarray(values[name] if values[name] is not None else 0.0, float)
         for bits in (8, 16, 32):
             whole = 2.0**bits
@@ -136,6 +153,16 @@ def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column], numbers:
                 row = int(numbers[np.flatnonzero(high)[0]])
                 text = f"{name} is below {whole / 4:.0f} or above {3 * whole / 4:.0f}: has it {bits} bits and a sign?"
                 yield Finding("error", "register", row, text, f"write twos_complement({name}, {bits})")
+        for bits, largest in _SIGN_BITS.get(signal, ()):
+            half = 2.0 ** (bits - 1)
+            high, low = (column >= half) & (column <= half + largest), (column >= 0.0) & (column <= largest)
+            within = (column == np.round(column)) & (high | low)
+            # a signal that changes its sign passes near 0 on both sides
+            near = [column[one].min() - less <= 0.25 * largest for one, less in ((high, half), (low, 0.0)) if one.any()]
+            if len(near) == 2 and all(near) and np.all(within | np.isnan(column)):
+                row = int(numbers[np.flatnonzero(high)[0]])
+                text = f"{name} is at most {largest:.0f}, or {half:.0f} and more: is its bit {bits - 1} the sign?"
+                yield Finding("error", "register", row, text, f"write sign_magnitude({name}, {bits})")
 
 
 def _left_out(rows: np.ndarray, check: str, what: str) -> Iterator[Finding]:
@@ -148,7 +175,45 @@ def _left_out(rows: np.ndarray, check: str, what: str) -> Iterator[Finding]:
 
 
 def read_table(path: Path) -> Cells:
-    """A file's columns as they stand there; see `read_log`, which says which files."""
+    """Return a file's columns, a list's as one column an entry; see `read_log`, which says which files are read."""
+    table = _read_table(path)
+    columns: dict[str, Any] = {}
+    for name, values in table.columns.items():
+        lists = [_as_list(value) for value in values] if any(_as_list(value) for value in values[:20]) else []
+        for entry in range(max((len(one) for one in lists if one), default=0)):
+            columns[f"{name}[{entry}]"] = [one[entry] if one and entry < len(one) else None for one in lists]
+        if not lists:
+            columns[name] = values
+    if len(columns) > len(table.columns) and not table.entries:
+        for folder in [*path.absolute().parents][:3]:
+            if (info := folder / "meta" / "info.json").is_file():
+                table = table._replace(entries=_entry_names(json.loads(info.read_text(encoding="utf-8"))))
+                break
+    return table._replace(columns=columns)
+
+
+def _as_list(value: Any) -> list[Any] | None:
+    """Return a cell's list, also from a text such as `[0.1 2]`; None if it holds none."""
+    if isinstance(value, str) and value[:1] == "[" and value[-1:] == "]":
+        return value.strip("[]").replace(",", " ").split()
+    return value if isinstance(value, list) and not any(isinstance(one, list | dict) for one in value) else None
+
+
+def _entry_names(content: Any) -> dict[str, list[str]]:
+    """Return the names of the entries of list columns, from the `features` of a parsed file; empty without them."""
+    features = content.get("features") if isinstance(content, dict) else None
+    found = {}
+    for name, feature in features.items() if isinstance(features, dict) else ():
+        names = feature.get("names") if isinstance(feature, dict) else None
+        # Some files list the names under the kind of entry, as {"motors": [...]}.
+        names = next(iter(names.values()), None) if isinstance(names, dict) else names
+        if isinstance(names, list):
+            found[name] = [*map(str, names)]
+    return found
+
+
+def _read_table(path: Path) -> Cells:
+    """Return a file's columns as they stand there."""
     kind = Path(path.name.removesuffix(".gz")).suffix.lower()
     if kind == ".parquet":
         try:
@@ -210,7 +275,8 @@ def _is_filled(row: Sequence[str]) -> bool:
     missing, numbers = sum(cell.lower() in ("", "null", "none", "na") for cell in row), 0
     for cell in row:
         try:
-            float(cell.replace(",", "."))
+            for one in _as_list(cell) or [cell.replace(",", ".")]:
+                float(one)
             numbers += 1
         except ValueError:
             numbers += bool(STAMP.match(cell))
@@ -224,111 +290,11 @@ def _json(content: Any) -> Cells:
     tables = [one for one in lists.values() if isinstance(one[0], dict)]
     if len(tables) == 1 and all(isinstance(row, dict) for row in tables[0]):
         names = dict.fromkeys(name for row in tables[0] for name in row)
-        return Cells({name: [row.get(name) for row in tables[0]] for name in names}, constants, [])
+        columns = {name: [row.get(name) for row in tables[0]] for name in names}
+        return Cells(columns, constants, [], entries=_entry_names(content))
     if isinstance(content, dict) and not tables and lists and len({len(one) for one in lists.values()}) == 1:
-        return Cells(lists, constants, [])
+        return Cells(lists, constants, [], entries=_entry_names(content))
     raise ValueError(
         "JSON must be a list of rows, an object with one such list and numbers beside it, or an object of columns of "
         "the same length"
     )
-
-
-# -- proposed, for a person to read before it is used -----------------------------------------------------------------
-
-_NAMES = {
-    "only": "enable enabled armed",
-    "time": "t time timestamp stamp zeit",
-    "command": "goal target command setpoint reference ref cmd desired",
-    "temperature": "temp temperature",
-    "bus": "bus vbus vin supply vcc battery",
-    "duty": "duty pwm",
-    "velocity": "w omega speed velocity vel qd dq drehzahl",
-    "position": "q pos position angle theta phi encoder enc winkel",
-    "torque": "tau torque trq moment",
-    "current": "i current iq strom",
-    "voltage": "u v voltage spannung",
-}
-"""Signal -> words of its names; of a name with several the first signal counts."""
-_UNITS = {"°": "deg", "º": "deg", "degrees": "deg", "radians": "rad", "sec": "s", "seconds": "s", "%": "percent"}
-_LARGE = {"velocity": (1000.0, "rpm"), "current": (200.0, "mA"), "duty": (1.5, "percent")}  # above, in that unit
-
-
-class Proposal(NamedTuple):
-    """What a log's columns may be."""
-
-    columns: str
-    """As `read_log` and `--columns` take it."""
-    doubts: tuple[str, ...]
-    """What could not be told, or was guessed."""
-
-
-def propose_columns(path: Path | str) -> Proposal:
-    """Which signals the columns of a file may be: by names, units in them (`u [V]`, `pos_deg`) or below, and values.
-
-    Args:
-        path: of a log, as `read_log` takes it.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, or has no time or nothing else.
-    """
-    table, entries, doubts = read_table(Path(path)), {}, []
-    for name in table.columns:
-        words = [one for one in re.split(r"[\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()) if one]
-        bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]", name)
-        ends = re.split(r"[\W_]+", name.lower() if name.isupper() else name)[1:]  # mA is one, and none of two words
-        stated = [table.units.get(name, "").strip("[]() "), *([bracket[1]] if bracket else []), *reversed(ends)]
-        stated += reversed(words[1:])
-        named = [one for one, known in _NAMES.items() if {*known.split()} & {*words}]
-        fitting = [one for one in named if any(text and _valid(one, text) for text in stated[: 1 + bool(bracket)])]
-        signal = next((one for one in (*fitting, *named) if one not in entries), None)
-        if signal is None:
-            doubts.append(f"{name}: " + (f"left out, {named[0]} is another" if named else "not known, left out"))
-            continue
-        unit = next((one for text in stated if text and (one := _valid(signal, text))), None)
-        if unit is None:
-            unit, doubt = _guessed(signal, name, table)
-            doubts.append(f"{name}: {doubt}")
-        plain = name.isascii() and name.isidentifier() and not keyword.iskeyword(name)
-        entries[signal] = f"{name if plain else json.dumps(name, ensure_ascii=False)}:{unit}"
-    if "voltage" not in entries and {"duty", "bus"} <= entries.keys():
-        duty, bus = entries["duty"].rpartition(":")[0], entries["bus"].rpartition(":")
-        part = "/100" if entries["duty"].endswith("percent") else ""
-        entries["voltage"] = f"{duty}{part}*{bus[0]}:{bus[2]}"
-        doubts.append("voltage: taken as the duty's share of the bus")
-    if "time" not in entries or len(entries) < 2:
-        known = ", ".join(table.columns)
-        raise ValueError(f"log {path}: no time, or nothing else, can be told by its columns: {known}")
-    return Proposal(",".join(f"{signal}={entry}" for signal, entry in entries.items()), tuple(doubts))
-
-
-def _valid(signal: str, unit: str) -> str | None:
-    """A unit as the mapping takes it, if it is one of the signal."""
-    for one in (_UNITS.get(unit, unit), unit.upper() if len(unit) == 1 else unit, unit[:1] + unit[1:].upper()):
-        try:
-            Column(signal, "x", one)
-        except ValueError:
-            continue
-        return one
-    return None
-
-
-def _guessed(signal: str, name: str, table: Cells) -> tuple[str, str]:
-    """A unit by a column's values, and what is to be seen to."""
-    unit = KINDS[signal] or "1"
-    try:
-        found = table.numbers(name)
-    except ValueError:
-        return unit, "holds texts"
-    if signal == "time" and any(isinstance(one, str) and STAMP.match(one) for one in table.columns[name][:2]):
-        return "s", "clock stamps, read as seconds since the first"
-    found = found[np.isfinite(found)]
-    largest = float(np.abs(found).max(initial=0.0))
-    step = float(np.median(np.diff(found))) if found.size > 1 else 0.0
-    if signal == "time" and step > 0.5:
-        unit = "us" if step > 50.0 else "ms"
-    elif signal == "position" and largest > 40.0 and (grid := find_resolution(found)) > 0.0:
-        unit = "deg" if abs(360.0 / grid - round(360.0 / grid)) < 1e-3 else unit  # else it may turn on
-    elif signal in _LARGE and largest > _LARGE[signal][0]:
-        unit = _LARGE[signal][1]
-    return unit, f"no unit is stated, {unit} is a guess (values up to {largest:.4g}): see to it"

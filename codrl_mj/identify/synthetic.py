@@ -14,7 +14,7 @@ import numpy as np
 
 from codrl_mj.actuators import Drive
 from codrl_mj.actuators.shaft import resistance_at
-from codrl_mj.fields import Checked, check_names, real
+from codrl_mj.fields import Checked, check_memory, check_names, real
 from codrl_mj.identify.columns import KINDS
 from codrl_mj.identify.log import Log
 from codrl_mj.runs.files import writing
@@ -95,6 +95,7 @@ class Load(Checked):
 
 FREE = Load()  # nothing but the rotor
 SEEN = "current", "position", "velocity", "torque", "bus", "voltage", "duty"  # what a simulated log has
+_SAMPLE_SIZE, _ROW_SIZE = 80, 200  # memory [bytes] of a drive's sample, and of a row until it is written, as measured
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,8 +171,17 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
 
 def sample_times(drive: Drive, duration: float) -> np.ndarray:
     """The times [s] of the drive's samples from 0 to a duration, shape (n + 1,)."""
+    check_size(drive, duration, 0.0)
     period = 1.0 / drive.controller.sample_rate
     return period * np.arange(math.ceil(duration / period - 1e-9) + 1)
+
+
+def check_size(drive: Drive, duration: float, rate: float) -> None:
+    """Refuse a simulation of a duration [s], with rows at a rate [Hz], that memory does not hold."""
+    samples, rows = duration * drive.controller.sample_rate, duration * rate
+    what = f"{duration:,g} s are {samples:,.0f} samples of the drive and {rows:,.0f} rows"
+    remedy = "shorten the duration (--duration), or lower the rate of the rows"
+    check_memory(_SAMPLE_SIZE * samples + _ROW_SIZE * rows, what, remedy)
 
 
 def simulate(
@@ -188,6 +198,8 @@ def simulate(
 
     Signals without a sensor show what is. The voltage is the one asked for, without sag; the torque n*kT*i.
     """
+    if isinstance(excitation, Excitation):
+        check_size(drive, excitation.duration, sampler.rate)
     course = run(drive, excitation, load, position)
     check_names(sensors or {}, SEEN, "signal")
     random = np.random.default_rng(seed)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from codrl_mj.evaluation import check_episodes
 from codrl_mj.runs import CONFIG, finished
 from codrl_mj.runs.files import sealed, write_json
 from codrl_mj.training import folder
@@ -55,6 +56,7 @@ def train(
         RunInUseError: another process trains in `out`.
         TrainingStoppedError: a signal asked to stop.
     """
+    check_episodes(config.evaluation_episodes, "evaluation_episodes")
     record = folder.admit(out, config, resume, accept_changes)
     if record is None and finished(out):
         return out

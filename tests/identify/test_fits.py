@@ -303,7 +303,7 @@ def test_a_voltage_alone_tells_the_constants_only_together(swings):
         ({"rig": "pendulum", "known": {"mgl": 3.6}, "estimated": ["mgl"]}, "mgl: both known and estimated"),
         ({"rig": "pendulum", "segment": 0.0}, r"segment = 0.0: must be >= 0.05"),
         ({"logs": [], "rig": "free"}, "none was given"),
-        ({"logs": ["still"], "rig": "free"}, "tell nothing"),
+        ({"logs": ["still"], "rig": "free"}, "nothing can be identified"),
         ({"logs": ["slow"], "rig": "pendulum"}, r"a row every 0.1 s, must be at most 0.05 s"),
         (
             {"logs": ["swing0", "velocity"], "rig": "pendulum"},

@@ -3,11 +3,13 @@
 import dataclasses
 import functools
 import math
+import re
 
 import numpy as np
 import pytest
 
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
+from codrl_mj.identify import identify
 from codrl_mj.identify.checks import FACTORS, check, name_of_factor
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.simulation import Moved, moving
@@ -194,6 +196,48 @@ def test_a_voltage_that_is_no_mean_is_found_where_it_changes_between_rows():
     assert (one.severity, "half a row" in one.message) == ("warning", True)
     (one,) = found(dataclasses.replace(at_rows, mean_voltage=False), "voltage")
     assert one.severity == "info"
+
+
+def test_a_duty_in_percent_is_found():
+    log = without(logged(), "torque", "bus")
+    assert found(log, "unit") == []
+    (one,) = found(scaled(log, duty=100.0), "unit")
+    assert (one.severity, one.remedy) == ("error", "correct its unit, such as duty=column:percent")
+    (one,) = found(without(scaled(log, voltage=100.0), "duty", "current"), "unit")
+    assert (one.severity, "a duty in percent" in one.message) == ("warning", True)
+
+
+@pytest.mark.parametrize("signals", [("current",), ("velocity",), ("position",)])
+def test_a_supply_taken_for_the_motors_voltage_is_found(signals):
+    log = without(logged(kind="slow_sine"), *{*logged().signals} - {*signals, "voltage"})
+    assert "error" not in {one.severity for one in found(log, "voltage")}
+    supply = 24.0 + 0.05 * np.sin(log.time)
+    (one,) = [one for one in found(replaced(log, voltage=supply), "voltage") if one.severity == "error"]
+    assert one.remedy.startswith("write bus=column:V")
+    held = replaced(log, voltage=supply, **{name: np.cumsum(np.abs(log.signals[name])) for name in signals})
+    assert "error" not in {one.severity for one in found(held, "voltage")}  # it may be a step that is held
+
+
+def test_rows_that_repeat_old_values_are_found():
+    """A position that is read 500 times a second into rows of 5 kHz; one of a coarse encoder is left in peace."""
+    log = logged(kind="slow_sine")
+    (one,) = found(replaced(log, position=np.repeat(log.signals["position"][::10], 10)[:-9]), "repeated")
+    assert (one.severity, "every 10th row" in one.message) == ("warning", True)
+    coarse = logged(kind="slow_sine", changes=(("position", "resolution", 0.05),))
+    assert found(coarse, "repeated") == found(log, "repeated") == []
+
+
+@pytest.mark.parametrize("signals", [("velocity",), ("position", "velocity"), ("voltage",), ("position", "voltage")])
+@pytest.mark.parametrize("every", [1, 300])
+def test_what_a_fit_refuses_is_an_error_of_the_check(signals, every):
+    """Rows over 50 ms apart, and too few signals, are refused by both, in the same words."""
+    log = logged(kind="slow_sine")
+    part = Log("part", 10.0 * log.time[::every], {name: log.signals[name][::every] for name in signals})
+    told = [one for one in check(part) if one.check in ("signals", "rows")]
+    assert bool(told) == (signals != ("position", "voltage") or every == 300)
+    if told:
+        with pytest.raises(ValueError, match=re.escape(f"{told[0].message}; {told[0].remedy}")):
+            identify([part], "free", {"load_inertia": 0.0})
 
 
 def test_gaps_dropped_rows_and_jitter():

@@ -59,13 +59,18 @@ def test_errors_are_an_exit_status_and_json(capsys):
 def test_columns_are_proposed_with_the_line_to_type_next(capsys):
     said(capsys, QUBE)
     text = said(capsys, "columns log.csv")
-    assert "to be checked: current: no unit is stated, A is a guess" in text
+    assert "to be checked: current: no unit is stated: replace UNIT by A or mA" in text
     line = text.splitlines()[-1].removeprefix("codrl-mj identify ")
-    assert "current=current:A" in line
+    assert "current=current:UNIT" in line
     assert line.endswith("--rig free --known load_inertia=0 --out motor")
+    assert "current=current:UNIT: the unit is not filled in" in said(capsys, line, 2)
+    units = ("current:A", "position:rad", "velocity:rad/s", "torque:N*m")
+    for unit in units:
+        line = line.replace(f"{unit.partition(':')[0]}:UNIT", unit)
     said(capsys, f"check {line.partition(' --rig')[0]} --rig free")
     columns = json.loads(said(capsys, "columns log.csv --json"))["columns"]
-    assert columns.startswith("time=time:s,current=current:A")
+    assert columns.startswith("time=time:s,current=current:UNIT")
+    columns = "time=time:s,current=current:A,voltage=voltage:V,position=position:rad"
     assert "rig is not given (--rig on the command line" in said(capsys, f"log.csv --columns {columns}", 2)
 
 

@@ -112,6 +112,27 @@ def test_a_register_with_a_sign_is_seen(tmp_path):
     np.testing.assert_array_equal(log.signals["current"], numbers)
 
 
+@pytest.mark.parametrize(("signal", "bits"), [("duty", 11), ("voltage", 11), ("current", 16), ("velocity", 16)])
+def test_a_register_whose_highest_bit_is_the_sign_is_seen(tmp_path, signal, bits):
+    numbers = np.round(300.0 * np.sin(0.2 * np.arange(200.0))).astype(int)
+    register = [abs(one) | (int(one < 0) << (bits - 1)) for one in map(int, numbers)]
+    path = write(tmp_path, "\n".join(["t,x"] + [f"{row},{one}" for row, one in enumerate(register)]))
+    unit = {"duty": "1", "voltage": "V", "current": "A", "velocity": "rad/s"}[signal]
+    (found,) = read_log(path, f"time=t:s,{signal}=x:{unit}").findings
+    assert (found.severity, found.check, found.row) == ("error", "register", 1 + int(np.argmax(numbers < 0)))
+    assert found.remedy == f"write sign_magnitude(x, {bits})"
+    log = read_log(path, f"time=t:s,{signal}=sign_magnitude(x, {bits}):{unit}")
+    assert log.findings == ()
+    np.testing.assert_array_equal(log.signals[signal], numbers)
+    assert read_log(path, "time=t:s,position=x:rad").findings == ()  # an encoder's counts may be there
+
+
+def test_a_voltage_in_whole_millivolts_has_no_sign_to_lose(tmp_path):
+    numbers = np.round(700.0 + 600.0 * np.sin(0.2 * np.arange(200.0))).astype(int)
+    path = write(tmp_path, "\n".join(["t,x"] + [f"{row},{one}" for row, one in enumerate(numbers)]))
+    assert read_log(path, "time=t:s,voltage=x:mV").findings == ()
+
+
 @pytest.mark.parametrize(
     ("text", "name", "says"),
     [

@@ -1,0 +1,291 @@
+"""Columns that are proposed for logs as people have them: nothing is guessed that nobody would find out later."""
+
+import gzip
+import json
+import re
+import shlex
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from codrl_mj.cli import main
+from codrl_mj.identify import check, propose_columns, read_log
+from codrl_mj.identify.identify import checked
+from codrl_mj.identify.log import SIGNALS
+
+ROWS = np.arange(600)
+TIME = 0.01 * ROWS
+SPEED = 3.0 * np.sin(np.pi * TIME)
+ANGLE = 3.0 / np.pi * (1.0 - np.cos(np.pi * TIME))
+VOLTS = 5.0 * np.sin(np.pi * TIME + 0.3)
+CURRENT = 0.8 * np.sin(np.pi * TIME + 0.4) + 0.01 * np.random.default_rng(0).standard_normal(600)
+SUPPLY = 24.0 + 0.05 * np.sin(TIME)
+COUNTS = np.round(2048 + ANGLE / (2.0 * np.pi) * 4096).astype(int)
+LOAD = np.round(VOLTS / 12.0 * 1000).astype(int)
+ZERO = 0 * ROWS
+EPOCH = 1_700_000_000
+
+SLOPPY = {
+    "Dynamixel Wizard": (
+        {"Time(ms)": 10 * ROWS, "Present Position": COUNTS, "Present Current": LOAD, "Present PWM": LOAD}
+        | {"Present Input Voltage": ZERO + 120},
+        'time="Time(ms)":ms,position="Present Position":UNIT,current="Present Current":UNIT,duty="Present PWM":UNIT,'
+        'bus="Present Input Voltage":UNIT',
+    ),
+    "Feetech debugger": (
+        {"Time": 10 * ROWS, "Position": COUNTS, "Goal": COUNTS, "Load": LOAD, "Current": LOAD} | {"Voltage": ZERO + 74},
+        "time=Time:ms,position=Position:UNIT,command=Goal:UNIT,duty=Load:UNIT,current=Current:UNIT,bus=Voltage:UNIT",
+    ),
+    "LeRobot's registers": (
+        {"timestamp": TIME, "Goal_Position": COUNTS, "Present_Position": COUNTS, "Present_Current": LOAD},
+        "time=timestamp:s,command=Goal_Position:UNIT,position=Present_Position:UNIT,current=Present_Current:UNIT",
+    ),
+    "ODrive": (
+        {"timestamp": EPOCH + TIME, "pos_estimate": ANGLE, "vel_estimate": SPEED, "Iq_measured": CURRENT}
+        | {"vbus_voltage": SUPPLY, "Vq": VOLTS, "pos_setpoint": ANGLE, "current_state": ZERO},
+        "time=timestamp:s,position=pos_estimate:UNIT,velocity=vel_estimate:UNIT,current=Iq_measured:UNIT,"
+        "bus=vbus_voltage:V,voltage=Vq:V,command=pos_setpoint:UNIT",
+    ),
+    "moteus": (
+        {"timestamp": TIME, "MODE": ZERO, "POSITION": ANGLE, "VELOCITY": SPEED, "TORQUE": CURRENT}
+        | {"Q_CURRENT": CURRENT, "D_CURRENT": 0.1 * CURRENT, "VOLTAGE": SUPPLY, "FAULT": ZERO},
+        "time=timestamp:s,position=POSITION:UNIT,velocity=VELOCITY:UNIT,torque=TORQUE:UNIT,current=Q_CURRENT:UNIT,"
+        "bus=VOLTAGE:V",
+    ),
+    "VESC Tool": (
+        {"ms_today": 36_000_000 + 20 * ROWS, "input_voltage": SUPPLY, "current_motor": CURRENT, "current_in": CURRENT}
+        | {"d_axis_current": CURRENT, "q_axis_current": CURRENT, "erpm": SPEED, "duty_cycle": VOLTS / 24.0}
+        | {"encoder_position": ANGLE, "d_axis_voltage": VOLTS},
+        "time=ms_today:ms,bus=input_voltage:V,current=current_motor:UNIT,duty=duty_cycle:1,"
+        "position=encoder_position:UNIT,voltage=duty_cycle*input_voltage:V",
+    ),
+    "ROS 1": (
+        {"%time": 10_000_000 * ROWS, "field.header.seq": ROWS, "field.position0": ANGLE, "field.effort0": CURRENT},
+        'time="%time":ns,position="field.position0":UNIT,torque="field.effort0":UNIT',
+    ),
+    "ROS 2": (
+        {"header.stamp.sec": EPOCH + ROWS // 100, "header.stamp.nanosec": ROWS % 100 * 10_000_000, "position": ANGLE}
+        | {"effort": CURRENT},
+        'time="header.stamp.sec"+"header.stamp.nanosec"/1e9:s,position=position:UNIT,torque=effort:UNIT',
+    ),
+    "PlotJuggler": (
+        {"__time": EPOCH + TIME, "/joint_states/j0/position": ANGLE, "/joint_states/j0/effort": CURRENT},
+        'time=__time:s,position="/joint_states/j0/position":UNIT,torque="/joint_states/j0/effort":UNIT',
+    ),
+    "Arduino": (
+        {"millis": 10 * ROWS, "pwm": LOAD // 4, "encoder": COUNTS, "i": CURRENT},
+        "time=millis:ms,duty=pwm:UNIT,position=encoder:UNIT,current=i:UNIT",
+    ),
+    "microseconds": (
+        {"micros": 1000 * ROWS, "rpm": SPEED, "iq": CURRENT},
+        "time=micros:us,velocity=rpm:rpm,current=iq:UNIT",
+    ),
+    "an oscilloscope": (
+        {"Time [s]": TIME, "CH1 voltage [mV]": 1000.0 * VOLTS, "CH2 current [A]": CURRENT},
+        'time="Time [s]":s,voltage="CH1 voltage [mV]":mV,current="CH2 current [A]":A',
+    ),
+    "a table of degrees": (
+        {"time_s": TIME, "commanded_deg_s": SPEED, "angle_deg": (200.0 * ANGLE) % 360.0, "feedback_deg_s": SPEED}
+        | {"torque_N_m": CURRENT},
+        "time=time_s:s,command=commanded_deg_s:deg/s,position=unwrap(angle_deg,360):deg,velocity=feedback_deg_s:deg/s,"
+        "torque=torque_N_m:N*m",
+    ),
+    "turns that wrap": (
+        {"t_s": TIME, "pos": (2.0 * ANGLE) % 1.0, "u_V": VOLTS},
+        "time=t_s:s,position=unwrap(pos,1):turn,voltage=u_V:V",
+    ),
+    "radians that wrap": (
+        {"t_s": TIME, "pos": (9.0 * ANGLE) % (2.0 * np.pi) - np.pi, "u_V": VOLTS},
+        "time=t_s:s,position=unwrap(pos,2*pi):rad,voltage=u_V:V",
+    ),
+    "an encoder's degrees": (
+        {"t_s": TIME, "pos": COUNTS * 360.0 / 4096, "u_V": VOLTS},
+        "time=t_s:s,position=pos:deg,voltage=u_V:V",
+    ),
+    "names of others": (
+        {"time": TIME, "goal_position": ANGLE, "goal_current": CURRENT, "current_position": ANGLE}
+        | {"current_velocity": SPEED, "current_limit": ZERO, "bus_current": CURRENT, "present_current": CURRENT},
+        "time=time:s,command=goal_position:UNIT,position=current_position:UNIT,velocity=current_velocity:UNIT,"
+        "current=present_current:UNIT",
+    ),
+    "one letter each": (
+        {"t": TIME, "q": ANGLE, "w": SPEED, "u": CURRENT, "i": CURRENT},
+        "time=t:s,position=q:UNIT,velocity=w:UNIT,voltage=u:UNIT,current=i:UNIT",
+    ),
+    "ten rows a second, or ten thousand": (
+        {"t": 10.0 * TIME, "q_rad": ANGLE, "u_V": VOLTS},
+        "time=t:UNIT,position=q_rad:rad,voltage=u_V:V",
+    ),
+    "an inverter": (
+        {
+            "t_s": TIME,
+            "motor_voltage_V": VOLTS,
+            "dc_voltage_V": SUPPLY,
+            "dc_current_A": CURRENT,
+            "motor_current_A": CURRENT,
+        },
+        "time=t_s:s,voltage=motor_voltage_V:V,bus=dc_voltage_V:V,current=motor_current_A:A",
+    ),
+}
+"""Whose log -> its columns, what is to be proposed."""
+SI = {"duty": "1", "command": "1", "time": "s"} | {name: unit for name, unit in SIGNALS.items() if unit}
+
+
+def written(folder, columns, name="log.csv"):
+    table = np.column_stack([*columns.values()])
+    lines = [",".join(f'"{one}"' for one in columns), *(",".join(f"{value:.17g}" for value in row) for row in table)]
+    (folder / name).write_text("\n".join(lines))
+    return folder / name
+
+
+def filled(columns, time="s"):
+    """Return columns with a unit for each that is left open."""
+    return re.sub(r"(\w+)=([^,]*):UNIT", lambda one: f"{one[1]}={one[2]}:{(SI | {'time': time})[one[1]]}", columns)
+
+
+@pytest.mark.parametrize("whose", SLOPPY)
+def test_a_log_of_somebody_is_proposed_and_taken_once_its_units_are_filled_in(tmp_path, whose):
+    columns, expected = SLOPPY[whose]
+    found = propose_columns(written(tmp_path, columns))
+    assert found.columns == expected
+    assert found.problem is None
+    if "UNIT" in expected:
+        with pytest.raises(ValueError, match="the unit is not filled in; write the column's own, such as"):
+            read_log(tmp_path / "log.csv", expected)
+    log = read_log(tmp_path / "log.csv", filled(expected, "ms"))
+    assert {one.check for one in check(log)}.isdisjoint({"signals", "rows", "wrapped"})
+    checked([log], "free", {"load_inertia": 0.0})
+
+
+MOTION = {"position_rad": ANGLE, "velocity_rad_s": SPEED}
+EFFORTS = {"torque_Nm": CURRENT, "current_A": CURRENT, "voltage_V": VOLTS}
+
+
+@pytest.mark.parametrize("motion", [(), ("position_rad",), ("velocity_rad_s",), tuple(MOTION)])
+@pytest.mark.parametrize("effort", [(), ("torque_Nm",), ("current_A",), ("voltage_V",), ("voltage_V", "current_A")])
+@pytest.mark.parametrize(("step", "count"), [(0.01, 600), (0.1, 600), (0.01, 12)])
+def test_what_is_proposed_and_passed_by_the_check_is_what_the_fit_takes(tmp_path, motion, effort, step, count):
+    """By docs/identify.md: voltage and current, or an effort with a motion; rows within 50 ms; enough rows."""
+    if not motion + effort:
+        return
+    columns = {"t_s": step * ROWS, **{name: (MOTION | EFFORTS)[name] for name in (*motion, *effort)}}
+    path = written(tmp_path, {name: values[:count] for name, values in columns.items()})
+    told = len(effort) == 2 or (motion and effort)
+    possible = told and (step <= 0.05 or not motion) and count > 20
+    found = propose_columns(path)
+    assert (found.problem is None) == bool(possible), found.problem
+    log = read_log(path, found.columns)
+    assert bool({one.check for one in check(log)} & {"signals", "rows"}) is not bool(possible)
+    if possible:
+        checked([log], "free", {"load_inertia": 0.0})
+        return
+    with pytest.raises(ValueError, match=r"nothing can be identified|a row every 0.1 s, must be at most|12 rows in"):
+        checked([log], "free", {"load_inertia": 0.0})
+
+
+def said(capsys, *words):
+    status = main(["identify", *map(str, words)])
+    out, error = capsys.readouterr()
+    return status, out, error
+
+
+def test_a_line_to_type_next_is_taken_as_it_is_or_there_is_none(tmp_path, capsys):
+    """Without open units: the fit if it would begin, the check where that finds errors, else nothing."""
+    good = {"t_s": TIME, "u_V": VOLTS, "i_A": CURRENT, "q_rad": np.round(ANGLE, 3)}
+    status, out, _ = said(capsys, "columns", written(tmp_path, good))
+    line = out.splitlines()[-1]
+    assert status == 0
+    assert line.startswith("codrl-mj identify ")
+    assert line.endswith("--rig free --known load_inertia=0 --out motor")
+    bad = good | {"i_A": -CURRENT}
+    status, out, _ = said(capsys, "columns", written(tmp_path, bad))
+    line = out.splitlines()[-1]
+    assert status == 0
+    assert line.startswith("codrl-mj identify check ")
+    status, out, _ = said(capsys, *shlex.split(line)[2:])
+    assert status == 1
+    assert "sign" in out
+    status, out, _ = said(capsys, "columns", written(tmp_path, {"t_s": TIME, "goal_deg": ANGLE, "present_deg": ANGLE}))
+    assert status == 1
+    text = " ".join(out.split())
+    assert "this log has no voltage, current or torque: nothing can be identified from it; log one of them" in text
+    assert "Feetech: Present Load" in text
+    assert "codrl-mj identify" not in out
+    assert "--columns time=t_s:s,command=goal_deg:deg,position=present_deg:deg" in out
+
+
+def test_of_a_duty_without_a_supply_it_says_what_to_write(tmp_path):
+    found = propose_columns(written(tmp_path, {"t_s": TIME, "present_deg": ANGLE, "duty": VOLTS / 12.0}))
+    assert found.columns == "time=t_s:s,position=present_deg:deg,duty=duty:1"
+    assert "voltage=duty*12:V if the supply has 12 V" in found.problem
+
+
+EPISODE = [
+    {"timestamp": k / 30, "action": [a, 0.5], "observation.state": [a - 1.0, 1.0], "effort": [u, 0.0]}
+    for k, a, u in zip(range(90), map(float, ANGLE), map(float, CURRENT), strict=False)
+]
+FEATURES = {
+    "action": {"names": ["shoulder_pan.pos", "elbow"]},
+    "observation.state": {"names": {"motors": ["shoulder_pan", "elbow"]}},
+    "timestamp": {"names": None},
+}
+LISTED = "time=timestamp:s,torque=effort[0]:N*m,"
+
+
+def episode(folder, kind):
+    """The episode in a file of one kind; that of Parquet by a stand-in for pyarrow."""
+    columns = {name: [row[name] for row in EPISODE] for name in EPISODE[0]}
+    rows = ["timestamp;action;observation.state;effort"]
+    rows += [";".join(str(value) for value in row.values()) for row in EPISODE]
+    content = {
+        "json": json.dumps(EPISODE),
+        "columns.json": json.dumps(columns),
+        "features.json": json.dumps({"features": FEATURES, "rows": EPISODE}),
+        "csv": "\n".join(rows),
+        "numpy.csv": "\n".join(rows).replace(", ", " "),
+        "parquet": "",
+    }[kind]
+    path = folder / "data" / "chunk-000" / f"episode.{kind}"
+    path.parent.mkdir(parents=True)
+    path.write_text(content)
+    return path, columns
+
+
+@pytest.mark.parametrize("kind", ["json", "columns.json", "features.json", "csv", "numpy.csv", "parquet"])
+def test_an_entry_of_a_list_is_a_column(tmp_path, monkeypatch, kind):
+    path, columns = episode(tmp_path, kind)
+    table = SimpleNamespace(to_pydict=lambda: columns)
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow.parquet", SimpleNamespace(read_table=lambda _: table))
+    log = read_log(path, LISTED + 'command=action[1]:deg,position="observation.state"[0]:deg')
+    np.testing.assert_allclose(log.signals["command"], np.deg2rad(0.5))
+    np.testing.assert_allclose(log.signals["position"], np.deg2rad(ANGLE[:90] - 1.0))
+    with pytest.raises(
+        ValueError, match=r"action holds lists of 2 numbers; write the one you want, such as action\[0\]"
+    ):
+        read_log(path, LISTED + "command=action:deg")
+    found = propose_columns(path)
+    assert 'command=action[0]:UNIT,position="observation.state[0]":UNIT,torque=effort[0]:UNIT' in found.columns
+    read_log(path, filled(found.columns))
+
+
+@pytest.mark.parametrize("where", ["in the file", "beside it"])
+def test_an_entry_of_a_list_has_the_joints_name_where_that_is_known(tmp_path, where):
+    path, _ = episode(tmp_path, "features.json" if where == "in the file" else "json")
+    if where == "beside it":
+        (tmp_path / "meta").mkdir()
+        (tmp_path / "meta" / "info.json").write_text(json.dumps({"fps": 30, "features": FEATURES}))
+    wanted = LISTED + "command=action[elbow]:deg,position=observation.state[shoulder_pan]:deg"
+    log = read_log(path, wanted)
+    np.testing.assert_allclose(log.signals["command"], np.deg2rad(0.5))
+    np.testing.assert_allclose(log.signals["position"], np.deg2rad(ANGLE[:90] - 1.0))
+    (first,) = [one for one in propose_columns(path).doubts if one.startswith("action")]
+    assert "the first of shoulder_pan.pos, elbow is taken" in first
+    with pytest.raises(ValueError, match=r"unknown column action\[wrist\]"):
+        read_log(path, LISTED + "command=action[wrist]:deg")
+
+
+def test_a_packed_log_is_proposed_too(tmp_path):
+    path = written(tmp_path, {"t_s": TIME, "u_V": VOLTS, "q_rad": ANGLE})
+    (tmp_path / "log.csv.gz").write_bytes(gzip.compress(path.read_bytes()))
+    assert propose_columns(tmp_path / "log.csv.gz") == propose_columns(path)
