@@ -23,6 +23,9 @@ LONGEST = 20  # and on to so many, while that is better
 STARTS = 4
 BETTER = 0.8  # a delay is believed where it takes the robust cost to less than this share, and
 SURE = 3.0  # lowers that of the segments by more, in the mean, than so many standard deviations of that mean
+UNEXPLAINED = 8.0  # residuals of more standard deviations of the sensor in the mean are no noise,
+UNLIKE = 0.02
+"""and more than this share of what moves within a segment is not explained: the log is bad, or the model is."""
 Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 
 
@@ -311,3 +314,39 @@ def _better(these: np.ndarray, those: np.ndarray) -> bool:
     gained = those - these
     error = gained.std(ddof=1) / np.sqrt(len(gained)) if len(gained) > 1 else 0.0
     return bool(these.sum() < BETTER * those.sum() and gained.mean() > SURE * error)
+
+
+def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
+    """Return what a fit says is wrong with its logs or its model; `shares` gets the unexplained share of each log."""
+    unlike: dict[str, str] = {}
+    for place, log in enumerate(fit.logs):
+        own = [pair for pair in zip(fit.segments, fit.residuals, strict=True) if pair[0].log == place]
+        sizes = np.concatenate([np.abs(residuals) for _, residuals in own])
+        rest = np.concatenate([residuals * segment.deviation for segment, residuals in own])
+        swing = np.concatenate([segment.measured - segment.measured.mean() for segment, _ in own])
+        share = float(np.std(rest) / max(np.std(swing), 1e-12))
+        if sizes.mean() / 0.8 > UNEXPLAINED and share > UNLIKE:
+            shares[log.name] = max(share, shares.get(log.name, 0.0))
+            unlike[log.name] = (
+                f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} % of what moves"
+            )
+    found = []
+    if 1 < len(unlike) == len(fit.logs):
+        found.append(
+            "the model does not explain any of the logs within what their sensors see: of the first, residuals are "
+            f"{next(iter(unlike.values()))}. Fit more friction, or find out what else moved"
+        )
+    else:
+        found += [
+            f"log {name}: residuals are {text} in the mean: the model does not explain it. Leave it out, find out what "
+            "else moved, or fit more friction"
+            for name, text in unlike.items()
+        ]
+    values = np.array([one.values for one in fit.tried])
+    costs = np.array([np.mean(np.abs(np.concatenate(one.residuals))) for one in fit.tried])
+    near = costs < 1.1 * costs.min()
+    apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(fit.values), fit.model.scales)
+    if np.any(apart > 0.2):
+        names = ", ".join(name for name, one in zip(fit.model.names, apart, strict=True) if one > 0.2)
+        found.append(f"several minima: starts ended within 10 % of the best cost, but apart in {names}")
+    return found

@@ -17,7 +17,7 @@ _HINTED = 0.9  # An efficiency is hinted at where it takes all cost, and half of
 _APART = 0.05  # and differs by more than this from the one that the fit took as known.
 
 
-class Choice(NamedTuple):
+class FrictionChoice(NamedTuple):
     """A shaft with its kind of friction."""
 
     model: ShaftModel
@@ -25,16 +25,16 @@ class Choice(NamedTuple):
     """Why this kind; empty if it was asked for."""
 
 
-def choose_friction(model: ShaftModel, logs: Sequence[Log], wanted: str, on_step: Callable[[], None]) -> Choice:
+def choose_friction(model: ShaftModel, logs: Sequence[Log], wanted: str, on_step: Callable[[], None]) -> FrictionChoice:
     """Return the model with the friction that is wanted or, for `auto`, with what leaving out one log at a time favors.
 
     More than viscous and Coulomb friction is kept where the errors on the logs left out fall by more, in the mean, than
     two standard deviations of that mean. With fewer than three logs none is.
     """
     if wanted != "auto":
-        return Choice(dataclasses.replace(model, friction=wanted), "")
+        return FrictionChoice(dataclasses.replace(model, friction=wanted), "")
     if len(logs) < LEAST_LOGS:
-        return Choice(
+        return FrictionChoice(
             model,
             f"friction: coulomb, because auto compares the errors on logs left out: it needs {LEAST_LOGS} logs that "
             f"move, and there {'is' if len(logs) == 1 else 'are'} {len(logs)}. Name more, or choose --friction load, "
@@ -53,7 +53,7 @@ def choose_friction(model: ShaftModel, logs: Sequence[Log], wanted: str, on_step
         f"friction: {best.friction}, by the mean errors on the logs left out [{SIGNALS[model.output]}]: {means}; a "
         "richer one is taken if it is better by two standard deviations"
     )
-    return Choice(best, reason)
+    return FrictionChoice(best, reason)
 
 
 def _left_out_errors(model: ShaftModel, logs: Sequence[Log], on_step: Callable[[], None]) -> np.ndarray:

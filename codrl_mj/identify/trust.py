@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, refit
+from codrl_mj.identify.estimate import Fit, fit_warnings, refit
 from codrl_mj.identify.log import BLOCK, Log, halved, moves, replaced
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import DEFAULTS, FRICTION, OF_WINDING, PARAMETERS
@@ -48,9 +48,6 @@ CAUSES = {
 }
 """What widens an interval, in words."""
 AT_BOUND = 1e-3  # nearer to a bound, in the parameter's scale, a value is at it
-UNEXPLAINED = 8.0  # residuals of more standard deviations of the sensor in the mean are no noise,
-UNLIKE = 0.02
-"""and more than this share of what moves within a segment is not explained: the log is bad, or the model is."""
 
 
 def judged(
@@ -74,7 +71,7 @@ def judged(
                 constant = [one for one in estimates if one.name == source]
                 found = _with_constant(found, constant[0], known) if constant else found
         estimates += found
-        warnings += _warnings(fit, unlike)
+        warnings += fit_warnings(fit, unlike)
     completed, unexplained = _completed(estimates, given, defaults), max(unlike.values(), default=0.0)
     if unexplained > MISUNDERSTOOD:
         why = f"the fit leaves {unexplained:.0%} of what moves in a log unexplained"
@@ -244,42 +241,6 @@ def _completed(estimates: list[Estimate], given: Mapping[str, float], defaults: 
         ends = max(low, 0.0), max(high, 0.0)
         named["rotor_inertia"] = Estimate("rotor_inertia", max(value, 0.0), *ends, status, why)
     return [named[name] for name in PARAMETERS if name in named]
-
-
-def _warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
-    """What is wrong with logs, or with the model of them; `shares` gets what is unexplained of each such log."""
-    unlike: dict[str, str] = {}
-    for place, log in enumerate(fit.logs):
-        own = [pair for pair in zip(fit.segments, fit.residuals, strict=True) if pair[0].log == place]
-        sizes = np.concatenate([np.abs(residuals) for _, residuals in own])
-        rest = np.concatenate([residuals * segment.deviation for segment, residuals in own])
-        swing = np.concatenate([segment.measured - segment.measured.mean() for segment, _ in own])
-        share = float(np.std(rest) / max(np.std(swing), 1e-12))
-        if sizes.mean() / 0.8 > UNEXPLAINED and share > UNLIKE:
-            shares[log.name] = max(share, shares.get(log.name, 0.0))
-            unlike[log.name] = (
-                f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} % of what moves"
-            )
-    found = []
-    if 1 < len(unlike) == len(fit.logs):
-        found.append(
-            "the model does not explain any of the logs within what their sensors see: of the first, residuals are "
-            f"{next(iter(unlike.values()))}. Fit more friction, or find out what else moved"
-        )
-    else:
-        found += [
-            f"log {name}: residuals are {text} in the mean: the model does not explain it. Leave it out, find out what "
-            "else moved, or fit more friction"
-            for name, text in unlike.items()
-        ]
-    values = np.array([one.values for one in fit.tried])
-    costs = np.array([np.mean(np.abs(np.concatenate(one.residuals))) for one in fit.tried])
-    near = costs < 1.1 * costs.min()
-    apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(fit.values), fit.model.scales)
-    if np.any(apart > 0.2):
-        names = ", ".join(name for name, one in zip(fit.model.names, apart, strict=True) if one > 0.2)
-        found.append(f"several minima: starts ended within 10 % of the best cost, but apart in {names}")
-    return found
 
 
 def _sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
