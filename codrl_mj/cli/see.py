@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from codrl_mj.actuators import trusting
 from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, with_environment
 from codrl_mj.cli.parsing import Trust
 from codrl_mj.cli.subject import Source, policy_and_environment
@@ -19,7 +20,6 @@ from codrl_mj.cli.terminal import progress_bar
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.worlds import is_world
 from codrl_mj.fields import did_you_mean
-from codrl_mj.own_code import trusting
 from codrl_mj.runs import told_apart
 
 
