@@ -16,6 +16,7 @@ import environment_pages
 import page_pictures_tasks
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.worlds import find_world
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import every_rebuilt
 
@@ -107,7 +108,12 @@ def test_an_argument_that_nobody_documents_is_noticed(monkeypatch):
 def test_every_argument_is_in_the_page_with_its_default_and_the_tasks_own_options_too(task):
     rows = {row[0].strip("`"): row[1].strip("`") for row in _table((FOLDER / "arguments.md").read_text())}
     assert "(arguments.md)" in _section(task, "Arguments")
-    fields = {field.name: repr(field.default) for field in dataclasses.fields(EnvConfig)[1:]}  # without the task
+    known = find_world(task).fields
+    fields = {
+        field.name: repr(field.default)
+        for field in dataclasses.fields(EnvConfig)[1:]  # without the task
+        if field.name in known
+    }
     parameters = dict(list(inspect.signature(ActuatedEnv).parameters.items())[1:-1])  # and without **arguments
     expected = {name: repr(parameter.default) for name, parameter in parameters.items()} | fields
     assert expected.pop("options") == "None"

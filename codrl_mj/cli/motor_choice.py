@@ -182,7 +182,7 @@ class Choose:
                 temporary.write_text(yaml.safe_dump(chosen, sort_keys=False))
             print(f"wrote {self.out / 'actuators.yaml'}")
             if short := [found[0].name for found in ranked.values() if found[0].lacks]:
-                say(f"no motor does it; written is the nearest: {', '.join(short)}")
+                say(f"no motor surely does it with that margin; written is the nearest: {', '.join(short)}")
         content = [
             {
                 "drives": name or None,

@@ -68,7 +68,7 @@ class Building:
             return plain
         for pattern, actuator in wanted.items() if self._action == "force" else ():
             plainly = plain.actuator_biastype[matched_by(pattern, names)] == int(mujoco.mjtBias.mjBIAS_NONE)
-            if actuator.MOTION and plainly.any():
+            if actuator.MOTION and actuator.commands() and plainly.any():
                 raise ValueError(
                     f"action = 'force': {pattern!r}: the environment asks its actuators for forces, and a "
                     f"{type(actuator).__name__} is asked for motions; must be {' or '.join(actuator.commands())}"

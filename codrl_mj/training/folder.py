@@ -102,7 +102,7 @@ def needs_trust(run: Path) -> bool:
     """Return True if loading a run imports the module of somebody's own task, agent or actuator."""
     try:
         load_config(run)
-    except ValueError:  # also of a damaged run, which says so when it is loaded
+    except (ValueError, OSError):  # also of a damaged run, which says so when it is loaded
         return True
     return False
 

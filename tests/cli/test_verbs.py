@@ -15,6 +15,7 @@ from codrl_mj.actuators import NAMED, CurrentLoop, Motor, Supply
 from codrl_mj.agents.presets import ELSEWHERE, PRESETS
 from codrl_mj.cli import VERBS, find_verb, main
 from codrl_mj.envs.config import EnvConfig
+from codrl_mj.envs.worlds import find_world
 from codrl_mj.evaluation import evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.tasks import TASKS, named_actuator
@@ -50,7 +51,7 @@ def test_the_help_explains_every_named_actuator_and_every_field_with_its_unit(ca
             assert f"--actuator.{part}.{field.name.replace('_', '-')}" in text
     for unit in ("[ohm]", "[H]", "[N*m/A]", "[V*s/rad]", "[m]", "[V/A]", "[V/(A*s)]", "[V*s/A]", "[1/s]", "[s]"):
         assert unit in text
-    names = {field.name for field in dataclasses.fields(EnvConfig)} - {"task", "actuator", "options"}
+    names = {*find_world("cartpole").fields} - {"task", "actuator", "options"}
     for flag in (*(f"env.{name.replace('_', '-')}" for name in names), "env.center-radius", "seed", "out"):
         assert f"--{flag}" in text
 

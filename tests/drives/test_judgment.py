@@ -235,11 +235,11 @@ def test_a_largest_current_counts_in_both(furuta, capsys, monkeypatch):
 def test_gears_are_judged_on_the_command_line(tmp_path, pololu, furuta, capsys, monkeypatch):
     monkeypatch.setattr("codrl_mj.drives.demands_of", lambda *_, **__: {"": furuta})
     line = ["motor", "choose", str(pololu[1]), "furuta", "--gears", "6.25", "18.75", "--out", str(tmp_path / "out")]
-    assert main(line) == 0
+    assert main(line) == 1  # none does it
     printed = " ".join(capsys.readouterr().out.split())
     assert "known.toml at gear 6.25: try it. friction" in printed
     assert "known.toml at gear 18.75: try it. rotor" in printed
-    assert "no motor does it; written is the nearest" in printed
+    assert "no motor surely does it with that margin; written is the nearest" in printed
     assert sorted(path.name for path in (tmp_path / "out").glob("*.png")) == ["known-18.75.png", "known-6.25.png"]
     assert main([*line[:5], "0"]) == 2
     assert "gear_ratio = 0" in capsys.readouterr().err
