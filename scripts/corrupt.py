@@ -77,7 +77,7 @@ stall_current = "5.5 A"
 no_load_speed = "330 rpm"
 no_load_current = "0.2 A"
 inductance = "1.3 mH"
-rotor_inertia = "10.5 gcm2"
+rotor_inertia = "10.5 gcm2 at motor"
 max_winding_temperature = "155 degC"
 [sources]
 "shop" = "the rest"
