@@ -47,7 +47,8 @@ $(MUJOCO4)/.installed: pyproject.toml constraints.txt
 
 mujoco4: $(MUJOCO4)/.installed  ## the engine's tests and the certificate on MuJoCo 4, which dm_control does not work with
 	@$(MUJOCO4)/bin/python -m pytest -m "not slow and not matrix and not browser" -n 2 --dist loadfile --no-loadscope-reorder \
-		--ignore tests/foreign/test_dm_control.py $(MUJOCO4_TESTS)
+		--ignore tests/foreign/test_dm_control.py --deselect tests/foreign/test_divergence.py::test_dm_controls_environment_stops \
+		--deselect tests/motorised/test_ideal.py::test_there_are_enough_robots $(MUJOCO4_TESTS)
 	@$(MUJOCO4)/bin/python -m codrl_mj validate --quick
 
 node_modules/axe-core:
