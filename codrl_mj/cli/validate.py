@@ -48,7 +48,7 @@ class Validate:
 
         if self.model is not None and (self.tasks or self.mutations):
             raise ValueError("--model: give a model or tasks, and no --mutations, which are faults of the tasks")
-        tasks = faulty(self.tasks) if self.mutations else self.tasks
+        tasks = faulty(self.tasks) if self.mutations else self.tasks or None
         model = None if self.model is None else own_model.load(self.model)
         with progress_bar("{task.completed}/{task.total}") as bar:
             row = bar.add_task("validating", total=None)
