@@ -333,5 +333,5 @@ def _is_integer(value: Any) -> bool:
 
 
 def command(*words: object, trust: bool = False) -> str:
-    """Return a command line of this program as a shell takes it, whatever is in the words."""
+    """Return a command line of this program, quoted for a shell."""
     return shlex.join(["codrl-mj", *map(str, words), *["--trust"] * trust])

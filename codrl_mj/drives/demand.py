@@ -43,7 +43,7 @@ class Demand:
     linear: bool = False
     """Whether the joint is a slide."""
     servo: bool = False
-    """Whether the model's own position or velocity servo makes the torque: it gets there with less, only later."""
+    """True if the model's own position or velocity servo makes the torque; with less torque it arrives later."""
     swing: Swing | None = None
     """The pendulum, where the task is to swing one up."""
     model_gear: float = 1.0

@@ -117,7 +117,7 @@ class Bound:
     """`surely`, `surely not`, or where nothing follows `try it`; `hopeless` where most of it is missing; `it depends`
     where one of the sides is not known, and NaN."""
     remedy: str
-    """What to change, or what is not known; empty where it holds."""
+    """Change or missing number that would make it hold; empty if it holds."""
 
     def __str__(self) -> str:
         """In a sentence."""
@@ -154,7 +154,7 @@ class Feasibility:
 
     @property
     def why(self) -> str:
-        """What is in the way or not known, the decisive first; empty where nothing is."""
+        """Return what is in the way or not known, the decisive first; empty if nothing is."""
         return ". ".join(map(str, self.in_the_way))
 
     @property

@@ -201,7 +201,7 @@ def distinct(logs: Sequence[Log], held_out: Sequence[Log]) -> tuple[list[Log], l
 
 
 def _content(log: Log) -> bytes:
-    """Return a digest of a log's signals, whatever its name and its times, which may begin anywhere."""
+    """Return a digest of a log's signals; its name and the start of its time do not count."""
     digest = hashlib.sha256()
     for name in sorted(log.signals):
         digest.update(name.encode() + log.signals[name].tobytes())

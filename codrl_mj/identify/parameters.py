@@ -44,7 +44,7 @@ OF_MOTOR = (
 OF_LOSS = ("gear_efficiency", "stribeck_friction", "stribeck_speed", "stribeck_exponent")
 """Fields of `GearMotor` that the simulation of a shaft has from a base where they are neither fitted nor known."""
 OF_WINDING = {"current": ("torque_constant", "back_emf_constant"), "voltage": ("resistance", "resistance")}
-"""What drives a shaft -> what that takes from the winding, and what it is called there."""
+"""Signal that drives a shaft -> parameter taken from the winding, and its name there."""
 OF_FRICTION: dict[str, tuple[str, ...]] = {
     "coulomb": ("coulomb_friction", "viscous_friction"),
     "stribeck": ("coulomb_friction", "viscous_friction", "stribeck_friction", "stribeck_speed"),

@@ -42,7 +42,7 @@ _USUAL = {"voltage": (1.0, 60.0), "bus": (3.0, 60.0), "duty": (0.02, 1.0), "temp
 
 
 class Proposal(NamedTuple):
-    """What a log's columns may be."""
+    """Kinds of columns of a log."""
 
     columns: str
     """As `read_log` and `--columns` take it, once each `UNIT` in it is replaced."""
