@@ -14,6 +14,7 @@ from codrl_mj.cli.environments import flags
 from codrl_mj.cli.motor import MotorName
 from codrl_mj.cli.parsing import AsJson, named_numbers
 from codrl_mj.cli.terminal import number, print_table, progress_bar, say
+from codrl_mj.fields import command
 from codrl_mj.identify.plan import Sensing
 from codrl_mj.identify.synthetic import FREE, Load, Sampler
 
@@ -406,7 +407,7 @@ class ProposeColumns:
         out = "" if "check" in verb else " --out motor"
         alone = ", of a motor on its own (else --rig pendulum if one hangs at position 0, load if it lifts one)"
         say(f"next{how}{alone if rig else ''}:")
-        print(f"codrl-mj {verb} {shlex.quote(str(self.log))} --columns {shlex.quote(found.columns)}{rig}{out}")
+        print(command(*verb.split(), self.log, "--columns", found.columns, *rig.split(), *out.split()))
         return 0, found
 
     def _has_errors(self, columns: str) -> bool:

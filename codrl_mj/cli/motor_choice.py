@@ -170,6 +170,7 @@ class Choose:
             about = "; ".join(filter(None, (choice.lacks, unknown, choice.drive.assumed)))
             if about and (choice.lacks or place < len(shown)):
                 say(f"{at}: {about}" if alone else f"{name}: {at}: {about}")
+        short = [found[0].name for found in ranked.values() if found[0].lacks]
         if self.out is not None:
             gears = [f"-{choice.ratio:.4g}" if self.gears else "" for _, choice in shown]
             stems = [choice.name.removesuffix(Path(choice.name).suffix) for _, choice in shown]
@@ -181,7 +182,7 @@ class Choose:
                 chosen = actuators_of({name: (found[0], demands[name]) for name, found in ranked.items()})
                 temporary.write_text(yaml.safe_dump(chosen, sort_keys=False))
             print(f"wrote {self.out / 'actuators.yaml'}")
-            if short := [found[0].name for found in ranked.values() if found[0].lacks]:
+            if short:
                 say(f"no motor surely does it with that margin; written is the nearest: {', '.join(short)}")
         content = [
             {
@@ -199,8 +200,7 @@ class Choose:
             }
             for name, choice in told
         ]
-        nothing_does_it = any(found[0].lacks for found in ranked.values())
-        return int(nothing_does_it), {"units": _UNITS, "demand": source, "ranking": content}
+        return int(bool(short)), {"units": _UNITS, "demand": source, "ranking": content}
 
 
 _UNITS = {
