@@ -4,8 +4,9 @@
     >>> import codrl_mj
     >>> env = gym.make("codrl_mj/CartPole-v0", actuator="weaker")
 
-Importing the package registers its environments with Gymnasium (which loads no plugins since its version 1.0).
-Everything named here is imported on first use, so that `import codrl_mj` costs little.
+Importing the package registers its environments with Gymnasium (which loads no plugins since its
+version 1.0). Everything named here is imported on first use, so that `import codrl_mj` costs
+little.
 """
 
 import importlib

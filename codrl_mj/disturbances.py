@@ -21,32 +21,38 @@ __all__ = ["OFF", "PLAIN", "Disturbances", "Joint", "check_delay", "resolve"]
 class Disturbances(fields.Checked):
     """Imperfections between the agent and its actuator, and loads on the joint; each is off at 0, its default.
 
-    The command is the desired force [N] or torque [N*m] at the joint. On its way to the actuator it is first
-    delayed, then quantised, then limited in its rate, once per integration step. Where an agent commands a current or a
-    voltage, the command is the force of that current, or of as many amperes as volts.
+    The command is the desired force [N] or torque [N*m] at the joint. On its way to the actuator it
+    is first delayed, then quantised, then limited in its rate, once per integration step. Where an
+    agent commands a current or a voltage, the command is the force of that current, or of as many
+    amperes as volts.
 
-    What is the actuator's own (its sensor, its supply) is described there, and what is the joint's (damping, friction)
-    by the environment's `joint`.
+    What is the actuator's own (its sensor, its supply) is described there, and what is the joint's
+    (damping, friction) by the environment's `joint`.
 
     Raises:
-        ValueError: a field is not a finite number within its bound; the message names field, value and bound.
+        ValueError: a field is not a finite number within its bound; the message names field, value
+            and bound.
     """
 
     command_delay: float = real(0.0, least=0, unit="s")
-    """Delay of the command [s], >= 0; where it is no whole number of integration steps, the two neighbouring commands
-    are interpolated linearly. Until the first command arrives, a position is held, and others are zero."""
+    """Delay of the command [s], >= 0; where it is no whole number of integration steps, the two
+    neighbouring commands are interpolated linearly. Until the first command arrives, a position is
+    held, and others are zero.
+    """
     command_quantum: float = real(0.0, least=0, unit="N")
     """Quantisation step of the command [N or N*m], >= 0; rounds half to even, and ends at the largest force."""
     command_rate: float = real(0.0, least=0, unit="N/s")
-    """Largest change of the command per second [N/s or N*m/s], >= 0; 0: no limit. It starts from zero, or
-    from the position at the reset."""
+    """Largest change of the command per second [N/s or N*m/s], >= 0; 0: no limit. It starts from
+    zero, or from the position at the reset.
+    """
     pulse_force: float = real(0.0, least=0, unit="N")
     """Size of random load pulses at the actuated joint [N or N*m], >= 0; either sign is as likely."""
     pulse_duration: float = real(0.0, least=0, unit="s")
     """Duration of a load pulse [s], > 0 where there are pulses."""
     pulse_interval: float = real(0.0, least=0, unit="s")
-    """Mean time [s] from the start, and from the end of each pulse, to the next; exponentially distributed. > 0 where
-    there are pulses."""
+    """Mean time [s] from the start, and from the end of each pulse, to the next; exponentially
+    distributed. > 0 where there are pulses.
+    """
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -54,9 +60,14 @@ class Disturbances(fields.Checked):
         for name in ("pulse_duration", "pulse_interval"):
             value = getattr(self, name)
             if self.pulse_force and not value:
-                raise ValueError(f"Disturbances.{name} = {value:g}: must be a finite number > 0 where there are pulses")
+                raise ValueError(
+                    f"Disturbances.{name} = {value:g}: must be a finite number > 0 where there are"
+                    " pulses"
+                )
             if value and not self.pulse_force:
-                raise ValueError(f"Disturbances.{name} = {value:g}: there are no pulses: give pulse_force > 0")
+                raise ValueError(
+                    f"Disturbances.{name} = {value:g}: there are no pulses: give pulse_force > 0"
+                )
 
     @property
     def random(self) -> bool:
@@ -73,7 +84,8 @@ class Joint(fields.Checked):
     """What is added to the actuated joints of the model; nothing by default. MuJoCo physics only.
 
     Raises:
-        ValueError: a field is not a finite number within its bound; the message names field, value and bound.
+        ValueError: a field is not a finite number within its bound; the message names field, value
+            and bound.
     """
 
     damping: float = real(0.0, least=0, unit="N*s/m")
@@ -111,13 +123,22 @@ def check_delay(disturbances: Disturbances, step_duration: float, max_steps: int
         step_duration: of an environment step [s].
         max_steps: the longest episode [environment steps]; None if it is not known.
     """
-    delay, episode = disturbances.command_delay, math.inf if max_steps is None else max_steps * step_duration
+    delay, episode = (
+        disturbances.command_delay,
+        math.inf if max_steps is None else max_steps * step_duration,
+    )
     text = f"Disturbances.command_delay = {delay:g}: "
     remedy = f"it is in seconds: for {delay:g} ms write {delay / 1e3:g}"
     if delay >= episode:
-        raise ValueError(f"{text}must be < {episode:g} s, the longest episode, or no command would arrive; {remedy}")
+        raise ValueError(
+            f"{text}must be < {episode:g} s, the longest episode, or no command would arrive;"
+            f" {remedy}"
+        )
     if delay > 20.0 * step_duration:
-        warnings.warn(f"{text}a delay of {delay / step_duration:.3g} environment steps; {remedy}", stacklevel=2)
+        warnings.warn(
+            f"{text}a delay of {delay / step_duration:.3g} environment steps; {remedy}",
+            stacklevel=2,
+        )
 
 
 _NEAR = 1e-9  # of an integration step: nearer to a whole number of steps is that number
@@ -148,15 +169,20 @@ def rate_limited(command: float, before: float, change: float) -> float:
 
 
 PULSE_NAMES = ("key", "step", "index", "start")
-"""What the memory of an environment's pulses holds: the key of the random numbers, integration steps since the start of
-the episode, number of the present or next pulse, and when that one starts [s]."""
+"""What the memory of an environment's pulses holds: the key of the random numbers, integration
+steps since the start of the episode, number of the present or next pulse, and when that one starts
+[s].
+"""
 KEY, STEP, INDEX, START = range(len(PULSE_NAMES))
 
 
-def pulse_load(memory: np.ndarray, timestep: float, force: float, duration: float, interval: float) -> float:
+def pulse_load(
+    memory: np.ndarray, timestep: float, force: float, duration: float, interval: float
+) -> float:
     """The mean load [N or N*m] over an environment's next integration step; moves the memory on by that step.
 
-    A pulse that covers part of a step counts in proportion, so that its impulse does not depend on the step.
+    A pulse that covers part of a step counts in proportion, so that its impulse does not depend on
+    the step.
     """
     key, step = int(memory[KEY]), memory[STEP]
     begin, end = step * timestep, (step + 1.0) * timestep

@@ -42,7 +42,9 @@ def real(
     """
     limits = [("> ", above), (">= ", least), ("< ", below), ("<= ", most)]
     kind = "a number" if infinite else "a finite number"
-    text = " ".join([kind, " and ".join(f"{sign}{limit:g}" for sign, limit in limits if limit is not None)]).strip()
+    text = " ".join(
+        [kind, " and ".join(f"{sign}{limit:g}" for sign, limit in limits if limit is not None)]
+    ).strip()
 
     def holds(value: Any) -> bool:
         return (
@@ -53,11 +55,16 @@ def real(
             and (most is None or value <= most)
         )
 
-    low, high = (next((limit for limit in pair if limit is not None), None) for pair in ((above, least), (below, most)))
+    low, high = (
+        next((limit for limit in pair if limit is not None), None)
+        for pair in ((above, least), (below, most))
+    )
     return _bounded(default, holds, text, optional, unit, float, (low, high))
 
 
-def integer(default: int | None, least: int, optional: bool = False, unit: str = "", most: float = math.inf) -> Any:
+def integer(
+    default: int | None, least: int, optional: bool = False, unit: str = "", most: float = math.inf
+) -> Any:
     """A field for an integer of at least `least`; `optional`, or a default of None, lets it be None."""
     return _bounded(
         default,
@@ -85,7 +92,9 @@ def units(default: tuple[int, ...]) -> Any:
     """A field for the units of a network's hidden layers."""
 
     def holds(value: Any) -> bool:
-        return isinstance(value, tuple) and all(_is_integer(count) and count >= 1 for count in value)
+        return isinstance(value, tuple) and all(
+            _is_integer(count) and count >= 1 for count in value
+        )
 
     return _bounded(default, holds, "a tuple of integers >= 1")
 
@@ -127,7 +136,9 @@ class Checked:
                 continue
             if not holds(value):
                 none = " or none" if optional else ""
-                raise ValueError(f"{type(self).__name__}.{field.name} = {value!r}: must be {text}{none}")
+                raise ValueError(
+                    f"{type(self).__name__}.{field.name} = {value!r}: must be {text}{none}"
+                )
             if kind is not None:
                 object.__setattr__(self, field.name, kind(value))
 
@@ -148,7 +159,10 @@ def check_memory(size: float, what: str, remedy: str) -> None:
         remedy: what to change.
     """
     if (room := free_memory()) is not None and size > room:
-        raise ValueError(f"{what}: about {size / 1e9:,.3g} GB of memory, of which {room / 1e9:.3g} are free; {remedy}")
+        raise ValueError(
+            f"{what}: about {size / 1e9:,.3g} GB of memory, of which {room / 1e9:.3g} are free;"
+            f" {remedy}"
+        )
 
 
 def check_names(
@@ -167,18 +181,28 @@ def check_names(
         known: what they may be.
         what: what to call them, such as `actuator field`.
         prefix: stands before each of them in the message.
-        every: list the known ones beside the nearest, too: for names that somebody else has for the same.
+        every: list the known ones beside the nearest, too: for names that somebody else has for the
+            same.
         listed_by: the command that lists them, where they are many.
-        inner: dotted names of what is in their parts, to be suggested to whoever leaves the part out.
+        inner: dotted names of what is in their parts, to be suggested to whoever leaves the part
+            out.
     """
     known, inner = list(known), list(inner)
     for name in given:
         if name not in known:
-            near = [one for one in inner if one.rpartition(".")[2] == name][:3] or _nearest(name, known)
+            near = [one for one in inner if one.rpartition(".")[2] == name][:3] or _nearest(
+                name, known
+            )
             near = near or _nearest(name, inner)
-            hints = [f"did you mean {' or '.join(f'{prefix}{one}' for one in near)}?"] if near else []
+            hints = (
+                [f"did you mean {' or '.join(f'{prefix}{one}' for one in near)}?"] if near else []
+            )
             if every or not near:
-                hints.append(f"`{listed_by}` lists the known ones" if listed_by else f"known: {', '.join(known)}")
+                hints.append(
+                    f"`{listed_by}` lists the known ones"
+                    if listed_by
+                    else f"known: {', '.join(known)}"
+                )
             raise ValueError(f"unknown {what} {prefix}{name}; {' '.join(hints)}")
 
 
@@ -186,14 +210,20 @@ def leaves(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """What nested mappings hold, by dotted names."""
     found: dict[str, Any] = {}
     for key, value in mapping.items():
-        found |= leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+        found |= (
+            leaves(value, f"{prefix}{key}.")
+            if isinstance(value, Mapping)
+            else {f"{prefix}{key}": value}
+        )
     return found
 
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """What two mappings have otherwise, by dotted names: both values, `absent` where one has none."""
     mine, others = leaves(one), leaves(other)
-    pairs = {name: (mine.get(name, "absent"), others.get(name, "absent")) for name in [*mine, *others]}
+    pairs = {
+        name: (mine.get(name, "absent"), others.get(name, "absent")) for name in [*mine, *others]
+    }
     return {name: pair for name, pair in pairs.items() if repr(pair[0]) != repr(pair[1])}
 
 
@@ -203,14 +233,17 @@ def check_pattern(pattern: str) -> None:
         re.compile(pattern)
     except (re.error, TypeError) as error:
         raise ValueError(
-            f"{pattern!r}: must be a regular expression ({error}); '.*' is any name, 'leg.*' those of a leg"
+            f"{pattern!r}: must be a regular expression ({error}); '.*' is any name, 'leg.*' those"
+            " of a leg"
         ) from None
 
 
 def check_joint_dynamics(value: Any) -> None:
     """Refuse what `joint_dynamics` of `codrl_mj.motorise` cannot be."""
     if value not in (None, "keep", "replace"):
-        raise ValueError(f"joint_dynamics = {value!r}: must be keep or replace; None keeps, and warns")
+        raise ValueError(
+            f"joint_dynamics = {value!r}: must be keep or replace; None keeps, and warns"
+        )
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
@@ -222,8 +255,8 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 def _nearest(name: object, known: Iterable[str]) -> list[str]:
     """Return the few names that begin with a name or have all of its words, or else the one that is most like it.
 
-    Of dotted names only the last parts are compared where the parts before it are known: what two names begin with
-    alike makes them no more similar.
+    Of dotted names only the last parts are compared where the parts before it are known: what two
+    names begin with alike makes them no more similar.
     """
     text, spelt = str(name).lower(), {one.lower(): one for one in known}
     begun = [spelt[one] for one in spelt if len(text) > 2 and one.startswith(text)]
@@ -234,7 +267,9 @@ def _nearest(name: object, known: Iterable[str]) -> list[str]:
     if not ends:
         ends, last = {one: one for one in spelt}, text
     words = _words(last)
-    same = [spelt[one] for end, one in ends.items() if words and words <= _words(end.rpartition(".")[2])]
+    same = [
+        spelt[one] for end, one in ends.items() if words and words <= _words(end.rpartition(".")[2])
+    ]
     if 0 < len(same) < 4:
         return same
     beside = [end for end in ends if last == text or "." not in end]
@@ -266,17 +301,32 @@ def field_docs(kind: type) -> Mapping[str, str]:
 def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:
     """Build a dataclass, and those in its fields, from nested mappings; absent fields take their defaults."""
     if not isinstance(mapping, Mapping):
-        raise ValueError(f"{what} {prefix.rstrip('.')!r} = {mapping!r}: must be a mapping of {cls.__name__}'s fields")
+        raise ValueError(
+            f"{what} {prefix.rstrip('.')!r} = {mapping!r}: must be a mapping of {cls.__name__}'s"
+            " fields"
+        )
     nested = parts(cls)
-    absent = {field.name: field.metadata["absent"] for field in dataclasses.fields(cls) if "absent" in field.metadata}
-    inner = [f"{name}.{field.name}" for name, kind in nested.items() for field in dataclasses.fields(kind)]
-    check_names(mapping, (field.name for field in dataclasses.fields(cls)), what, prefix, inner=inner)
+    absent = {
+        field.name: field.metadata["absent"]
+        for field in dataclasses.fields(cls)
+        if "absent" in field.metadata
+    }
+    inner = [
+        f"{name}.{field.name}"
+        for name, kind in nested.items()
+        for field in dataclasses.fields(kind)
+    ]
+    check_names(
+        mapping, (field.name for field in dataclasses.fields(cls)), what, prefix, inner=inner
+    )
 
     def built(key: str, value: Any) -> Any:
         """Return a part of a mapping as its dataclass; one that is a dataclass already stays."""
         if key not in nested or value is None or isinstance(value, nested[key]):
             return value
-        if isinstance(value, Mapping) and key in absent:  # over what stands for the part where it is left out
+        if (
+            isinstance(value, Mapping) and key in absent
+        ):  # over what stands for the part where it is left out
             value = {**dataclasses.asdict(absent[key]), **value}
         return build(nested[key], value, what, f"{prefix}{key}.")
 
@@ -307,7 +357,9 @@ def declared_parts(cls: Any) -> dict[str, Any]:
     except NameError:  # names that only a type checker sees
         return {}
     declared = {name: hints[name] for name in parts(cls) if hints[name] is not Any}
-    return {name: hint for name, hint in declared.items() if isinstance(hint, type | types.UnionType)}
+    return {
+        name: hint for name, hint in declared.items() if isinstance(hint, type | types.UnionType)
+    }
 
 
 def _bounded(
@@ -319,7 +371,11 @@ def _bounded(
     kind: type | None = None,
     between: tuple[float | None, float | None] = (None, None),
 ) -> Any:
-    metadata = {"bound": (holds, text, optional or default is None, kind), "unit": unit, "between": between}
+    metadata = {
+        "bound": (holds, text, optional or default is None, kind),
+        "unit": unit,
+        "between": between,
+    }
     return dataclasses.field(default=default, metadata=metadata)
 
 

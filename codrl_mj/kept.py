@@ -1,13 +1,15 @@
 """Compiled functions, kept on disk: the first process compiles, the next ones load what it made.
 
-What is kept is machine code for one CPU, so its key has everything that was compiled in: the bytecode, constants,
-closure values and globals of every function that is reached, somebody's own too, and the files that these stand in; all
-of this package's source; MuJoCo's layout, whose offsets are among the constants; versions, CPU and numba's settings.
-What has a value that is not known here is not kept. Addresses of this process are known to it by name (`linked`).
+What is kept is machine code for one CPU, so its key has everything that was compiled in: the
+bytecode, constants, closure values and globals of every function that is reached, somebody's own
+too, and the files that these stand in; all of this package's source; MuJoCo's layout, whose offsets
+are among the constants; versions, CPU and numba's settings. What has a value that is not known here
+is not kept. Addresses of this process are known to it by name (`linked`).
 
-The folder is the user's cache folder, or what CODRL_MJ_CACHE names; `off` keeps nothing. numba unpickles what is around
-the code: so folder and files must belong to the user, with nobody else allowed to write them, or they are not used. A
-file is written whole or not at all, and one that is damaged counts as none.
+The folder is the user's cache folder, or what CODRL_MJ_CACHE names; `off` keeps nothing. numba
+unpickles what is around the code: so folder and files must belong to the user, with nobody else
+allowed to write them, or they are not used. A file is written whole or not at all, and one that is
+damaged counts as none.
 """
 
 import ctypes
@@ -42,7 +44,18 @@ from numba.extending import _Intrinsic
 MOST = 500_000_000
 """Bytes that the folder may hold; beyond, what was not used for the longest time goes."""
 _PACKAGE = Path(__file__).parent
-_OTHERS = {"builtins", "math", "numba", "numpy", "llvmlite", "mujoco", "typing", "functools", "operator", "ctypes"}
+_OTHERS = {
+    "builtins",
+    "math",
+    "numba",
+    "numpy",
+    "llvmlite",
+    "mujoco",
+    "typing",
+    "functools",
+    "operator",
+    "ctypes",
+}
 """Packages of which a version says all."""
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis), np.generic)
 _SYMBOLS: dict[str, int] = {}
@@ -67,8 +80,8 @@ def folder() -> Path | None:
 def _count_anew() -> None:
     """Let numba's names for functions be like those of no other process.
 
-    It tells functions of one name apart by a count, in what the linker sees too: of two functions that two processes
-    called alike it would take the one for the other, wherever both are loaded.
+    It tells functions of one name apart by a count, in what the linker sees too: of two functions
+    that two processes called alike it would take the one for the other, wherever both are loaded.
     """
     FunctionIdentity._unique_ids = itertools.count(secrets.randbits(60))  # type: ignore[attr-defined]
 
@@ -91,7 +104,9 @@ def linked(name: str, address: int) -> str:
 
 def external(name: str, function: Any, signature: Any) -> Any:
     """A C function of ctypes', for compiled code."""
-    return types.ExternalFunction(linked(name, ctypes.cast(function, ctypes.c_void_p).value or 0), signature)
+    return types.ExternalFunction(
+        linked(name, ctypes.cast(function, ctypes.c_void_p).value or 0), signature
+    )
 
 
 def njit(function: Any = None, **options: Any) -> Any:
@@ -107,7 +122,9 @@ def cfunc(signature: Any, **options: Any) -> Callable[[Any], Any]:
     """`numba.cfunc`, kept on disk."""
 
     def compiled(function: Any) -> Any:
-        made: Any = CFunc(function, sigutils.normalize_signature(signature), locals={}, options=options)
+        made: Any = CFunc(
+            function, sigutils.normalize_signature(signature), locals={}, options=options
+        )
         made._cache = _Kept("cfunc", function, options)
         made.compile()
         return made
@@ -136,7 +153,10 @@ class _Kept(_Cache):  # type: ignore[misc]
     """What numba asks for the compiled forms of one function."""
 
     def __init__(self, kind: str, function: Any, options: Any) -> None:
-        self._name, self._about = function.__name__, (kind, tuple(sorted(options.items())), function)
+        self._name, self._about = (
+            function.__name__,
+            (kind, tuple(sorted(options.items())), function),
+        )
 
     @property
     def cache_path(self) -> str:
@@ -185,14 +205,18 @@ def _path(name: str, about: Any) -> Path | None:
         if place is None:
             return None
         _tell(key, about, (), {})
-    except Exception:  # whatever somebody's value does when it is looked at: then it is compiled in every process
+    except (
+        Exception
+    ):  # whatever somebody's value does when it is looked at: then it is compiled in every process
         return None
     return place / f"{name}-{key.hexdigest()}.code"
 
 
 def _usable(status: os.stat_result) -> bool:
     """Whether a file or folder is the user's, and nobody else may write it."""
-    return not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o022)
+    return not hasattr(os, "getuid") or (
+        status.st_uid == os.getuid() and not status.st_mode & 0o022
+    )
 
 
 def _read(path: Path) -> bytes | None:
@@ -224,7 +248,10 @@ def _write(path: Path, payload: bytes) -> None:
         except OSError:
             Path(temporary).unlink(missing_ok=True)
             return
-        files = sorted(((one.stat().st_mtime, one.stat().st_size, one) for one in path.parent.iterdir()), reverse=True)
+        files = sorted(
+            ((one.stat().st_mtime, one.stat().st_size, one) for one in path.parent.iterdir()),
+            reverse=True,
+        )
         total = 0
         for _, size, one in files:
             total += size
@@ -240,8 +267,17 @@ def _foundation() -> bytes:
     key = hashlib.sha256()
     for one in (numba, llvmlite, np, mujoco):
         key.update(f"{one.__name__} {one.__version__}\n".encode())
-    cpu = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten(), platform.machine(), sys.version
-    settings = sorted((name, repr(value)) for name, value in vars(numba.config).items() if isinstance(value, _PLAIN))
+    cpu = (
+        binding.get_host_cpu_name(),
+        binding.get_host_cpu_features().flatten(),
+        platform.machine(),
+        sys.version,
+    )
+    settings = sorted(
+        (name, repr(value))
+        for name, value in vars(numba.config).items()
+        if isinstance(value, _PLAIN)
+    )
     key.update(repr((cpu, settings)).encode())
     sources = sorted(_PACKAGE.rglob("*.py"))
     if not sources:
@@ -285,8 +321,16 @@ def _tell(key: Any, value: Any, names: tuple[str, ...], told: dict[int, Any]) ->
         case python.FunctionType():
             _tell_function(key, value, told)
         case python.CodeType():
-            parts = value.co_code, value.co_names, value.co_varnames, value.co_freevars, value.co_argcount
-            _tell(key, (*parts, value.co_kwonlyargcount, value.co_flags, value.co_consts), names, told)
+            parts = (
+                value.co_code,
+                value.co_names,
+                value.co_varnames,
+                value.co_freevars,
+                value.co_argcount,
+            )
+            _tell(
+                key, (*parts, value.co_kwonlyargcount, value.co_flags, value.co_consts), names, told
+            )
         case python.ModuleType():
             key.update(f"module {value.__name__}\n".encode())
             if value.__name__.partition(".")[0] not in _OTHERS:
@@ -304,10 +348,16 @@ def _tell(key: Any, value: Any, names: tuple[str, ...], told: dict[int, Any]) ->
         case types.Type():
             key.update(f"{type(value).__qualname__} {value.name}\n".encode())
         case type() if hasattr(value, "_fields") or root in (*_OTHERS, "codrl_mj"):
-            key.update(f"class {value.__module__}.{value.__qualname__} {getattr(value, '_fields', ())}\n".encode())
+            key.update(
+                f"class {value.__module__}.{value.__qualname__} {getattr(value, '_fields', ())}\n".encode()
+            )
         case functools.partial():
             _tell(key, (value.func, value.args, tuple(sorted(value.keywords.items()))), names, told)
-        case _ if isinstance(value, python.BuiltinFunctionType | np.ufunc) or root in ("numba", "numpy", "typing"):
+        case _ if isinstance(value, python.BuiltinFunctionType | np.ufunc) or root in (
+            "numba",
+            "numpy",
+            "typing",
+        ):
             key.update(f"{root} {getattr(value, '__qualname__', None) or repr(value)}\n".encode())
         case _:
             raise _NotKnownError(repr(value))
@@ -315,7 +365,11 @@ def _tell(key: Any, value: Any, names: tuple[str, ...], told: dict[int, Any]) ->
 
 def _tell_function(key: Any, function: Any, told: dict[int, Any]) -> None:
     """A function: its code, its defaults, what it closes over, the globals that it names, the file that it is in."""
-    code, scope, root = function.__code__, function.__globals__, str(function.__module__).partition(".")[0]
+    code, scope, root = (
+        function.__code__,
+        function.__globals__,
+        str(function.__module__).partition(".")[0],
+    )
     key.update(f"function {function.__module__}.{function.__qualname__}\n".encode())
     if root not in (*_OTHERS, "codrl_mj"):
         key.update(hashlib.sha256(_file(function.__module__)).digest())
@@ -323,7 +377,12 @@ def _tell_function(key: Any, function: Any, told: dict[int, Any]) -> None:
         return
     names = _named(code)
     _tell(key, code, names, told)
-    _tell(key, (function.__defaults__, tuple(sorted((function.__kwdefaults__ or {}).items()))), names, told)
+    _tell(
+        key,
+        (function.__defaults__, tuple(sorted((function.__kwdefaults__ or {}).items()))),
+        names,
+        told,
+    )
     for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
         key.update(f"closure {name} ".encode())
         try:

@@ -34,7 +34,11 @@ def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         with np.errstate(all="ignore"):
             return function(*arguments)
     except Exception as error:
-        own = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == function.__code__.co_filename]
+        own = [
+            f
+            for f in traceback.extract_tb(error.__traceback__)
+            if f.filename == function.__code__.co_filename
+        ]
         where = place(function, own[-1].lineno if own else None)
         raise ValueError(f"{where}: {type(error).__name__}: {error}") from error
 
@@ -48,13 +52,18 @@ def place(function: Callable[..., Any], line: int | None = None) -> str:
 def check_form(function: Callable[..., Any], value: Any, form: Form, declared: str) -> Any:
     """What a function returns (or numba says that it does), which has to be of a form; `declared` says where."""
     if not _fits(value, form):
-        raise ValueError(f"{place(function)}: returns {_said(value)}, must return {_wanted(form)}: see {declared}")
+        raise ValueError(
+            f"{place(function)}: returns {_said(value)}, must return {_wanted(form)}: see"
+            f" {declared}"
+        )
     return value
 
 
 def _fits(value: Any, form: Form) -> bool:
     if isinstance(form, str):
-        scalar = isinstance(value, np.ndarray) and value.shape == () and value.dtype.kind in "biuf"  # of np.where
+        scalar = (
+            isinstance(value, np.ndarray) and value.shape == () and value.dtype.kind in "biuf"
+        )  # of np.where
         return scalar or isinstance(value, numbers.Real | np.bool_)
     return isinstance(value, tuple) and len(value) == len(form) and all(map(_fits, value, form))
 
@@ -71,17 +80,30 @@ def _wanted(form: Form) -> str:
     if isinstance(form, str):
         return "a number"
     flat = all(isinstance(one, str) for one in form)
-    return f"a tuple of {len(form)} ({', '.join(form)})" if flat else f"({', '.join(map(_wanted, form))})"
+    return (
+        f"a tuple of {len(form)} ({', '.join(form)})"
+        if flat
+        else f"({', '.join(map(_wanted, form))})"
+    )
 
 
 def not_compiled(function: Callable[..., Any], error: Exception) -> str:
     """What numba says of a function that it does not compile, as a sentence."""
     text = str(error)
-    lines = [line.strip() for line in text.splitlines() if line.strip() and not line.strip().startswith("Failed in")]
-    causes = [cause for cause in re.findall(r"\w*Error: (.+)", text) if not cause.startswith("Failed in")]
+    lines = [
+        line.strip()
+        for line in text.splitlines()
+        if line.strip() and not line.strip().startswith("Failed in")
+    ]
+    causes = [
+        cause for cause in re.findall(r"\w*Error: (.+)", text) if not cause.startswith("Failed in")
+    ]
     said = causes[-1] if causes else " ".join(lines[:2] if lines[0].endswith(":") else lines[:1])
     line = re.search(r'(?m)^\s*File ".+", line (\d+):', text)
-    return f"{place(function, int(line[1]) if line else None)}: numba does not compile it: {said.strip()}"
+    return (
+        f"{place(function, int(line[1]) if line else None)}: numba does not compile it:"
+        f" {said.strip()}"
+    )
 
 
 def asset_folder() -> Path:
@@ -90,7 +112,9 @@ def asset_folder() -> Path:
     for folder in (package / "_assets", package.parent / "assets"):
         if folder.is_dir():
             return folder
-    raise FileNotFoundError(f"no models beside codrl_mj in {package}: the installation is incomplete")
+    raise FileNotFoundError(
+        f"no models beside codrl_mj in {package}: the installation is incomplete"
+    )
 
 
 def asset_path(name: str) -> Path:
@@ -99,7 +123,9 @@ def asset_path(name: str) -> Path:
         if path.is_file():
             return path
     if Path(name).parent == Path():
-        raise FileNotFoundError(f"no model {name!r} in {Path.cwd()}, nor among codrl_mj's: give the whole path")
+        raise FileNotFoundError(
+            f"no model {name!r} in {Path.cwd()}, nor among codrl_mj's: give the whole path"
+        )
     raise FileNotFoundError(f"no model file {name}")
 
 
@@ -107,18 +133,26 @@ def read_text(path: Path) -> str:
     """Return the text of a file, without the byte order mark that some editors put in front.
 
     Raises:
-        ValueError: it is not UTF-8; the message has the line, and the character if it was saved in Windows-1252.
+        ValueError: it is not UTF-8; the message has the line, and the character if it was saved in
+            Windows-1252.
     """
     content = path.read_bytes()
     try:
         wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-        return content.decode("utf-16" if wide else "utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+        return (
+            content.decode("utf-16" if wide else "utf-8-sig")
+            .replace("\r\n", "\n")
+            .replace("\r", "\n")
+        )
     except UnicodeDecodeError as error:
-        line, byte = content.count(b"\n", 0, error.start) + 1, content[error.start : error.start + 1]
+        line, byte = (
+            content.count(b"\n", 0, error.start) + 1,
+            content[error.start : error.start + 1],
+        )
         meant = byte.decode("cp1252", "replace")
         raise ValueError(
-            f"line {line} has the byte 0x{byte.hex()} ({meant} in Windows-1252), which is not UTF-8: save the file as "
-            "UTF-8"
+            f"line {line} has the byte 0x{byte.hex()} ({meant} in Windows-1252), which is not"
+            " UTF-8: save the file as UTF-8"
         ) from None
 
 
@@ -135,10 +169,15 @@ def read_yaml(path: Path) -> Any:
             keys = [key.value for key, _ in node.value]
             for key, _ in node.value[::-1]:
                 if keys.count(key.value) > 1 and key.value != "<<":
-                    raise ValueError(f"line {key.start_mark.line + 1}: {key.value} is given twice: leave one out")
+                    raise ValueError(
+                        f"line {key.start_mark.line + 1}: {key.value} is given twice: leave one out"
+                    )
             return super().construct_mapping(node, deep)
 
-    kinds = {"int": r"[-+]?(0|[1-9][\d_]*)$|0x[\da-fA-F]+$", "float": r"[-+]?(\d[\d_]*(\.\d*)?|\.\d+)([eE][-+]?\d+)?$"}
+    kinds = {
+        "int": r"[-+]?(0|[1-9][\d_]*)$|0x[\da-fA-F]+$",
+        "float": r"[-+]?(\d[\d_]*(\.\d*)?|\.\d+)([eE][-+]?\d+)?$",
+    }
     kinds["float"] += r"|[-+]?(\.(inf|Inf|INF)|Infinity)$|\.?(nan|NaN|NAN)$"
     tags = {f"tag:yaml.org,2002:{kind}": re.compile(text) for kind, text in kinds.items()}
     Loader.yaml_implicit_resolvers = {
@@ -178,16 +217,19 @@ def load_module(text: str) -> Any:
     module = text.partition(":")[0]
     if not _TRUSTED.get():
         raise ValueError(
-            f"{text!r}: needs the module {module}, and importing it executes whatever its author put there. Pass "
-            "--trust (in Python: trust=True) if that author is you, or somebody whose programs you would run"
+            f"{text!r}: needs the module {module}, and importing it executes whatever its author"
+            " put there. Pass --trust (in Python: trust=True) if that author is you, or somebody"
+            " whose programs you would run"
         )
     try:
         return importlib.import_module(module)
     except Exception as error:
-        if not module or (isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")):
+        if not module or (
+            isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
+        ):
             raise ValueError(
-                f"{text!r}: {error}; must be module:NAME of a module that is installed or in the present folder, "
-                f"{Path.cwd()}; on the command line FILE.py:NAME does as well"
+                f"{text!r}: {error}; must be module:NAME of a module that is installed or in the"
+                f" present folder, {Path.cwd()}; on the command line FILE.py:NAME does as well"
             ) from None
         where, ours = _origin(error)
         said = str(error) if ours else f"importing {module} failed: {type(error).__name__}: {error}"
@@ -197,12 +239,22 @@ def load_module(text: str) -> Any:
 def _origin(error: Exception) -> tuple[str, bool]:
     """Return the user's file and line that an error comes from, and whether it is one that this package raised."""
     frames, package = traceback.extract_tb(error.__traceback__), Path(__file__).parent
-    places = [(frame.filename, frame.lineno) for frame in frames if not frame.filename.startswith("<")]
-    if isinstance(error, SyntaxError) and error.filename:  # no frame is in the file that is not parsed
+    places = [
+        (frame.filename, frame.lineno) for frame in frames if not frame.filename.startswith("<")
+    ]
+    if (
+        isinstance(error, SyntaxError) and error.filename
+    ):  # no frame is in the file that is not parsed
         places.append((error.filename, error.lineno))
-    installed = [Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+    installed = [
+        Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")
+    ]
     others = [place for place in places if not Path(place[0]).is_relative_to(package)]
-    users = [one for one in others if not any(Path(one[0]).is_relative_to(folder) for folder in installed)]
+    users = [
+        one
+        for one in others
+        if not any(Path(one[0]).is_relative_to(folder) for folder in installed)
+    ]
     file, line = (users or others)[-1]
     return f"{file}, line {line}", Path(frames[-1].filename).is_relative_to(package)
 
@@ -214,7 +266,9 @@ def load_object(text: str) -> Any:
         return functools.reduce(getattr, name.split("."), module)
     except AttributeError as error:
         hint = fields.did_you_mean(name, vars(module)).rstrip() or "see"
-        raise ValueError(f"{text!r}: {error}; must be module:NAME; {hint} {getattr(module, '__file__', '')}") from None
+        raise ValueError(
+            f"{text!r}: {error}; must be module:NAME; {hint} {getattr(module, '__file__', '')}"
+        ) from None
 
 
 def look_up(
@@ -227,8 +281,8 @@ def look_up(
 ) -> Any:
     """What a name stands for: a value of `known`, which are ours, or, if `anybodys`, what stands at `module:NAME`.
 
-    Messages call it `what`. What is not ours has to be a subclass `of` a class, if one is given. `others` are names
-    that are known elsewhere, to be suggested but not listed, by what lists them.
+    Messages call it `what`. What is not ours has to be a subclass `of` a class, if one is given.
+    `others` are names that are known elsewhere, to be suggested but not listed, by what lists them.
     """
     if isinstance(name, str) and name in known:
         return known[name]

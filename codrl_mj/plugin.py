@@ -1,9 +1,10 @@
 """Registers our MuJoCo actuator plugin, one for all motors, when the package is imported; and MuJoCo's own library.
 
-MuJoCo knows a plugin by a structure of addresses of functions. `.mjb` files and pickles store the slot that it was
-registered in, so there is exactly one of ours, registered at a time that depends on nothing else. Importing numba and
-compiling would make `import codrl_mj` slow: what is registered here are two Python functions. When a first model
-reaches them, the others are compiled (`codrl_mj.engine.plugin`) and their addresses written into the structure.
+MuJoCo knows a plugin by a structure of addresses of functions. `.mjb` files and pickles store the
+slot that it was registered in, so there is exactly one of ours, registered at a time that depends
+on nothing else. Importing numba and compiling would make `import codrl_mj` slow: what is registered
+here are two Python functions. When a first model reaches them, the others are compiled
+(`codrl_mj.engine.plugin`) and their addresses written into the structure.
 """
 
 import ctypes
@@ -19,8 +20,25 @@ FAMILY = "family"
 """Its only configuration attribute: the family of the actuator, as `module:Class`."""
 
 _FUNCTIONS = (
-    *("nstate", "nsensordata", "init", "destroy", "copy", "reset", "compute", "advance", "visualize"),
-    *("actuator_act_dot", "sdf_distance", "sdf_gradient", "sdf_staticdistance", "sdf_attribute", "sdf_aabb"),
+    *(
+        "nstate",
+        "nsensordata",
+        "init",
+        "destroy",
+        "copy",
+        "reset",
+        "compute",
+        "advance",
+        "visualize",
+    ),
+    *(
+        "actuator_act_dot",
+        "sdf_distance",
+        "sdf_gradient",
+        "sdf_staticdistance",
+        "sdf_attribute",
+        "sdf_aabb",
+    ),
 )
 _OF_PID = {"nstate", "init", "destroy", "reset", "compute", "advance", "actuator_act_dot"}
 """The functions that MuJoCo's own plugin `mujoco.pid` has."""
@@ -51,7 +69,9 @@ def library() -> ctypes.CDLL:
     for pattern in ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll"):
         for path in Path(mujoco.__file__).parent.glob(pattern):
             return ctypes.CDLL(str(path))
-    raise LayoutError(f"MuJoCo {mujoco.__version__}: found no libmujoco in {Path(mujoco.__file__).parent}")
+    raise LayoutError(
+        f"MuJoCo {mujoco.__version__}: found no libmujoco in {Path(mujoco.__file__).parent}"
+    )
 
 
 def registered() -> dict[str, tuple[int, Any]]:
@@ -66,13 +86,21 @@ def registered() -> dict[str, tuple[int, Any]]:
 def check_structure(known: dict[str, tuple[int, Any]]) -> None:
     """Compare `Plugin` with the one that MuJoCo itself filled for `mujoco.pid`."""
     pid = known["mujoco.pid"][1] if "mujoco.pid" in known else Plugin()
-    attributes = {pid.attributes[index] for index in range(pid.nattribute)} if 0 < pid.nattribute < 20 else set()
+    attributes = (
+        {pid.attributes[index] for index in range(pid.nattribute)}
+        if 0 < pid.nattribute < 20
+        else set()
+    )
     filled = {function for function in _FUNCTIONS if getattr(pid, function)}
-    if not {b"kp", b"ki", b"kd"} <= attributes or pid.capabilityflags != _ACTUATOR or filled != _OF_PID:
+    if (
+        not {b"kp", b"ki", b"kd"} <= attributes
+        or pid.capabilityflags != _ACTUATOR
+        or filled != _OF_PID
+    ):
         raise LayoutError(
-            f"MuJoCo {mujoco.__version__}: its plugin mujoco.pid is not as expected (functions "
-            f"{', '.join(sorted(filled))}). Install a MuJoCo that this version of codrl_mj was tested with (see "
-            "pyproject.toml)"
+            f"MuJoCo {mujoco.__version__}: its plugin mujoco.pid is not as expected (functions"
+            f" {', '.join(sorted(filled))}). Install a MuJoCo that this version of codrl_mj was"
+            " tested with (see pyproject.toml)"
         )
 
 
@@ -93,8 +121,8 @@ def register() -> None:
     check_structure(known)
     if NAME in known:  # MuJoCo would end the process
         raise RuntimeError(
-            f"MuJoCo has a plugin {NAME} already: another copy of codrl_mj was imported in this process, which can "
-            "have one only"
+            f"MuJoCo has a plugin {NAME} already: another copy of codrl_mj was imported in this"
+            " process, which can have one only"
         )
     states = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int)(_states)
     start = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int)(_start)

@@ -1,7 +1,8 @@
 """Environments as dm_env agents know them: `suite.load("pendulum", "gym")`, or any of Gymnasium's in a `DmEnvironment`.
 
-Dynamics, rewards and ends are the Gymnasium environment's, bit for bit. Needs the extra `dm-control`, which brings
-MuJoCo 3. With MuJoCo 4 it works where dm_env is installed, but for `physics`: dm_control 1.0.50 needs MuJoCo 3.
+Dynamics, rewards and ends are the Gymnasium environment's, bit for bit. Needs the extra
+`dm-control`, which brings MuJoCo 3. With MuJoCo 4 it works where dm_env is installed, but for
+`physics`: dm_control 1.0.50 needs MuJoCo 3.
 """
 
 import copy
@@ -36,18 +37,20 @@ def __getattr__(name: str) -> Any:
 class DmEnvironment(dm_env.Environment):
     """A Gymnasium environment with dm_env's interface; whatever else that one has is had through this.
 
-    Such as `state`, `model`, `data`, `render` and `randomization`. The `info` of the last step, with the actuators'
-    signals, is in `info`.
+    Such as `state`, `model`, `data`, `render` and `randomization`. The `info` of the last step,
+    with the actuators' signals, is in `info`.
     """
 
-    def __init__(self, env: "gymnasium.Env[Any, Any]", random: Any = None, flat_observation: bool = False) -> None:
+    def __init__(
+        self, env: "gymnasium.Env[Any, Any]", random: Any = None, flat_observation: bool = False
+    ) -> None:
         """Wrap an environment.
 
         Args:
             env: the environment, of discrete actions or a box of them.
             random: a seed or a `numpy.random.Generator` for the initial states; any if None.
-            flat_observation: whether our tasks' observations are one vector, `observations`, as those of others are
-                that have no names.
+            flat_observation: whether our tasks' observations are one vector, `observations`, as
+                those of others are that have no names.
         """
         self.env, self.info = env, dict[str, Any]()
         self._ended, self._seed = True, None
@@ -56,7 +59,9 @@ class DmEnvironment(dm_env.Environment):
         elif random is not None:
             self._seed = operator.index(random)
         self._names = () if flat_observation else getattr(env.unwrapped, "observation_names", ())
-        self._physics: Any = None  # a dm_control.mujoco.Physics, which is imported when it is first asked for
+        self._physics: Any = (
+            None  # a dm_control.mujoco.Physics, which is imported when it is first asked for
+        )
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode."""
@@ -67,8 +72,8 @@ class DmEnvironment(dm_env.Environment):
     def step(self, action: Any) -> dm_env.TimeStep:
         """Advance by one environment step; an episode that has ended starts anew.
 
-        An episode ends with discount 0 where the task says so and with discount 1 at the time limit; a last step that
-        is both has discount 1, as everywhere in dm_control.
+        An episode ends with discount 0 where the task says so and with discount 1 at the time
+        limit; a last step that is both has discount 1, as everywhere in dm_control.
 
         Raises:
             ValueError: the action is not of the action spec.
@@ -93,11 +98,16 @@ class DmEnvironment(dm_env.Environment):
         if self._names:
             entries = {name: [value] for name, value in zip(self._names, observation, strict=True)}
         arrays = {name: np.array(values) for name, values in entries.items()}
-        return {name: one.astype(np.float64) if one.dtype.kind == "f" else one for name, one in arrays.items()}
+        return {
+            name: one.astype(np.float64) if one.dtype.kind == "f" else one
+            for name, one in arrays.items()
+        }
 
     def observation_spec(self) -> dict[str, specs.Array]:
         """The observation space, by name."""
-        some = self._entries(copy.deepcopy(self.env.observation_space).sample())  # whose generator is the user's
+        some = self._entries(
+            copy.deepcopy(self.env.observation_space).sample()
+        )  # whose generator is the user's
         return {name: specs.Array(one.shape, one.dtype, name) for name, one in some.items()}
 
     def action_spec(self) -> specs.Array:
@@ -112,8 +122,8 @@ class DmEnvironment(dm_env.Environment):
     def physics(self) -> Any:
         """dm_control's view of the simulation's present model and data: named indexing, `render`, `reset_context`.
 
-        It is a `dm_control.mujoco.Physics`. Steps are the environment's own; so are complete saved states, `snapshot`
-        and `restore`.
+        It is a `dm_control.mujoco.Physics`. Steps are the environment's own; so are complete saved
+        states, `snapshot` and `restore`.
 
         Raises:
             RuntimeError: dm_control does not work with the installed MuJoCo.
@@ -142,14 +152,18 @@ class DmEnvironment(dm_env.Environment):
         """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
 
         Returns:
-            None; or the first observation of an episode, where the environment could only start one anew.
+            None; or the first observation of an episode, where the environment could only start one
+            anew.
 
         Raises:
-            ValueError: the snapshot is of another environment or other arguments; nothing was changed.
+            ValueError: the snapshot is of another environment or other arguments; nothing was
+                changed.
         """
         check_snapshot(snapshot, self.snapshot())
         self.env.reset()  # which Gymnasium's wrappers insist on
-        own = {name: values for name, values in snapshot.items() if name not in ("elapsed", "ended")}
+        own = {
+            name: values for name, values in snapshot.items() if name not in ("elapsed", "ended")
+        }
         begun = self.env.get_wrapper_attr("restore")(own)
         self._ended = begun is None and bool(snapshot["ended"])
         if begun is not None:
@@ -185,11 +199,12 @@ def load(
     Args:
         domain_name: task name, such as `pendulum`; or an environment's whole configuration.
         task_name: `gym`.
-        actuator: as for `codrl_mj.envs.ActuatedEnv`, the task's own unless given; over a configuration's.
+        actuator: as for `codrl_mj.envs.ActuatedEnv`, the task's own unless given; over a
+            configuration's.
         task_kwargs: `random`, as for `DmEnvironment`.
         environment_kwargs: `flat_observation`, as for `DmEnvironment`.
-        **options: the other fields of `codrl_mj.envs.config.EnvConfig`, and the task's own options, over a
-            configuration's.
+        **options: the other fields of `codrl_mj.envs.config.EnvConfig`, and the task's own options,
+            over a configuration's.
     """
     if task_name != TASK_NAME:
         raise ValueError(f"task_name = {task_name!r}: every domain has one task, {TASK_NAME!r}")
@@ -198,11 +213,14 @@ def load(
         raise ValueError(f"task_kwargs = {dict(given)!r}: may only hold 'random'")
     if isinstance(domain_name, str):
         limit = options.pop("max_episode_steps", None)
-        config: Any = EnvConfig.of(domain_name, "default" if actuator is _DEFAULT else actuator, options)
+        config: Any = EnvConfig.of(
+            domain_name, "default" if actuator is _DEFAULT else actuator, options
+        )
         config = dataclasses.replace(config, max_episode_steps=limit)
     elif not isinstance(domain_name, EnvConfig):
         raise ValueError(
-            f"domain_name = {domain_name!r}: must be a task's name or an EnvConfig; others go into DmEnvironment(...)"
+            f"domain_name = {domain_name!r}: must be a task's name or an EnvConfig; others go into"
+            " DmEnvironment(...)"
         )
     else:
         over = options if actuator is _DEFAULT else {"actuator": actuator, **options}

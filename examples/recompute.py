@@ -16,10 +16,13 @@ DOSES = {
     "furuta": ("lag 0.5", "weakness 0.55", "supply 0.6", "delay 0.5", "friction 0.2", "noise 0.8"),
 }
 print(
-    f"{'task':10}{'tested on':16}{'trained on: ideal':>20}{'random':>20}{'it':>20}   (mean score; of 20, how many fail)"
+    f"{'task':10}{'tested on':16}{'trained on: ideal':>20}{'random':>20}{'it':>20}   (mean score;"
+    " of 20, how many fail)"
 )
 for task, doses in DOSES.items():
     for dose in doses:
         cells = [scores[task, trained, dose] for trained in ("ideal", "generic", dose.split()[0])]
-        shown = [f"{statistics.mean(each):.3f}; {sum(one < 0.9 for one in each):2}" for each in cells]
+        shown = [
+            f"{statistics.mean(each):.3f}; {sum(one < 0.9 for one in each):2}" for each in cells
+        ]
         print(f"{task:10}{dose:16}" + "".join(f"{one:>20}" for one in shown))

@@ -7,12 +7,17 @@ from pathlib import Path
 from statistics import mean, variance
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "docs/results/reproduction")
-claims, runs = (list(csv.DictReader((folder / name).read_text().splitlines())) for name in ("claims.csv", "runs.csv"))
+claims, runs = (
+    list(csv.DictReader((folder / name).read_text().splitlines()))
+    for name in ("claims.csv", "runs.csv")
+)
 
 
 def student(freedom: float) -> float:
     """Student's t at 97.5 %: its density is integrated by Simpson's rule, and the bound found by halving."""
-    scale = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(freedom * math.pi)
+    scale = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(
+        freedom * math.pi
+    )
     low, high = 0.0, 700.0
     for _ in range(50):
         x = (low + high) / 2
@@ -26,7 +31,10 @@ def values(arm: str, column: str) -> dict[str, str]:
     """What there is of an arm, first seeds first: seed (a second training of it too) -> text."""
     found: dict[str, str] = {}
     for row in runs:
-        if ", ".join(row[name] for name in ("task", "settings", "motor", "physics")) == arm and row[column]:
+        if (
+            ", ".join(row[name] for name in ("task", "settings", "motor", "physics")) == arm
+            and row[column]
+        ):
             found[row["seed"] + " again" * (row["seed"] in found)] = row[column]
     return found
 
@@ -37,7 +45,9 @@ def interval(*samples: list[float], spread: float = 0.0) -> tuple[float, float]:
     middle = mean(samples[0]) - (mean(samples[1]) if len(samples) > 1 else 0)
     if not sum(parts):
         return middle, middle
-    freedom = sum(parts) ** 2 / sum(part**2 / (len(one) - 1) for part, one in zip(parts, samples, strict=True))
+    freedom = sum(parts) ** 2 / sum(
+        part**2 / (len(one) - 1) for part, one in zip(parts, samples, strict=True)
+    )
     half = student(freedom) * math.sqrt(sum(parts))
     return middle - half, middle + half
 
@@ -49,8 +59,14 @@ def verdict(claim: dict[str, str]) -> str:
     if not all(len(one) > (rule not in ("one episode", "every seed")) for one in texts):
         return "not testable"
     if rule == "one episode":
-        times = sorted(float(time) for one in texts[0].values() for time in one.split() if time != "-")
-        ends = [times[math.ceil(share * len(times)) - 1] for share in (0.025, 0.975)] if times else [math.inf] * 2
+        times = sorted(
+            float(time) for one in texts[0].values() for time in one.split() if time != "-"
+        )
+        ends = (
+            [times[math.ceil(share * len(times)) - 1] for share in (0.025, 0.975)]
+            if times
+            else [math.inf] * 2
+        )
         return "compatible" if ends[0] <= least <= ends[1] else "not confirmed"
     samples = [[float(text) for text in one.values()] for one in texts]
     if rule == "every seed":
@@ -66,4 +82,7 @@ def verdict(claim: dict[str, str]) -> str:
 
 
 for claim in claims:
-    print(f"{claim['task']}: {claim['statement']}: {claim['says']} ({claim['settings']}): {verdict(claim)}")
+    print(
+        f"{claim['task']}: {claim['statement']}: {claim['says']} ({claim['settings']}):"
+        f" {verdict(claim)}"
+    )

@@ -1,6 +1,7 @@
 """An arm with position servos, as somebody's Gymnasium environment: two links in a vertical plane reach for a point.
 
-The action is where the joints are asked to be; `ServoArm-v0` registers with Gymnasium when this module is imported.
+The action is where the joints are asked to be; `ServoArm-v0` registers with Gymnasium when this
+module is imported.
 """
 
 import tempfile
@@ -51,7 +52,10 @@ class ServoArm(MujocoEnv):
     A step is 25 ms, an episode 100. Success: the hand is within 3 cm of the target at the end.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array", "depth_array"], "render_fps": 40}  # noqa: RUF012
+    metadata = {  # noqa: RUF012
+        "render_modes": ["human", "rgb_array", "depth_array"],
+        "render_fps": 40,
+    }
 
     def __init__(self, **options: Any) -> None:
         """Build the model."""
@@ -75,12 +79,16 @@ class ServoArm(MujocoEnv):
     def _way(self) -> np.ndarray:
         """From the hand to the target [m]."""
         shoulder, both = self.data.qpos[0], self.data.qpos.sum()
-        hand = 0.2 * np.array([np.cos(shoulder), np.sin(shoulder)]) + 0.18 * np.array([np.cos(both), np.sin(both)])
+        hand = 0.2 * np.array([np.cos(shoulder), np.sin(shoulder)]) + 0.18 * np.array(
+            [np.cos(both), np.sin(both)]
+        )
         return self._target - hand
 
     def _seen(self) -> np.ndarray:
         angles = self.data.qpos
-        return np.concatenate([np.cos(angles), np.sin(angles), 0.1 * self.data.qvel, self._target, self._way()])
+        return np.concatenate(
+            [np.cos(angles), np.sin(angles), 0.1 * self.data.qvel, self._target, self._way()]
+        )
 
     def reset_model(self) -> np.ndarray:
         """Start at rest somewhere, with a target within reach."""

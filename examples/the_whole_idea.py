@@ -1,12 +1,14 @@
 """The whole idea in one file: a motor, its current loop, a cart-pole, and a policy that learns with or without them.
 
-Read it from top to bottom; it needs numpy alone. Run it, and within a minute you see a policy that balances a pole on
-ideal forces and drops it on a motor, and another of five numbers that learned through the motor and keeps it up.
+Read it from top to bottom; it needs numpy alone. Run it, and within a minute you see a policy that
+balances a pole on ideal forces and drops it on a motor, and another of five numbers that learned
+through the motor and keeps it up.
 
     python examples/the_whole_idea.py
 
-Everything else in codrl_mj is this with MuJoCo in the place of `cartpole`, real motors in the place of `Motor`, and
-better agents in the place of `learn`. Up to rounding, `motor_step` and `cartpole_step` are the package's own steps.
+Everything else in codrl_mj is this with MuJoCo in the place of `cartpole`, real motors in the place
+of `Motor`, and better agents in the place of `learn`. Up to rounding, `motor_step` and
+`cartpole_step` are the package's own steps.
 """
 
 from typing import NamedTuple
@@ -44,15 +46,20 @@ class Motor(NamedTuple):
     max_voltage: float = 24.0  # what the supply has [V]
 
 
-PAPER = Motor()  # arXiv 2507.00268 drives its cart with this one, which is quick enough not to be noticed
-SLOW = Motor(inductance=1.0, kp=1.0, ki=1.0, kd=0.0, kff=0.0)  # ten times its inductance, under a gentle loop
+PAPER = (
+    Motor()
+)  # arXiv 2507.00268 drives its cart with this one, which is quick enough not to be noticed
+SLOW = Motor(
+    inductance=1.0, kp=1.0, ki=1.0, kd=0.0, kff=0.0
+)  # ten times its inductance, under a gentle loop
 
 
-# 2. Its current loop. ----------------------------------------------------------------------------------------------
-#
-# Who wants a force wants a current: i_ref = r*force/kT. A PID controller compares it with the current that flows and
-# chooses the voltage. It adds what the turning takes away (kE*omega), and it cannot go beyond the supply. One step of
-# it is one step of Algorithm 1 of the paper; the winding then moves by explicit Euler.
+# 2. Its current loop.
+# ----------------------------------------------------------------------------------------------
+# Who wants a force wants a current: i_ref = r*force/kT. A PID controller compares it with the
+# current that flows and chooses the voltage. It adds what the turning takes away (kE*omega), and it
+# cannot go beyond the supply. One step of it is one step of Algorithm 1 of the paper; the winding
+# then moves by explicit Euler.
 
 
 def motor_at_rest(many: int) -> np.ndarray:
@@ -60,7 +67,9 @@ def motor_at_rest(many: int) -> np.ndarray:
     return np.zeros((3, many))
 
 
-def motor_step(motor: Motor, state: np.ndarray, desired: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, ...]:
+def motor_step(
+    motor: Motor, state: np.ndarray, desired: np.ndarray, speed: np.ndarray
+) -> tuple[np.ndarray, ...]:
     """One step of the loop: the motor's next state, the force [N] that the cart gets, and the voltage [V]."""
     current, integral, last_error = state
     back_emf = motor.back_emf_constant * speed / motor.arm
@@ -71,13 +80,18 @@ def motor_step(motor: Motor, state: np.ndarray, desired: np.ndarray, speed: np.n
     voltage = voltage + motor.kff * reference + back_emf
     voltage = np.clip(voltage, -motor.max_voltage, motor.max_voltage)
     current = current + (voltage - back_emf - motor.resistance * current) / motor.inductance * STEP
-    return np.array([current, integral, error]), motor.torque_constant * current / motor.arm, voltage
+    return (
+        np.array([current, integral, error]),
+        motor.torque_constant * current / motor.arm,
+        voltage,
+    )
 
 
-# 3. A cart with a pole on it. --------------------------------------------------------------------------------------
-#
-# Gymnasium's CartPole-v1: a cart of 1 kg, a pole of 0.1 kg and 1 m, explicit Euler. An episode ends when the cart is
-# 2.4 m away or the pole leans by 12 degrees. Here are many of them at once, a column each.
+# 3. A cart with a pole on it.
+# --------------------------------------------------------------------------------------
+# Gymnasium's CartPole-v1: a cart of 1 kg, a pole of 0.1 kg and 1 m, explicit Euler. An episode ends
+# when the cart is 2.4 m away or the pole leans by 12 degrees. Here are many of them at once, a
+# column each.
 
 
 def cartpole_step(state: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -95,10 +109,11 @@ def standing(state: np.ndarray) -> np.ndarray:
     return (np.abs(state[0]) <= 2.4) & (np.abs(state[2]) <= np.radians(12))
 
 
-# 4. A policy. ------------------------------------------------------------------------------------------------------
-#
-# Five numbers: how much position, speed, angle and turning speak for a push to the right, and a bias. While it learns,
-# the policy tosses a coin with that probability; afterwards it takes the likelier side. It never sees the motor.
+# 4. A policy.
+# ------------------------------------------------------------------------------------------------------
+# Five numbers: how much position, speed, angle and turning speak for a push to the right, and a
+# bias. While it learns, the policy tosses a coin with that probability; afterwards it takes the
+# likelier side. It never sees the motor.
 
 
 def preference(policy: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -111,10 +126,10 @@ def probability(policy: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return 1 / (1 + np.exp(-preference(policy, seen)))
 
 
-# 5. Episodes. ------------------------------------------------------------------------------------------------------
-#
-# The only line that matters is the one with `motor_step` in it. Leave it out, as nearly everybody does, and the cart
-# gets what the policy asked for, at once.
+# 5. Episodes.
+# ------------------------------------------------------------------------------------------------------
+# The only line that matters is the one with `motor_step` in it. Leave it out, as nearly everybody
+# does, and the cart gets what the policy asked for, at once.
 
 
 class Episodes(NamedTuple):
@@ -125,9 +140,15 @@ class Episodes(NamedTuple):
     alive: np.ndarray  # was it still standing when it decided? Their sum is an episode's return.
 
 
-def play(policy: np.ndarray, motor: Motor | None, many: int, rng: np.random.Generator, explore: bool) -> Episodes:
+def play(
+    policy: np.ndarray, motor: Motor | None, many: int, rng: np.random.Generator, explore: bool
+) -> Episodes:
     """Episodes side by side, through a motor or, if there is none, on ideal forces."""
-    state, inside, alive = rng.uniform(-0.05, 0.05, (4, many)), motor_at_rest(many), np.ones(many, bool)
+    state, inside, alive = (
+        rng.uniform(-0.05, 0.05, (4, many)),
+        motor_at_rest(many),
+        np.ones(many, bool),
+    )
     steps = []
     while alive.any() and len(steps) < LIMIT:
         chance = probability(policy, state)
@@ -143,11 +164,11 @@ def play(policy: np.ndarray, motor: Motor | None, many: int, rng: np.random.Gene
     return Episodes(np.moveaxis(seen, 1, 0), right, alive)
 
 
-# 6. Learning. ------------------------------------------------------------------------------------------------------
-#
-# Policy gradient, the oldest one (Williams, 1992): play, and make likelier what went better than usual at that time of
-# an episode. What "went" means is the number of steps that the pole stood afterwards, later ones counting less. Adam
-# (Kingma and Ba, 2015) chooses the size of the step.
+# 6. Learning.
+# ------------------------------------------------------------------------------------------------------
+# Policy gradient, the oldest one (Williams, 1992): play, and make likelier what went better than
+# usual at that time of an episode. What "went" means is the number of steps that the pole stood
+# afterwards, later ones counting less. Adam (Kingma and Ba, 2015) chooses the size of the step.
 
 
 def learn(motor: Motor | None, seed: int = 0, rounds: int = 100, many: int = 64) -> np.ndarray:
@@ -162,10 +183,14 @@ def learn(motor: Motor | None, seed: int = 0, rounds: int = 100, many: int = 64)
         usual = to_come.sum(1, keepdims=True) / np.maximum(alive.sum(1, keepdims=True), 1)
         better = (to_come - usual) * alive / (to_come - usual)[alive].std()
 
-        surprise = (right - probability(policy, seen)) * better  # the gradient of log-probability times `better`
+        surprise = (
+            right - probability(policy, seen)
+        ) * better  # the gradient of log-probability times `better`
         gradient = np.append(np.tensordot(seen, surprise, 2), surprise.sum()) / alive.sum()
         mean, square = 0.9 * mean + 0.1 * gradient, 0.99 * square + 0.01 * gradient**2
-        policy = policy + 0.1 * mean / (1 - 0.9**number) / (np.sqrt(square / (1 - 0.99**number)) + 1e-8)
+        policy = policy + 0.1 * mean / (1 - 0.9**number) / (
+            np.sqrt(square / (1 - 0.99**number)) + 1e-8
+        )
         if number % 20 == 0:
             print(f"    round {number:3}: the pole stands for {alive.sum(0).mean() * STEP:4.1f} s")
     return policy
@@ -173,10 +198,13 @@ def learn(motor: Motor | None, seed: int = 0, rounds: int = 100, many: int = 64)
 
 def score(policy: np.ndarray, motor: Motor | None, many: int = 100) -> float:
     """Mean return of greedy episodes from starts that learning never saw; 500 is full marks."""
-    return float(play(policy, motor, many, np.random.default_rng(10_000), explore=False).alive.sum(0).mean())
+    return float(
+        play(policy, motor, many, np.random.default_rng(10_000), explore=False).alive.sum(0).mean()
+    )
 
 
-# 7. The story. -----------------------------------------------------------------------------------------------------
+# 7. The story.
+# -----------------------------------------------------------------------------------------------------
 
 
 def late(motor: Motor) -> list[float]:
@@ -193,7 +221,10 @@ def main() -> dict[str, dict[str, float]]:
     print(f"You ask for {PUSH:g} N. The motor gives")
     for name, motor in (("the paper's", PAPER), ("the slow one", SLOW)):
         got = late(motor)
-        print(f"    {name:14}" + ", ".join(f"{got[n - 1]:.1f} N after {n * STEP:.2f} s" for n in (1, 10, 25, 50)))
+        print(
+            f"    {name:14}"
+            + ", ".join(f"{got[n - 1]:.1f} N after {n * STEP:.2f} s" for n in (1, 10, 25, 50))
+        )
     print("Learn on ideal forces:")
     ideal = learn(None)
     print("Learn through the slow motor:")
@@ -208,7 +239,8 @@ def main() -> dict[str, dict[str, float]]:
         policy[3] / policy[2] for policy in (ideal, through)
     )  # what turning counts, over what the angle does
     print(
-        f"\nThe first looks {first:.1f} s ahead. The second met a force that is late, and looks {second:.1f} s ahead."
+        f"\nThe first looks {first:.1f} s ahead. The second met a force that is late, and looks"
+        f" {second:.1f} s ahead."
     )
     return table
 

@@ -1,8 +1,8 @@
 """Writes docs/actuators_in_numbers.md and its two CSV files: what every actuator that has a name does on a bench.
 
-Torques and speeds are measured in the engine, on one hinge: blocked, turned slowly by a heavy load, or free. The loops
-of the catalogue's motors and their continuous torques are `codrl_mj.drives`'s. `make docs` runs it; a
-test compares the files with what it would write.
+Torques and speeds are measured in the engine, on one hinge: blocked, turned slowly by a heavy load,
+or free. The loops of the catalogue's motors and their continuous torques are `codrl_mj.drives`'s.
+`make docs` runs it; a test compares the files with what it would write.
 """
 
 import argparse
@@ -42,11 +42,14 @@ def settled(torques: np.ndarray, band: float) -> int:
     return int(wrong[-1]) + 1 if len(wrong) else 0
 
 
-def free_run(actuator: Any, timestep: float, inertia: float, time_constant: float) -> tuple[float, float]:
+def free_run(
+    actuator: Any, timestep: float, inertia: float, time_constant: float
+) -> tuple[float, float]:
     """No-load speed [rad/s] of the joint and the time constant [s] in which it is reached.
 
-    That is the area between speed and no-load speed over the latter: the sum of all time constants less none of the
-    winding's, whatever its inductance; torque and back-EMF are of the speed at a step's start, and so is the sum.
+    That is the area between speed and no-load speed over the latter: the sum of all time constants
+    less none of the winding's, whatever its inductance; torque and back-EMF are of the speed at a
+    step's start, and so is the sum.
 
     Args:
         actuator: whose.
@@ -68,13 +71,17 @@ def task_row(task: str, name: str) -> dict[str, Any]:
     for band in (5, 2):
         seconds = settled(torques, band / 100) * timestep
         row |= {f"settled_{band}_steps": seconds / spec.step_duration, f"settled_{band}_s": seconds}
-    product = motor.torque_constant * motor.back_emf_constant / motor.resistance / actuator.arm_radius**2
+    product = (
+        motor.torque_constant * motor.back_emf_constant / motor.resistance / actuator.arm_radius**2
+    )
 
     return row | {
         "first_step_percent": 100.0 * torques[spec.motor_inner_steps - 1] / asked,
         "steady_error_percent": round(100.0 * (torques[-1] / asked - 1.0), 6) + 0.0,
         "stall_torque": blocked(1e6, 50.0 * motor.electrical_time_constant)[-1, 0],
-        "no_load_speed": free_run(actuator, timestep, 50.0 * timestep * product, 50.0 * timestep)[0],
+        "no_load_speed": free_run(actuator, timestep, 50.0 * timestep * product, 50.0 * timestep)[
+            0
+        ],
         "slide": _on_a_slide(task),
     }
 
@@ -112,15 +119,21 @@ def motor_row(name: str) -> dict[str, Any]:
         "bandwidth_hz": loop.bandwidth,
         "stall_torque": _stall(free, speed),
         "no_load_speed": speed,
-        "continuous_torque": math.nan if continuous is None else float(torque_limits(free, 0.0, continuous)[1]),
-        "mechanical_time_constant_ms": math.nan if numbers.rotor_inertia is None else 1e3 * time_constant,
+        "continuous_torque": (
+            math.nan if continuous is None else float(torque_limits(free, 0.0, continuous)[1])
+        ),
+        "mechanical_time_constant_ms": (
+            math.nan if numbers.rotor_inertia is None else 1e3 * time_constant
+        ),
     }
 
 
 def _free(drive: Drive) -> tuple[float, float]:
     """`free_run` of the rotor alone; where its inertia is not known, of a load that takes 20 ms."""
     motor, rate = drive.motor, drive.controller.sample_rate
-    product = motor.torque_constant * motor.back_emf_constant * motor.gear_efficiency / motor.resistance
+    product = (
+        motor.torque_constant * motor.back_emf_constant * motor.gear_efficiency / motor.resistance
+    )
     known = motor.rotor_inertia > 0.0
     time_constant = motor.rotor_inertia / product if known else 0.02
     timestep = max(math.floor(time_constant / 100.0 * rate), 1) / rate
@@ -131,8 +144,15 @@ def _free(drive: Drive) -> tuple[float, float]:
 def _stall(drive: Drive, no_load_speed: float) -> float:
     """Torque [N*m] of the output that just turns, by its line through 1 and 2 % of the no-load speed."""
     duration = max(50.0 * drive.motor.electrical_time_constant, 2e-3)
-    most = drive.motor.torque_constant * drive.voltage_limit / drive.motor.resistance / drive.arm_radius
-    bench = on_bench(drive, 1.0 / drive.controller.sample_rate, 1e4 * most * duration / no_load_speed)
+    most = (
+        drive.motor.torque_constant
+        * drive.voltage_limit
+        / drive.motor.resistance
+        / drive.arm_radius
+    )
+    bench = on_bench(
+        drive, 1.0 / drive.controller.sample_rate, 1e4 * most * duration / no_load_speed
+    )
     slow, less_slow = (bench(1e6, duration, share * no_load_speed)[-1, 1] for share in (0.01, 0.02))
     return float(2.0 * slow - less_slow)
 
@@ -164,7 +184,10 @@ def _ranges(rows: list[dict[str, str]], column: str) -> list[str]:
     found: dict[str, list[float]] = {}
     for row in rows:
         found.setdefault(row["actuator"], []).append(float(row[column]))
-    return [" to ".join(dict.fromkeys([_number(min(some)), _number(max(some))])) for some in found.values()]
+    return [
+        " to ".join(dict.fromkeys([_number(min(some)), _number(max(some))]))
+        for some in found.values()
+    ]
 
 
 def _motor_line(row: dict[str, str]) -> list[str]:
@@ -182,7 +205,10 @@ def page(tables: Mapping[str, list[dict[str, str]]]) -> str:
     tasks, motors = tables["tasks"], tables["motors"]
     heads = ("motor", "V", "gear", "stall [N·m]", "no load [rad/s]", "continuous [N·m]")
     names = [f"`{name}`" for name in dict.fromkeys(row["actuator"] for row in tasks)]
-    paper = {"settles within 2 % [s]": "settled_2_s", "is there after a policy's step [%]": "first_step_percent"}
+    paper = {
+        "settles within 2 % [s]": "settled_2_s",
+        "is there after a policy's step [%]": "first_step_percent",
+    }
     loop = motors[0]
     return f"""# Actuators in numbers
 
@@ -214,7 +240,10 @@ values. –: not printed. Stall and no load are measured; they are as printed, t
 def _write(measured: list[dict[str, Any]], path: Path) -> list[dict[str, str]]:
     """Write a table, and return its rows as they stand there."""
     texts = [
-        {key: f"{value:.6g}" if isinstance(value, float) else f"{value}" for key, value in row.items()}
+        {
+            key: f"{value:.6g}" if isinstance(value, float) else f"{value}"
+            for key, value in row.items()
+        }
         for row in measured
     ]
     with writing(path) as temporary, temporary.open("w", newline="") as file:
@@ -226,10 +255,14 @@ def _write(measured: list[dict[str, Any]], path: Path) -> list[dict[str, str]]:
 
 def main() -> int:
     """Write the page and its tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the files")
     options = parser.parse_args()
-    tables = {kind: _write(measured, options.out / TABLES[kind]) for kind, measured in rows().items()}
+    tables = {
+        kind: _write(measured, options.out / TABLES[kind]) for kind, measured in rows().items()
+    }
     with writing(options.out / PAGE) as temporary:
         temporary.write_text(page(tables))
     print("\n".join(f"wrote {options.out / name}" for name in TABLES.values()))

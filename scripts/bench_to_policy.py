@@ -1,8 +1,9 @@
 """From a bench log to a policy: log, identify, train with what is left open, test on the motor that the log is of.
 
-The motor on the bench is one that only its logs show: that of a datasheet with more friction, a higher resistance and a
-lower torque constant. Agents learn Pendulum through the datasheet's motor and through the identified one, drawn within
-its intervals, and are tested on the real one. Trainings that were interrupted go on.
+The motor on the bench is one that only its logs show: that of a datasheet with more friction, a
+higher resistance and a lower torque constant. Agents learn Pendulum through the datasheet's motor
+and through the identified one, drawn within its intervals, and are tested on the real one.
+Trainings that were interrupted go on.
 """
 
 import argparse
@@ -36,22 +37,34 @@ REAL = dataclasses.replace(
         viscous_friction=1e-4,  # N*m*s/rad at the rotor
     ),
 )
-SENSORS = {"current": Sensor(noise=0.05), "position": Sensor(resolution=2.0 * np.pi / 4096)}  # A, rad
+SENSORS = {
+    "current": Sensor(noise=0.05),
+    "position": Sensor(resolution=2.0 * np.pi / 4096),
+}  # A, rad
 COLUMNS = "time=time:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
 
 
 def main() -> None:
     """Log, identify, train, test."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench_to_policy"), help="folder for all of it")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/bench_to_policy"), help="folder for all of it"
+    )
     parser.add_argument("--seeds", type=int, default=3, help="trainings of each kind")
-    parser.add_argument("--total-steps", type=int, default=15_000, help="environment steps of a training")
+    parser.add_argument(
+        "--total-steps", type=int, default=15_000, help="environment steps of a training"
+    )
     options = parser.parse_args()
     logs = list(_bench())
     found = identify(logs[:2], "free", {"gear_ratio": 20.0, "load_inertia": 0.0}, held_out=logs[2:])
     for one in found.estimates:
         real = getattr(REAL.motor, one.name, None)
-        print(f"{one.name}: {one.value:.4g} [{one.low:.4g}, {one.high:.4g}] {one.unit}, {one.status}; real {real}")
+        print(
+            f"{one.name}: {one.value:.4g} [{one.low:.4g}, {one.high:.4g}] {one.unit}, {one.status};"
+            f" real {real}"
+        )
     found.write(options.out)
     fitted = options.out / "actuator.yaml"
     through = {
@@ -63,7 +76,8 @@ def main() -> None:
     print("| trained through | on the datasheet's motor | on the real motor |\n| --- | --- | --- |")
     for name, env in through.items():
         runs = [
-            _trained(env, options.out / f"{name}-{seed}", seed, options.total_steps) for seed in range(options.seeds)
+            _trained(env, options.out / f"{name}-{seed}", seed, options.total_steps)
+            for seed in range(options.seeds)
         ]
         print(f"| {name} | {_tested(runs, DATASHEET)} | {_tested(runs, REAL)} |", flush=True)
 
@@ -75,7 +89,12 @@ def _bench() -> Iterator[Log]:
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(3):
             path = Path(folder) / f"bench{seed}.csv"
-            write_log(path, simulate(REAL, excitation, sensors=SENSORS, sampler=sampler, seed=seed, name=path.stem))
+            write_log(
+                path,
+                simulate(
+                    REAL, excitation, sensors=SENSORS, sampler=sampler, seed=seed, name=path.stem
+                ),
+            )
             yield read_log(path, COLUMNS)
 
 
@@ -86,7 +105,9 @@ def _trained(env: EnvConfig, out: Path, seed: int, steps: int) -> Path:
 
 def _tested(runs: list[Path], motor: Any) -> str:
     """Mean return over seeds, lowest and highest, and how many episodes end upright."""
-    tests = [evaluate(load_policy(run), EnvConfig(TASK, motor), EPISODES, TEST_SEED) for run in runs]
+    tests = [
+        evaluate(load_policy(run), EnvConfig(TASK, motor), EPISODES, TEST_SEED) for run in runs
+    ]
     returns = [one.returns.mean for one in tests]
     upright = np.mean([one.success.mean for one in tests if one.success is not None])
     return f"{np.mean(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}], {upright:.0%} upright"

@@ -1,7 +1,6 @@
 """What the benchmark times: our simulations, and those of other libraries."""
 
-import codrl_mj  # isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
-
+# isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
 import dataclasses
 import time
 from collections.abc import Callable
@@ -12,6 +11,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+import codrl_mj
 from codrl_mj import engine as callbacks
 from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import Plant
@@ -43,8 +43,8 @@ def engine(task: str, actuator: str | None = "paper") -> Subject:
 
     Args:
         task: the task's name.
-        actuator: `paper`; `drive`, the one that the certificate runs the task with; or `stepped`, the same with its
-            gains given, which is what keeps it from its closed form.
+        actuator: `paper`; `drive`, the one that the certificate runs the task with; or `stepped`,
+            the same with its gains given, which is what keeps it from its closed form.
     """
     definition = TASKS[task]
     timestep = definition.step_duration / definition.motor_inner_steps
@@ -53,7 +53,9 @@ def engine(task: str, actuator: str | None = "paper") -> Subject:
         one = fitted(task)
     if actuator == "stepped":
         bench = Bench(one, timestep)
-        one = one.replaced({"controller.kp": bench.kp, "controller.ki": bench.ki * one.controller.sample_rate})
+        one = one.replaced(
+            {"controller.kp": bench.kp, "controller.ki": bench.ki * one.controller.sample_rate}
+        )
     model = task_model(Plant(definition, (one,), definition.motor_inner_steps))
     data = mujoco.MjData(model)
 
@@ -78,7 +80,9 @@ def chain(motors: int, actuator: str | None, substeps: int = 10) -> Subject:
         body = body.add_body(pos=[0.0, 0.0, -0.1])
         joint = body.add_joint(name=f"joint{index}", axis=[0.0, 1.0, 0.0], damping=[0.1, 0.0, 0.0])
         body.explicitinertial, body.mass, body.inertia = True, 0.1, [0.01, 0.01, 0.01]
-        motor = spec.add_actuator(name=f"motor{index}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor = spec.add_actuator(
+            name=f"motor{index}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+        )
         motor.set_to_motor()
     given: Any = {
         "current_loop": codrl_mj.actuators.Actuator(
@@ -109,7 +113,9 @@ def single(name: str, env: Any) -> Subject:
             if terminated or truncated:
                 env.reset()
 
-    return Subject(name, run, lambda: env.reset(seed=0))  # a reset installs our callbacks where the environment is ours
+    return Subject(
+        name, run, lambda: env.reset(seed=0)
+    )  # a reset installs our callbacks where the environment is ours
 
 
 def ours(task: str, actuator: str) -> Subject:
@@ -127,7 +133,10 @@ def foreign(env_id: str, actuator: str | None) -> Subject:
     """An environment of Gymnasium's with motors behind its actuators; None: as it is."""
     if actuator is None:
         return theirs(env_id)
-    return single(actuator, codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True, disable_env_checker=True))
+    return single(
+        actuator,
+        codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True, disable_env_checker=True),
+    )
 
 
 def without_motors(env_id: str, actuator: str) -> Subject:
@@ -135,7 +144,12 @@ def without_motors(env_id: str, actuator: str) -> Subject:
     env = gymnasium.make(env_id, disable_env_checker=True)
     plain: Any = env.unwrapped
     model = codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True).unwrapped.model  # type: ignore[attr-defined]
-    for field in ("actuator_armature", "actuator_damping", "dof_frictionloss", "tendon_frictionloss"):
+    for field in (
+        "actuator_armature",
+        "actuator_damping",
+        "dof_frictionloss",
+        "tendon_frictionloss",
+    ):
         getattr(plain.model, field)[:] = getattr(model, field)
     mujoco.mj_setConst(plain.model, plain.data)
     return single(f"inertia and friction of {actuator}, no motors", env)
@@ -165,7 +179,9 @@ def electric_motor() -> Subject:
     """gym-electric-motor's permanently excited DC motor under current control: a motor, and no mechanics of a task."""
     import gym_electric_motor
 
-    return single("gym-electric-motor Cont-CC-PermExDc-v0", gym_electric_motor.make("Cont-CC-PermExDc-v0"))
+    return single(
+        "gym-electric-motor Cont-CC-PermExDc-v0", gym_electric_motor.make("Cont-CC-PermExDc-v0")
+    )
 
 
 def batched(name: str, env: Any) -> Subject:
@@ -176,7 +192,9 @@ def batched(name: str, env: Any) -> Subject:
     if isinstance(one, gymnasium.spaces.Discrete):
         actions = list(generator.integers(one.n, size=(20, count)))
     else:
-        actions = list(generator.uniform(one.low, one.high, (20, count, *one.shape)).astype(one.dtype))
+        actions = list(
+            generator.uniform(one.low, one.high, (20, count, *one.shape)).astype(one.dtype)
+        )
 
     def run(calls: int) -> None:
         for index in range(calls):
@@ -187,17 +205,25 @@ def batched(name: str, env: Any) -> Subject:
 
 def vector(task: str, num_envs: int, threads: int, actuator: str = "paper") -> Subject:
     """Our vector environment."""
-    env = gymnasium.make_vec(TASKS[task].env_id, num_envs, "vector_entry_point", num_threads=threads, actuator=actuator)
+    env = gymnasium.make_vec(
+        TASKS[task].env_id, num_envs, "vector_entry_point", num_threads=threads, actuator=actuator
+    )
     return batched(f"ours, N = {num_envs}, threads = {threads}, actuator {actuator!r}", env)
 
 
 def raw_batch(task: str, num_envs: int, threads: int, calls_apart: bool) -> Subject:
     """`Batch.step` of the same model with its motor: all inner steps of an environment step in one call, or apart."""
-    env: Any = gymnasium.make_vec(TASKS[task].env_id, num_envs, "vector_entry_point", num_threads=threads)
+    env: Any = gymnasium.make_vec(
+        TASKS[task].env_id, num_envs, "vector_entry_point", num_threads=threads
+    )
     env.reset(seed=0)
     env.step(np.zeros(env.action_space.shape, env.action_space.dtype))
     physics = env.unwrapped.physics
-    batch, start, inner_steps = Batch(physics.model, num_envs, threads), physics.snapshot(), physics.plant.inner_steps
+    batch, start, inner_steps = (
+        Batch(physics.model, num_envs, threads),
+        physics.snapshot(),
+        physics.plant.inner_steps,
+    )
 
     def prepare() -> None:
         install_callbacks(physics.model)
@@ -275,7 +301,15 @@ def ppo(num_envs: int, batched_ours: bool) -> tuple[str, Callable[[int], float]]
     else:
         env = DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")] * num_envs)
     watch = Stopwatch(env)
-    model = PPO("MlpPolicy", env, n_steps=2048 // num_envs, batch_size=256, n_epochs=10, seed=0, device="cpu")
+    model = PPO(
+        "MlpPolicy",
+        env,
+        n_steps=2048 // num_envs,
+        batch_size=256,
+        n_epochs=10,
+        seed=0,
+        device="cpu",
+    )
 
     def train(steps: int) -> float:
         watch.seconds, start = 0.0, time.perf_counter()

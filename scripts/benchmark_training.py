@@ -3,11 +3,12 @@
     python scripts/benchmark_training.py --seeds 10
     python scripts/benchmark_training.py --only 'ours, fast' --task pendulum
 
-Each contender has a process of its own and one core, and trains until the mean of the last 100 training episodes and
-that of 20 greedy episodes have both been good enough (475 of 500; -200). Counted are processor seconds without those
-greedy episodes, and environment steps. The first training of a process also pays for imports and compilers: its time
-from the process's start stands apart. Rows are added to docs/results/training_speed.csv as they finish; what is there
-is not done again. Libraries that are not installed are named, and left out: pip install '.[bench]'.
+Each contender has a process of its own and one core, and trains until the mean of the last 100
+training episodes and that of 20 greedy episodes have both been good enough (475 of 500; -200).
+Counted are processor seconds without those greedy episodes, and environment steps. The first
+training of a process also pays for imports and compilers: its time from the process's start stands
+apart. Rows are added to docs/results/training_speed.csv as they finish; what is there is not done
+again. Libraries that are not installed are named, and left out: pip install '.[bench]'.
 """
 
 import argparse
@@ -27,8 +28,20 @@ import gymnasium
 import numpy as np
 
 ROWS = Path(__file__).parents[1] / "docs" / "results" / "training_speed.csv"
-PAGE, WRITTEN = ROWS.parents[1] / "training_speed.md", "<!-- written by scripts/benchmark_training.py -->"
-COLUMNS = ("task", "contender", "seed", "steps", "seconds", "greedy_steps", "greedy_seconds", "first")
+PAGE, WRITTEN = (
+    ROWS.parents[1] / "training_speed.md",
+    "<!-- written by scripts/benchmark_training.py -->",
+)
+COLUMNS = (
+    "task",
+    "contender",
+    "seed",
+    "steps",
+    "seconds",
+    "greedy_steps",
+    "greedy_seconds",
+    "first",
+)
 ENOUGH = {"cartpole": 475.0, "pendulum": -200.0}
 TITLES = {"cartpole": "CartPole", "pendulum": "Pendulum"}
 WORTH = {"cartpole": 200.0, "pendulum": -500.0}
@@ -60,7 +73,11 @@ class Watch:
         """
         now = time.process_time() - self._began - self.paused
         last = [WORTH[self._task]] * 20 if returns is None else list(returns)
-        if "steps" not in self.found and len(last) >= 100 and np.mean(last[-100:]) >= ENOUGH[self._task]:
+        if (
+            "steps" not in self.found
+            and len(last) >= 100
+            and np.mean(last[-100:]) >= ENOUGH[self._task]
+        ):
             self.found |= {"steps": steps, "seconds": now}
         promising = len(last) >= 20 and np.mean(last[-20:]) >= WORTH[self._task]
         if "greedy_steps" not in self.found and promising and steps - self._looked >= INTERVAL:
@@ -118,18 +135,37 @@ def ours(settings: str, actuator: str | None) -> Callable[[str, int, Watch], Non
 
         config = TrainConfig.preset(task, "ppo", settings, actuator or "default")
         count = config.num_envs
-        env = make_vec_env(THEIRS[task], count) if actuator is None else make_sb3_vec_env(config.env, count)
+        env = (
+            make_vec_env(THEIRS[task], count)
+            if actuator is None
+            else make_sb3_vec_env(config.env, count)
+        )
         config.agent.make_model(env, seed).learn(BUDGET, _looking(watch))
 
     return run
 
 
 ZOO: dict[str, dict[str, Any]] = {
-    "cartpole": {"n_steps": 32, "batch_size": 256, "gae_lambda": 0.8, "gamma": 0.98, "n_epochs": 20, "ent_coef": 0.0},
-    "pendulum": {"n_steps": 1024, "batch_size": 64, "gae_lambda": 0.95, "gamma": 0.9, "n_epochs": 10, "use_sde": True},
+    "cartpole": {
+        "n_steps": 32,
+        "batch_size": 256,
+        "gae_lambda": 0.8,
+        "gamma": 0.98,
+        "n_epochs": 20,
+        "ent_coef": 0.0,
+    },
+    "pendulum": {
+        "n_steps": 1024,
+        "batch_size": 64,
+        "gae_lambda": 0.95,
+        "gamma": 0.9,
+        "n_epochs": 10,
+        "use_sde": True,
+    },
 }
-"""What RL Baselines3 Zoo recommends for PPO, whose learning rate on CartPole falls linearly from 1e-3, as clipping
-does from 0.2; eight environments there, four on Pendulum."""
+"""What RL Baselines3 Zoo recommends for PPO, whose learning rate on CartPole falls linearly from
+1e-3, as clipping does from 0.2; eight environments there, four on Pendulum.
+"""
 
 
 def on_stable_baselines3(library: str, actuator: str | None) -> Callable[[str, int, Watch], None]:
@@ -168,7 +204,9 @@ def with_rlox(task: str, seed: int, watch: Watch) -> None:
 
     class Look(Callback):
         def on_rollout_end(self, **given: Any) -> None:
-            act = lambda seen: np.asarray(algorithm.predict(torch.as_tensor(seen, dtype=torch.float32)))  # noqa: E731
+            act = lambda seen: np.asarray(  # noqa: E731
+                algorithm.predict(torch.as_tensor(seen, dtype=torch.float32))
+            )
             config = algorithm.config
             watch.see((given["update"] + 1) * config.n_envs * config.n_steps, None, act)
 
@@ -200,7 +238,9 @@ def with_rltools(task: str, seed: int, watch: Watch) -> None:
             return observation, reward, terminated, truncated, info
 
     def make() -> gymnasium.Env:
-        env = RescaleAction(Counted(gymnasium.make(THEIRS[task])), np.float32(-1.0), np.float32(1.0))
+        env = RescaleAction(
+            Counted(gymnasium.make(THEIRS[task])), np.float32(-1.0), np.float32(1.0)
+        )
         env.reset(seed=seed)
         return env
 
@@ -221,12 +261,16 @@ def with_envpool(task: str, seed: int, watch: Watch) -> None:
 
     torch.manual_seed(seed)
     discrete, count, length = task == "cartpole", 32, 64
-    gamma, decay, rate, epochs, batch = (0.99, 0.95, 1e-3, 10, 256) if discrete else (0.9, 0.95, 1e-3, 10, 256)
+    gamma, decay, rate, epochs, batch = (
+        (0.99, 0.95, 1e-3, 10, 256) if discrete else (0.9, 0.95, 1e-3, 10, 256)
+    )
     envs = envpool.make_gymnasium(THEIRS[task], num_envs=count, seed=seed, num_threads=1)
     inputs, outputs = envs.observation_space.shape[0], 2 if discrete else 1
 
     def network(last: int) -> nn.Sequential:
-        return nn.Sequential(nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, last))
+        return nn.Sequential(
+            nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, last)
+        )
 
     actor, critic, log_std = network(outputs), network(1), nn.Parameter(torch.zeros(outputs))
     parameters = [*actor.parameters(), *critic.parameters(), log_std]
@@ -271,9 +315,14 @@ def with_envpool(task: str, seed: int, watch: Watch) -> None:
                         torch.as_tensor(ended),
                     )
                 )
-                seen, began = torch.as_tensor(following, dtype=torch.float32), torch.as_tensor(ended)
+                seen, began = (
+                    torch.as_tensor(following, dtype=torch.float32),
+                    torch.as_tensor(ended),
+                )
             steps += count * length
-            states, actions, before, rewards, skipped, dead, over = map(torch.stack, zip(*kept, strict=True))
+            states, actions, before, rewards, skipped, dead, over = map(
+                torch.stack, zip(*kept, strict=True)
+            )
             values = critic(torch.cat([states, seen[None]]) * scale)[..., 0]
             advantage, advantages = torch.zeros(count), torch.zeros(length, count)
             for at in reversed(range(length)):
@@ -282,7 +331,10 @@ def with_envpool(task: str, seed: int, watch: Watch) -> None:
                 advantages[at] = advantage
         watch.see(steps, returns, act)
         use = ~skipped.flatten()
-        columns = [one.flatten(0, 1)[use] for one in (states, actions, before, advantages, advantages + values[:-1])]
+        columns = [
+            one.flatten(0, 1)[use]
+            for one in (states, actions, before, advantages, advantages + values[:-1])
+        ]
         for _ in range(epochs):
             for rows in torch.randperm(len(columns[0])).split(batch):
                 state, action, old, gain, target = (one[rows] for one in columns)
@@ -305,7 +357,10 @@ CONTENDERS: dict[str, tuple[Callable[[str, int, Watch], None], str | None]] = {
     "ours, default, through a motor": (ours("default", "paper"), "paper"),
     "ours, fast, through a motor": (ours("fast", "paper"), "paper"),
     "Stable-Baselines3, Gymnasium's task": (on_stable_baselines3("stable_baselines3", None), None),
-    "Stable-Baselines3, through a motor": (on_stable_baselines3("stable_baselines3", "paper"), "paper"),
+    "Stable-Baselines3, through a motor": (
+        on_stable_baselines3("stable_baselines3", "paper"),
+        "paper",
+    ),
     "SBX, Gymnasium's task": (on_stable_baselines3("sbx", None), None),
     "SBX, through a motor": (on_stable_baselines3("sbx", "paper"), "paper"),
     "rlox, Gymnasium's task": (with_rlox, None),
@@ -357,8 +412,14 @@ def table() -> str:
         cells = [name]
         for task in ENOUGH:
             of = medians(task, name)
-            seconds, *others = (format(of[key], form) if key in of else "–" for key, form in FORMS.items())
-            few = f" ({of['learned']:.0f} of {of['seeds']:.0f})" if of["learned"] < of["seeds"] else ""
+            seconds, *others = (
+                format(of[key], form) if key in of else "–" for key, form in FORMS.items()
+            )
+            few = (
+                f" ({of['learned']:.0f} of {of['seeds']:.0f})"
+                if of["learned"] < of["seeds"]
+                else ""
+            )
             cells += [seconds + few, *others]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
@@ -371,11 +432,17 @@ def draw() -> None:
     from codrl_mj.study.pages import save
 
     figure = Figure(figsize=(8.0, 4.2), layout="constrained")
-    for axes, (task, enough) in zip(figure.subplots(1, len(ENOUGH), sharey=True), ENOUGH.items(), strict=True):
-        seconds = {name: medians(task, name).get("greedy_seconds", 0.0) for name in reversed(CONTENDERS)}
+    for axes, (task, enough) in zip(
+        figure.subplots(1, len(ENOUGH), sharey=True), ENOUGH.items(), strict=True
+    ):
+        seconds = {
+            name: medians(task, name).get("greedy_seconds", 0.0) for name in reversed(CONTENDERS)
+        }
         colours = ["#0072B2" if name.startswith("ours") else "#999999" for name in seconds]
         bars = axes.barh([*seconds], [*seconds.values()], color=colours)
-        axes.bar_label(bars, [f"{value:.1f}" if value else "–" for value in seconds.values()], padding=3)
+        axes.bar_label(
+            bars, [f"{value:.1f}" if value else "–" for value in seconds.values()], padding=3
+        )
         axes.set(title=f"{TITLES[task]} to {enough:g}", xlabel="seconds of one core")
         axes.margins(x=0.15)
         axes.spines[["top", "right"]].set_visible(False)
@@ -384,7 +451,9 @@ def draw() -> None:
 
 def main() -> None:
     """Measure what is not there yet, print the table and put it on its page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--task", choices=list(ENOUGH))
     parser.add_argument("--only", default="", help="only contenders whose name contains this")
@@ -395,17 +464,28 @@ def main() -> None:
             csv.DictWriter(file, COLUMNS).writeheader()
     for task in [options.task] if options.task else list(ENOUGH):
         for name in CONTENDERS:
-            there = {int(row["seed"]) for row in rows() if (row["task"], row["contender"]) == (task, name)}
+            there = {
+                int(row["seed"])
+                for row in rows()
+                if (row["task"], row["contender"]) == (task, name)
+            }
             seeds = [seed for seed in range(options.seeds) if seed not in there]
             if options.here == name:
                 contend(task, name, seeds)
             elif not options.here and seeds and options.only in name:
                 given = ["--task", task, "--seeds", str(options.seeds), "--here", name]
-                single = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+                single = dict.fromkeys(
+                    ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
+                )
                 line = [sys.executable, __file__, *given]
-                done = subprocess.run(line, env=os.environ | single, check=False, capture_output=True, text=True)
+                done = subprocess.run(
+                    line, env=os.environ | single, check=False, capture_output=True, text=True
+                )
                 if done.returncode:
-                    print(f"left out: {name}, {task}: {done.stderr.strip().splitlines()[-1]}", flush=True)
+                    print(
+                        f"left out: {name}, {task}: {done.stderr.strip().splitlines()[-1]}",
+                        flush=True,
+                    )
                 else:
                     print(f"measured: {name}, {task}", flush=True)
     if not options.here:

@@ -1,12 +1,13 @@
 """Corrupts at random what a user hands to codrl-mj, and looks how that ends.
 
-Three kinds of cases, drawn from a seed: run folders (bytes changed, files cut, lost, emptied or exchanged, entries of
-JSON edited), files that a user writes (motors, actuators, tasks, families, configurations, models, bench logs), and
-command lines (words dropped, doubled, exchanged, misspelt, out of bounds). Each runs in a process of its own, forked
-from one that has compiled what they share. A case passes if the exit status is 0, 1 or 2, a refusal is a sentence,
-there is no traceback, no signal, nothing half-written is left, and no file that was there is changed or gone that the
-command does not name as its output. What is still at work after `--patience` is sent Ctrl-C, and must end with status
-130 and a word on it.
+Three kinds of cases, drawn from a seed: run folders (bytes changed, files cut, lost, emptied or
+exchanged, entries of JSON edited), files that a user writes (motors, actuators, tasks, families,
+configurations, models, bench logs), and command lines (words dropped, doubled, exchanged, misspelt,
+out of bounds). Each runs in a process of its own, forked from one that has compiled what they
+share. A case passes if the exit status is 0, 1 or 2, a refusal is a sentence, there is no
+traceback, no signal, nothing half-written is left, and no file that was there is changed or gone
+that the command does not name as its output. What is still at work after `--patience` is sent
+Ctrl-C, and must end with status 130 and a word on it.
 """
 
 import argparse
@@ -188,7 +189,9 @@ RUNS = {
 }
 """Command lines of the run folders, by name; `unfinished` is the first without what is written last."""
 COLUMNS = "--columns time=time:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
-SIMULATE = "identify simulate maxon-ec45-flat-50w --kind prbs --amplitude 4 --duration 1 --mean-voltage"
+SIMULATE = (
+    "identify simulate maxon-ec45-flat-50w --kind prbs --amplitude 4 --duration 1 --mean-voltage"
+)
 
 ON_RUNS = (
     "runs .",
@@ -227,14 +230,26 @@ ON_FILES = {
 }
 """File -> what is done with it, corrupted."""
 COMMANDS = (
-    *(command.replace("RUN", "runs/unfinished" if "resume" in command else "runs/ideal") for command in ON_RUNS),
+    *(
+        command.replace("RUN", "runs/unfinished" if "resume" in command else "runs/ideal")
+        for command in ON_RUNS
+    ),
     *(command for commands in ON_FILES.values() for command in commands),
     f"train cartpole --actuator weaker --env.center-radius 0.1 --seed 3 --out runs/mine {_PPO}",
     f"train pendulum --actuator maxon-ec45-flat-50w --actuator.motor.gear-ratio 20 {_PPO}",
-    f"train cartpole --env.randomize motor.inductance=uniform(0.05,0.2) controller.kp=loguniform(0.5,5) {_PPO}",
-    f"train InvertedPendulum-v5 --actuators slide=maxon-ec45-flat-50w --env.options frame_skip=2 {_PPO}",
+    (
+        "train cartpole --env.randomize motor.inductance=uniform(0.05,0.2)"
+        f" controller.kp=loguniform(0.5,5) {_PPO}"
+    ),
+    (
+        "train InvertedPendulum-v5 --actuators slide=maxon-ec45-flat-50w --env.options"
+        f" frame_skip=2 {_PPO}"
+    ),
     "evaluate runs/foreign --episodes 1 --actuators slide=lag --out evaluation.json",
-    "evaluate runs/weaker --episodes 2 --seed 4 --actuator paper --actuator.motor.inductance 0.3 --stochastic",
+    (
+        "evaluate runs/weaker --episodes 2 --seed 4 --actuator paper --actuator.motor.inductance"
+        " 0.3 --stochastic"
+    ),
     "render runs/weaker --out film.mp4 --actuator paper",
     "view runs/weaker --port 8123",
     "runs runs --sort return --out runs.json",
@@ -295,7 +310,9 @@ def change_bytes(content: bytes, rng: random.Random) -> bytes:
         return content[: rng.randrange(len(content) + 1) if rng.random() < 0.8 else 0]
     changed = bytearray(content)
     for _ in range(rng.randint(1, 4)):
-        changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(3) if rng.random() < 0.7 else rng.randrange(1, 256)
+        changed[rng.randrange(len(changed))] ^= (
+            1 << rng.randrange(3) if rng.random() < 0.7 else rng.randrange(1, 256)
+        )
     return bytes(changed)
 
 
@@ -305,13 +322,34 @@ def change_entry(content: Any, rng: random.Random) -> Any:
         keys = list(content) if isinstance(content, dict) else list(range(len(content)))
         key = rng.choice(keys)
         if rng.random() < 0.15:
-            return {k: v for k, v in content.items() if k != key} if isinstance(content, dict) else content[:key]
+            return (
+                {k: v for k, v in content.items() if k != key}
+                if isinstance(content, dict)
+                else content[:key]
+            )
         changed = content.copy()
         changed[key] = change_entry(content[key], rng)
         return changed
     if isinstance(content, dict) and rng.random() < 0.5:
         return content | {rng.choice(("surplus", "name", "family", "x" * 300)): 1}
-    return rng.choice((None, -1, 0, 1e300, float("nan"), float("inf"), "x", "", [], {}, [[]], True, 10**30, "paper"))
+    return rng.choice(
+        (
+            None,
+            -1,
+            0,
+            1e300,
+            float("nan"),
+            float("inf"),
+            "x",
+            "",
+            [],
+            {},
+            [[]],
+            True,
+            10**30,
+            "paper",
+        )
+    )
 
 
 def change_text(text: str, rng: random.Random) -> str:
@@ -334,7 +372,9 @@ def change_text(text: str, rng: random.Random) -> str:
         if rng.random() < 0.2:
             lines = text.splitlines(keepends=True) or [""]
             row = rng.randrange(len(lines))
-            lines[row : row + 1] = rng.choice(([], [lines[row]] * 2, [rng.choice(lines)], ["\t" + lines[row]]))
+            lines[row : row + 1] = rng.choice(
+                ([], [lines[row]] * 2, [rng.choice(lines)], ["\t" + lines[row]])
+            )
             text = "".join(lines)
     return text
 
@@ -343,7 +383,14 @@ def misspell(word: str, rng: random.Random) -> str:
     """A letter lost, doubled, exchanged with its neighbour, or another one."""
     at = rng.randrange(max(len(word), 1))
     head, letter, tail = word[:at], word[at : at + 1], word[at + 1 :]
-    return rng.choice((head + tail, head + 2 * letter + tail, head + tail[:1] + letter + tail[1:], head + "q" + tail))
+    return rng.choice(
+        (
+            head + tail,
+            head + 2 * letter + tail,
+            head + tail[:1] + letter + tail[1:],
+            head + "q" + tail,
+        )
+    )
 
 
 def scale(word: str, rng: random.Random) -> str:
@@ -358,7 +405,9 @@ def corrupt_run(folder: Path, rng: random.Random) -> Case:
     """Corrupt one file of one run folder."""
     run = folder / "runs" / rng.choice([*RUNS, "unfinished"])
     path = rng.choice(sorted(path for path in run.rglob("*") if path.is_file()))
-    how = rng.choice(("bytes", "bytes", "lost", "exchanged", "folder", "entry", "entry", "entry with a seal"))
+    how = rng.choice(
+        ("bytes", "bytes", "lost", "exchanged", "folder", "entry", "entry", "entry with a seal")
+    )
     if how.startswith("entry") and path.suffix != ".json":
         how = "bytes"
     other = folder / "runs" / rng.choice(list(RUNS)) / path.relative_to(run)
@@ -406,7 +455,9 @@ def corrupt_command(folder: Path, rng: random.Random) -> Case:  # noqa: ARG001 -
         elif change == "misspell":
             words[at] = misspell(words[at], rng)
         elif change == "scale":
-            at = rng.choice([place for place, word in enumerate(words) if word[:1].isdigit()] or [at])
+            at = rng.choice(
+                [place for place, word in enumerate(words) if word[:1].isdigit()] or [at]
+            )
             words[at] = scale(words[at], rng)
         else:
             words[at] = rng.choice((*WILD, "/dev/null/x", "runs", "wheel.py", "log.csv"))
@@ -435,13 +486,22 @@ def prepare(folder: Path) -> None:
     for name, text in texts.items():
         (folder / name).write_text(text)
     commands = [f"{command} --out runs/{name}" for name, command in RUNS.items()]
-    commands += [f"{SIMULATE} --out log.csv", f"train pendulum --actuator actuator.yaml {_PPO} --out ../warm"]
+    commands += [
+        f"{SIMULATE} --out log.csv",
+        f"train pendulum --actuator actuator.yaml {_PPO} --out ../warm",
+    ]
     commands += ["report runs/weaker --no-film --out ../warm.html", "advise actuator.yaml pendulum"]
     with contextlib.chdir(folder):
         for command in commands:
             assert codrl_mj(command.split()) == 0, command
     shutil.copytree(folder / "runs" / "weaker", folder / "runs" / "unfinished")
-    for name in ("result.json", "evaluation.json", "policy.json", "policy.safetensors", "learning_curve.png"):
+    for name in (
+        "result.json",
+        "evaluation.json",
+        "policy.json",
+        "policy.safetensors",
+        "learning_curve.png",
+    ):
         (folder / "runs" / "unfinished" / name).unlink()
     gc.collect()
 
@@ -449,7 +509,10 @@ def prepare(folder: Path) -> None:
 def digests(folder: Path) -> dict[str, str]:
     """Digest of every file by its path."""
     paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in paths
+    }
 
 
 def attempt(case: Case, folder: Path, patience: float) -> Outcome:
@@ -469,7 +532,9 @@ def attempt(case: Case, folder: Path, patience: float) -> Outcome:
         os.killpg(child, signal.SIGKILL)
     status = os.waitstatus_to_exitcode(ended[1])
     after = digests(folder)
-    resumed = "--resume" in case.command  # a training that goes on writes into its folder, its tables at once
+    resumed = (
+        "--resume" in case.command
+    )  # a training that goes on writes into its folder, its tables at once
     lost = [
         name
         for name in before
@@ -477,7 +542,11 @@ def attempt(case: Case, folder: Path, patience: float) -> Outcome:
         and name not in " ".join(case.command)
         and not (resumed and (status == 0 or name.endswith(".csv")))
     ]
-    halves = [str(path.relative_to(folder)) for place in [folder, *folder.rglob("*")] for path, _ in leftovers(place)]
+    halves = [
+        str(path.relative_to(folder))
+        for place in [folder, *folder.rglob("*")]
+        for path, _ in leftovers(place)
+    ]
     return Outcome(status, interrupted, output.read_text(errors="replace"), lost + halves)
 
 
@@ -515,7 +584,9 @@ def control(base: Path, patience: float) -> None:
         base.with_name("control.output").unlink()
 
 
-def cases(count: int, seed: int, only: list[str], base: Path, patience: float) -> Iterator[tuple[str, Case, Outcome]]:
+def cases(
+    count: int, seed: int, only: list[str], base: Path, patience: float
+) -> Iterator[tuple[str, Case, Outcome]]:
     """Run so many cases of each kind; yields their names, by which one can be run again."""
     names = [f"{kind}/{seed}/{index}" for kind in only for index in range(count)]
     for name in track(names, "corrupting", console=console(), transient=True):
@@ -529,7 +600,9 @@ def cases(count: int, seed: int, only: list[str], base: Path, patience: float) -
 
 def main() -> int:
     """Run the cases, print a table of how they ended, and what is wrong."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=300, help="cases of each kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", choices=list(KINDS), nargs="+", default=list(KINDS))
@@ -544,7 +617,9 @@ def main() -> int:
         base.mkdir()
         prepare(base)
         control(base, options.patience / 4)
-        for name, case, outcome in cases(options.count, options.seed, options.only, base, options.patience):
+        for name, case, outcome in cases(
+            options.count, options.seed, options.only, base, options.patience
+        ):
             how = "Ctrl-C" if outcome.interrupted else f"status {outcome.status}"
             counts[case.kind, how] += 1
             text = f"{name}: codrl-mj {' '.join(case.command)} [{case.corrupted}] -> {how}"
@@ -552,7 +627,10 @@ def main() -> int:
                 print(text, outcome.failures, outcome.output, sep="\n", flush=True, file=log)
             if outcome.failures:
                 failed += 1
-                console().print(escape(f"{text}: {', '.join(outcome.failures)}\n{outcome.output[-1500:]}"), style="red")
+                console().print(
+                    escape(f"{text}: {', '.join(outcome.failures)}\n{outcome.output[-1500:]}"),
+                    style="red",
+                )
     table = Table(title="How they ended", title_justify="left")
     for column in ("corrupted", "how", "cases"):
         table.add_column(column)

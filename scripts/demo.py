@@ -1,7 +1,8 @@
 """The main job in one command: learn to balance through a weak actuator.
 
-Cross-validates CartPole against Gymnasium, trains the same agent twice (on the ideal actuator and through the actuator
-`weaker`), deploys both policies on `weaker`, prints one table and films them side by side in a typical episode.
+Cross-validates CartPole against Gymnasium, trains the same agent twice (on the ideal actuator and
+through the actuator `weaker`), deploys both policies on `weaker`, prints one table and films them
+side by side in a typical episode.
 """
 
 import argparse
@@ -25,23 +26,35 @@ from codrl_mj.training import TrainConfig, TrainingStoppedError, finished, load_
 from codrl_mj.validation import validate
 
 TASK, REAL = "cartpole", "weaker"
-PAPER_REWARD = {"center_radius": 0.1}  # the paper trains with no reward beyond 0.1 m from the centre
+PAPER_REWARD = {
+    "center_radius": 0.1
+}  # the paper trains with no reward beyond 0.1 m from the centre
 
 
 def main() -> int:
     """Run the demonstration."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/demo"), help="folder for runs and video")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/demo"), help="folder for runs and video"
+    )
     parser.add_argument("--seed", type=int, default=0, help="training seed")
-    parser.add_argument("--total-steps", type=int, default=200_000, help="training steps of each policy")
-    parser.add_argument("--episodes", type=int, default=100, help="test episodes of each row of the table")
+    parser.add_argument(
+        "--total-steps", type=int, default=200_000, help="training steps of each policy"
+    )
+    parser.add_argument(
+        "--episodes", type=int, default=100, help="test episodes of each row of the table"
+    )
     options = parser.parse_args()
 
     print("1/4  Is the MuJoCo cart-pole Gymnasium's?")
     with progress_bar() as bar:
         row = bar.add_task("cross-validating", total=None)
         groups = "dynamics", "trajectories"
-        certificate = validate(TASK, groups=groups, on_part=lambda done, *_: bar.update(row, completed=done))
+        certificate = validate(
+            TASK, groups=groups, on_part=lambda done, *_: bar.update(row, completed=done)
+        )
     print_checks(certificate.checks)
     if not certificate.passed:
         return 1
@@ -50,7 +63,9 @@ def main() -> int:
     runs = {
         actuator: (
             TrainConfig(
-                EnvConfig(TASK, actuator, options=PAPER_REWARD), seed=options.seed, total_steps=options.total_steps
+                EnvConfig(TASK, actuator, options=PAPER_REWARD),
+                seed=options.seed,
+                total_steps=options.total_steps,
             ),
             options.out / f"{actuator}-seed{options.seed}",
         )
@@ -59,7 +74,10 @@ def main() -> int:
     waiting = {}
     for actuator, (config, out) in runs.items():
         if (out / CONFIG).is_file() and load_config(out) != config:
-            print(f"demo: {out} holds a run with other settings: choose another --out, or delete it", file=sys.stderr)
+            print(
+                f"demo: {out} holds a run with other settings: choose another --out, or delete it",
+                file=sys.stderr,
+            )
             return 2
         if finished(out):
             print(f"     {out} is trained already (delete it to train anew)")
@@ -67,7 +85,9 @@ def main() -> int:
             waiting[f"trained on {actuator}"] = (config, out)
     if waiting:
         with training_bars(waiting):
-            failures = train_runs({out: config for config, out in waiting.values()}, accept_changes=True)
+            failures = train_runs(
+                {out: config for config, out in waiting.values()}, accept_changes=True
+            )
         for out, error in failures.items():
             print(f"demo: {out}: {error} (see {failure_record(out)})", file=sys.stderr)
         if failures:

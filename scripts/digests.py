@@ -1,10 +1,10 @@
 """Digests of what a change of the code's structure must leave as it is, to the last bit.
 
-Written on two commits and compared by `--compare`: trajectories of every task through every actuator, command and
-disturbance, and through off-the-shelf motors; of environments of others; the weights that short trainings of every
-agent end with; what is identified from logs that are made here; every preset's configuration; and what every check of
-the quick certificate found at worst, as the number itself. They may depend on the machine and on the versions of the
-packages.
+Written on two commits and compared by `--compare`: trajectories of every task through every
+actuator, command and disturbance, and through off-the-shelf motors; of environments of others; the
+weights that short trainings of every agent end with; what is identified from logs that are made
+here; every preset's configuration; and what every check of the quick certificate found at worst, as
+the number itself. They may depend on the machine and on the versions of the packages.
 """
 
 import argparse
@@ -64,23 +64,37 @@ def disturbed(name: str, task: str, actuator: str = "paper") -> dict[str, Any]:
         actuator: a named actuator.
     """
     fields = DISTURBANCES[name]
-    joint = {field.removeprefix("joint_"): value for field, value in fields.items() if field in _JOINT}
-    sensor = {field: value for field, value in fields.items() if field in ("current_noise", "current_bias")}
+    joint = {
+        field.removeprefix("joint_"): value for field, value in fields.items() if field in _JOINT
+    }
+    sensor = {
+        field: value
+        for field, value in fields.items()
+        if field in ("current_noise", "current_bias")
+    }
     others = {field: value for field, value in fields.items() if field not in _JOINT | _MOTOR}
     arguments: dict[str, Any] = {"actuator": actuator, "disturbances": others, "joint": joint}
     nominal = named_actuator(actuator, task)
     if not isinstance(nominal, Ideal):
         limit = {"max_voltage": 0.5} if name in LOW_VOLTAGE else {}
         controller = dataclasses.replace(nominal.controller, **sensor, **limit)
-        supply = Supply(resistance=fields["supply_resistance"]) if "supply_resistance" in fields else None
+        supply = (
+            Supply(resistance=fields["supply_resistance"])
+            if "supply_resistance" in fields
+            else None
+        )
         arguments["actuator"] = dataclasses.replace(nominal, controller=controller, supply=supply)
     return arguments
 
 
 ACTUATORS = ("ideal", "paper", "weak", "weaker", "open_loop")
-_WINDING = Motor(resistance=1.3, inductance=0.2, torque_constant=0.9, back_emf_constant=0.8, arm_radius=0.7)
+_WINDING = Motor(
+    resistance=1.3, inductance=0.2, torque_constant=0.9, back_emf_constant=0.8, arm_radius=0.7
+)
 _GAINS = CurrentLoop(kp=1.0, ki=2.0, kd=0.01, kff=0.5, bemf_compensation=False, substeps=3)
-CUSTOM = Actuator(_WINDING, dataclasses.replace(_GAINS, integral_leak=0.1, derivative_time_constant=0.02))
+CUSTOM = Actuator(
+    _WINDING, dataclasses.replace(_GAINS, integral_leak=0.1, derivative_time_constant=0.02)
+)
 """An actuator none of whose fields is neutral."""
 STEPS, LIMIT, HOLD = 200, 50, 10
 """Steps of a trajectory, of its episodes at most, and for which an action is held."""
@@ -105,7 +119,11 @@ def digest(arrays: list[np.ndarray]) -> str:
 
 
 def trajectory(
-    task: str, num_envs: int | None, arguments: dict[str, Any], told: tuple[str, ...] = SIGNALS, steps: int = STEPS
+    task: str,
+    num_envs: int | None,
+    arguments: dict[str, Any],
+    told: tuple[str, ...] = SIGNALS,
+    steps: int = STEPS,
 ) -> str:
     """The digest of what an environment returns under random actions.
 
@@ -132,9 +150,13 @@ def trajectory(
         if step % HOLD == 0 and isinstance(space, Discrete):
             action = generator.integers(space.n, size=size)
         elif step % HOLD == 0:
-            action = generator.uniform(space.low, space.high, (*size, *space.shape)).astype(np.float32)
+            action = generator.uniform(space.low, space.high, (*size, *space.shape)).astype(
+                np.float32
+            )
         observation, reward, terminated, truncated, info = env.step(action)
-        signals = [info.get(name, np.zeros(size)) for name in told]  # none where every environment was reset
+        signals = [
+            info.get(name, np.zeros(size)) for name in told
+        ]  # none where every environment was reset
         seen += [observation, reward, terminated, env.unwrapped.state, *signals]
         if num_envs is None and (terminated or truncated):
             observation, _ = env.reset(options=options)
@@ -170,8 +192,13 @@ def trajectories() -> Entries:
     for task, definition in TASKS.items():
         for physics in ("mujoco", "analytic"):
             for name, arguments in variants(task, physics):
-                common = {"physics": physics, "observe_actuator": not name.startswith("ideal")} | arguments
-                for integrator in definition.integrators if name in ACTUATORS else definition.integrators[:1]:
+                common = {
+                    "physics": physics,
+                    "observe_actuator": not name.startswith("ideal"),
+                } | arguments
+                for integrator in (
+                    definition.integrators if name in ACTUATORS else definition.integrators[:1]
+                ):
                     digested = trajectory(task, None, common | {"integrator": integrator})
                     yield f"trajectory/{task}/{physics}/{integrator}/{name}", digested
                 if physics == "mujoco":
@@ -208,16 +235,25 @@ def weights(subject: str, num_envs: int, arguments: dict[str, Any]) -> str:
         arguments: of the environment.
     """
     agent, task, settings = subject.split("/")
-    budget: dict[str, Any] = {"total_steps": {"ppo": 1024, "sarsa": 2000}.get(agent, 600), "total_episodes": None}
+    budget: dict[str, Any] = {
+        "total_steps": {"ppo": 1024, "sarsa": 2000}.get(agent, 600),
+        "total_episodes": None,
+    }
     others: dict[str, Any] = {"seed": 3, "num_envs": num_envs, "evaluation_episodes": 1}
     config = TrainConfig.preset(task, agent, settings, **budget, **others)
     changes = dict(TRAININGS[subject])
-    if num_envs > 1 and getattr(config.agent, "train_every", 1) is None:  # at the end of a single environment's episode
+    if (
+        num_envs > 1 and getattr(config.agent, "train_every", 1) is None
+    ):  # at the end of a single environment's episode
         changes["train_every"] = 4
     env = EnvConfig(task, **arguments)
-    config = dataclasses.replace(config, env=env, agent=dataclasses.replace(config.agent, **changes))
+    config = dataclasses.replace(
+        config, env=env, agent=dataclasses.replace(config.agent, **changes)
+    )
     with tempfile.TemporaryDirectory() as folder:
-        tensors = load_file(train(config, Path(folder) / "run", tensorboard=False) / "policy.safetensors")
+        tensors = load_file(
+            train(config, Path(folder) / "run", tensorboard=False) / "policy.safetensors"
+        )
     return digest([tensors[name] for name in sorted(tensors)])
 
 
@@ -226,7 +262,10 @@ def trainings() -> Entries:
     for subject in TRAININGS:
         for physics in ("mujoco", "analytic"):
             for num_envs in (1,) if subject.startswith("sarsa") else (1, 4):
-                yield f"weights/{subject}/{physics}/{num_envs}", weights(subject, num_envs, {"physics": physics})
+                yield (
+                    f"weights/{subject}/{physics}/{num_envs}",
+                    weights(subject, num_envs, {"physics": physics}),
+                )
     for subject, num_envs in (("ppo/cartpole/default", 4), ("sarsa/mountain_car/default", 1)):
         for name in ("current_noise", "supply_resistance", "pulse"):
             arguments = {"observe_actuator": True} | disturbed(name, subject.split("/")[1])
@@ -237,7 +276,10 @@ def trainings() -> Entries:
 def certificate() -> Entries:
     """Names of the quick certificate's checks, and the worst that they found."""
     for check in __import__("codrl_mj.validation").validation.validate(quick=True).checks:
-        yield f"certificate/{check.group}/{check.task or 'no task'}/{check.name}", repr(float(check.worst))
+        yield (
+            f"certificate/{check.group}/{check.task or 'no task'}/{check.name}",
+            repr(float(check.worst)),
+        )
 
 
 MOTORS = {
@@ -262,7 +304,9 @@ def behind_motors() -> Entries:
         for name, actuator in MOTORS.items():
             for num_envs in (None, 4):
                 arguments = {"actuator": actuator, "allow_unstable": True}
-                arguments |= {"action": "position"} if name == "servo" else {}  # refused where an angle wraps
+                arguments |= (
+                    {"action": "position"} if name == "servo" else {}
+                )  # refused where an angle wraps
                 try:
                     digested = trajectory(task, num_envs, arguments, SIGNALS[:5], 60)
                 except ValueError:
@@ -292,11 +336,17 @@ def environments_of_others() -> Entries:
         "lag": {"actuator": {".*": "lag"}},
         "drive": {"actuator": {".*": drive}, "observe_actuator": True},
         "current": {"actuator": {".*": drive}, "action": "current"},
-        "delayed": {"actuator": {".*": drive}, "disturbances": {"command_delay": 0.1, "command_quantum": 0.1}},
+        "delayed": {
+            "actuator": {".*": drive},
+            "disturbances": {"command_delay": 0.1, "command_quantum": 0.1},
+        },
         "pulses": {"actuator": {".*": "lag"}, "disturbances": _PULSE},
         "drawn": {
             "actuator": {".*": drive},
-            "randomize": {".*": {"motor.resistance": "uniform(0.5, 2.0)"}, "model.gravity": "uniform(0.8, 1.2)"},
+            "randomize": {
+                ".*": {"motor.resistance": "uniform(0.5, 2.0)"},
+                "model.gravity": "uniform(0.8, 1.2)",
+            },
         },
     }
     for env_id in FAMILIES:
@@ -304,23 +354,35 @@ def environments_of_others() -> Entries:
             made = codrl_mj.make(env_id, allow_unstable=True, **arguments)
             yield f"others/{env_id}/{name}", rolled_out(made)
     for name in ("ideal", "drive", "drawn"):
-        arguments = {"randomize": None} | {key: ways[name][key] for key in ways[name] if key != "observe_actuator"}
+        arguments = {"randomize": None} | {
+            key: ways[name][key] for key in ways[name] if key != "observe_actuator"
+        }
         made_by = {"task_kwargs": {"random": 1}, "noise_seed": 3, "allow_unstable": True}
-        env = codrl_mj.make_dm_control("cheetah/run", arguments.pop("actuator"), **made_by, **arguments)
+        env = codrl_mj.make_dm_control(
+            "cheetah/run", arguments.pop("actuator"), **made_by, **arguments
+        )
         generator, seen = np.random.default_rng(1), []
         env.reset()
         for _ in range(60):
             step = env.step(generator.uniform(-1.0, 1.0, 6))
             seen += [*step.observation.values(), step.reward]
-        yield f"others/cheetah-run/{name}", digest([np.asarray(array, dtype=np.float64) for array in seen])
+        yield (
+            f"others/cheetah-run/{name}",
+            digest([np.asarray(array, dtype=np.float64) for array in seen]),
+        )
     for name, fields in ("vector", {}), ("vector, observed and delayed", SEEN):
-        config = EnvConfig("Hopper-v5", {".*": drive if fields else "lag"}, allow_unstable=True, **fields)
+        config = EnvConfig(
+            "Hopper-v5", {".*": drive if fields else "lag"}, allow_unstable=True, **fields
+        )
         vector = codrl_mj.make_sb3_vec_env(config, 2)
         vector.seed(3)
         seen = [vector.reset()]
         for _ in range(60):
             seen += vector.step(np.full((2, 3), 0.1, dtype=np.float32))[:2]
-        yield f"others/Hopper-v5/{name}", digest([np.asarray(array, dtype=np.float64) for array in seen])
+        yield (
+            f"others/Hopper-v5/{name}",
+            digest([np.asarray(array, dtype=np.float64) for array in seen]),
+        )
 
 
 SEEN: dict[str, Any] = {"observe_actuator": True, "disturbances": {"command_delay": 0.02}}
@@ -339,7 +401,9 @@ def furuta() -> Entries:
         "current": {"action": "current"},
         "voltage": {"action": "voltage"},
         "delayed": {"disturbances": _COMMAND | _PULSE},
-        "drawn": {"randomize": {"motor.resistance": Uniform(7.0, 9.0), "model.gravity": Uniform(0.9, 1.1)}},
+        "drawn": {
+            "randomize": {"motor.resistance": Uniform(7.0, 9.0), "model.gravity": Uniform(0.9, 1.1)}
+        },
     }
     for name, arguments in kinds.items():
         for num_envs in (None, 4) if name != "analytic" else (None,):
@@ -350,13 +414,31 @@ def furuta() -> Entries:
 def helps() -> Entries:
     """What every verb says with `--help`, and of every task and an environment of others `train`'s."""
     verbs = [
-        [verb] for verb in ("train", "evaluate", "runs", "render", "replay", "view", "report", "advise", "validate")
+        [verb]
+        for verb in (
+            "train",
+            "evaluate",
+            "runs",
+            "render",
+            "replay",
+            "view",
+            "report",
+            "advise",
+            "validate",
+        )
     ]
     verbs += [["train", task] for task in (*TASKS, "furuta", "HalfCheetah-v5")] + [["identify"]]
-    verbs += [["motor", verb] for verb in ("list", "show", "feasible", "choose", "design", "step", "new")]
+    verbs += [
+        ["motor", verb] for verb in ("list", "show", "feasible", "choose", "design", "step", "new")
+    ]
     for words in ([], *verbs):
-        out = subprocess.run([sys.executable, "-m", "codrl_mj", *words, "--help"], capture_output=True, check=False)
-        yield f"help/{' '.join(words) or 'codrl-mj'}", digest([np.frombuffer(out.stdout, dtype=np.uint8)])
+        out = subprocess.run(
+            [sys.executable, "-m", "codrl_mj", *words, "--help"], capture_output=True, check=False
+        )
+        yield (
+            f"help/{' '.join(words) or 'codrl-mj'}",
+            digest([np.frombuffer(out.stdout, dtype=np.uint8)]),
+        )
 
 
 def identified() -> Entries:
@@ -369,17 +451,35 @@ def identified() -> Entries:
         "pendulum": (Load(inertia=1e-3, gravity=0.05), {"mgl": 0.05}),
     }
     for rig, (load, known) in rigs.items():
-        made = [simulate(drive, prbs, load, sensors, Sampler(mean_voltage=True), seed) for seed in (1, 2)]
-        logs = [dataclasses.replace(log, signals={name: log.signals[name] for name in USED}) for log in made]
+        made = [
+            simulate(drive, prbs, load, sensors, Sampler(mean_voltage=True), seed)
+            for seed in (1, 2)
+        ]
+        logs = [
+            dataclasses.replace(log, signals={name: log.signals[name] for name in USED})
+            for log in made
+        ]
         for one in identify(logs, rig, {"gear_ratio": 1.0, **known}).estimates:
-            yield f"identified/{rig}/{one.name}", f"{one.value!r} {one.low!r} {one.high!r} {one.status}"
+            yield (
+                f"identified/{rig}/{one.name}",
+                f"{one.value!r} {one.low!r} {one.high!r} {one.status}",
+            )
 
-    columns, here = "time=time:s,position=position:rad,torque=torque:N*m", Path(os.environ.get("CODRL_MJ_DATA", "data"))
+    columns, here = (
+        "time=time:s,position=position:rad,torque=torque:N*m",
+        Path(os.environ.get("CODRL_MJ_DATA", "data")),
+    )
     if not (here / "bench_logs" / "dfki_pendulum").is_dir():
         return  # codrl-mj data dfki_pendulum
-    real = [read_log(here / "bench_logs" / "dfki_pendulum" / f"{name}.csv", columns) for name in ("ddp", "ilqr")]
+    real = [
+        read_log(here / "bench_logs" / "dfki_pendulum" / f"{name}.csv", columns)
+        for name in ("ddp", "ilqr")
+    ]
     for one in identify(real, "pendulum").estimates:
-        yield f"identified/real pendulum/{one.name}", f"{one.value!r} {one.low!r} {one.high!r} {one.status}"
+        yield (
+            f"identified/real pendulum/{one.name}",
+            f"{one.value!r} {one.low!r} {one.high!r} {one.status}",
+        )
 
 
 USED = ("voltage", "current", "position")
@@ -395,7 +495,10 @@ def configurations() -> Entries:
                 except ValueError:
                     continue
                 text = json.dumps(mapping, sort_keys=True).encode()
-                yield f"configuration/{task}/{agent}/{settings}", hashlib.sha256(text).hexdigest()[:16]
+                yield (
+                    f"configuration/{task}/{agent}/{settings}",
+                    hashlib.sha256(text).hexdigest()[:16],
+                )
 
 
 PARTS = {
@@ -423,15 +526,24 @@ def compare(first: dict[str, str], second: dict[str, str]) -> int:
 
 def main() -> int:
     """Make digests, or compare them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", choices=list(PARTS), help="only this part")
     parser.add_argument("--out", type=Path, help="JSON file for the digests")
-    parser.add_argument("--compare", type=Path, nargs=2, metavar="FILE", help="print what differs between two such")
+    parser.add_argument(
+        "--compare", type=Path, nargs=2, metavar="FILE", help="print what differs between two such"
+    )
     options = parser.parse_args()
     parts = [options.only] if options.only else list(PARTS)
     if options.compare:
         files = [read_json(path, "file of digests") for path in options.compare]
-        return int(compare(*({n: v for n, v in file.items() if n.split("/")[0] in parts} for file in files)) > 0)
+        return int(
+            compare(
+                *({n: v for n, v in file.items() if n.split("/")[0] in parts} for file in files)
+            )
+            > 0
+        )
     found: dict[str, str] = {}
     for part in parts:
         start = time.perf_counter()

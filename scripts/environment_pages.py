@@ -46,7 +46,11 @@ def common_arguments() -> str:
     Raises:
         ValueError: the signature of `ActuatedEnv` and the arguments that it documents differ.
     """
-    documented = inspect.cleandoc(ActuatedEnv.__init__.__doc__ or "").partition("Args:\n")[2].partition("\n\n")[0]
+    documented = (
+        inspect.cleandoc(ActuatedEnv.__init__.__doc__ or "")
+        .partition("Args:\n")[2]
+        .partition("\n\n")[0]
+    )
     entries = re.findall(r"^    (\**\w+): (.*(?:\n {8}.*)*)", documented, re.MULTILINE)
     meanings = {name.lstrip("*"): " ".join(text.split()) for name, text in entries}
     parameters = {
@@ -55,7 +59,9 @@ def common_arguments() -> str:
         if name not in ("self", "task")
     }
     if meanings.keys() - {"task"} != parameters.keys():
-        raise ValueError(f"ActuatedEnv documents {', '.join(meanings)} but takes {', '.join(parameters)}")
+        raise ValueError(
+            f"ActuatedEnv documents {', '.join(meanings)} but takes {', '.join(parameters)}"
+        )
     defaults = {field.name: field.default for field in dataclasses.fields(EnvConfig)[1:]}
     common = {*find_world("pendulum").fields} - {"options"}  # which each task's own page has
     defaults = {name: default for name, default in defaults.items() if name in common}
@@ -63,7 +69,8 @@ def common_arguments() -> str:
     defaults |= {
         name: parameter.default
         for name, parameter in parameters.items()
-        if name not in defaults and parameter.kind is not parameter.VAR_KEYWORD  # the tasks' own, which each page has
+        if name not in defaults
+        and parameter.kind is not parameter.VAR_KEYWORD  # the tasks' own, which each page has
     }
     for name, text in meanings.items():  # the reference has them whole
         first, stop, _ = text.partition(". ")
@@ -83,9 +90,13 @@ def page(task_name: str) -> str:
         "action space": f"`{_space(task.action_space)}`",
         "state": ", ".join(task.state_names),
         "environment step": f"{task.step_duration:g} s",
-        "integration steps in it": f"{task.motor_inner_steps} with a motor, {task.ideal_inner_steps} without",
+        "integration steps in it": (
+            f"{task.motor_inner_steps} with a motor, {task.ideal_inner_steps} without"
+        ),
         "integrators": ", ".join(f"`{name}`" for name in task.integrators),
-        "options of its own": ", ".join(f"`{name}` (default {value})" for name, value in own) or "none",
+        "options of its own": (
+            ", ".join(f"`{name}` (default {value})" for name, value in own) or "none"
+        ),
         "time limit": f"{task.max_episode_steps} steps",
         f"`{task.default_actuator}` actuator": _actuator(task_name),
     }
@@ -110,44 +121,51 @@ def _actuator(task_name: str) -> str:
     )
     if isinstance(actuator, Drive):
         return (
-            f"{constants}, rotor {motor.rotor_inertia:g} kg·m²; loop at {loop.sample_rate / 1e3:g} kHz, "
-            f"{loop.max_current:g} A, {actuator.voltage_limit:g} V"
+            f"{constants}, rotor {motor.rotor_inertia:g} kg·m²; loop at {loop.sample_rate / 1e3:g}"
+            f" kHz, {loop.max_current:g} A, {actuator.voltage_limit:g} V"
         )
     return (
-        f"{constants}, arm {motor.arm_radius:g}; kP {loop.kp:g}, kI {loop.ki:g}, kD {loop.kd:g}, kFF {loop.kff:g}, "
-        f"{loop.max_voltage:g} V"
+        f"{constants}, arm {motor.arm_radius:g}; kP {loop.kp:g}, kI {loop.ki:g}, kD {loop.kd:g},"
+        f" kFF {loop.kff:g}, {loop.max_voltage:g} V"
     )
 
 
 def index() -> str:
     """The Markdown page that lists the environments."""
     rows = "\n".join(
-        f"| [{_title(name)}]({name}.md) | {_documentation(name)[0].partition(': ')[2]} |" for name in TASKS
+        f"| [{_title(name)}]({name}.md) | {_documentation(name)[0].partition(': ')[2]} |"
+        for name in TASKS
     )
     return (
-        '# Environments\n\nChoose a task: `gymnasium.make("codrl_mj/Pendulum-v0")`, after `import codrl_mj`. All take '
-        f"[the same arguments](arguments.md).\n\n| environment | task |\n| --- | --- |\n{rows}\n"
+        '# Environments\n\nChoose a task: `gymnasium.make("codrl_mj/Pendulum-v0")`, after `import'
+        " codrl_mj`. All take [the same arguments](arguments.md).\n\n| environment | task |\n| ---"
+        f" | --- |\n{rows}\n"
     )
 
 
 def arguments() -> str:
     """The Markdown page of what every environment takes."""
     return (
-        "# Arguments of every environment\n\nSay what the force goes through, and how it is simulated.\n\n"
-        '```python\nimport codrl_mj\n\nenv = codrl_mj.make("cartpole", actuator="weak", observe_actuator=True)\n```\n\n'
-        "`gymnasium.make` takes the same, and so do command lines: `--env.observe-actuator`. A task's own options are "
-        f"on [its page](README.md).\n\n{common_arguments()}\n"
+        "# Arguments of every environment\n\nSay what the force goes through, and how it is"
+        ' simulated.\n\n```python\nimport codrl_mj\n\nenv = codrl_mj.make("cartpole",'
+        ' actuator="weak", observe_actuator=True)\n```\n\n`gymnasium.make` takes the same, and so'
+        " do command lines: `--env.observe-actuator`. A task's own options are on [its"
+        f" page](README.md).\n\n{common_arguments()}\n"
     )
 
 
 def pages() -> dict[str, str]:
     """Every page by its file name."""
-    return {"README.md": index(), "arguments.md": arguments()} | {f"{name}.md": page(name) for name in TASKS}
+    return {"README.md": index(), "arguments.md": arguments()} | {
+        f"{name}.md": page(name) for name in TASKS
+    }
 
 
 def main() -> int:
     """Write every page; scripts/page_pictures_tasks.py makes the films on them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the pages")
     options = parser.parse_args()
     for name, text in pages().items():

@@ -1,7 +1,7 @@
 """What Furuta policies are worth on weaker supplies and behind delays, trained on the ideal arm and through motors.
 
-Prints a table: the mean return over the seeds, and the worst and the best seed's. Runs that are finished are not
-trained again: half an hour of one core for three seeds.
+Prints a table: the mean return over the seeds, and the worst and the best seed's. Runs that are
+finished are not trained again: half an hour of one core for three seeds.
 """
 
 import argparse
@@ -35,27 +35,41 @@ TESTED = {f"{volts:g} V": motor(volts) for volts in (18.0, 12.0, 10.0, 8.0, 7.0,
 
 def main() -> None:
     """Train what is not trained, and evaluate all of it everywhere."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--episodes", type=int, default=30, help="of each policy on each motor")
     parser.add_argument("--total-steps", type=int, default=200_000)
-    parser.add_argument("--out", type=Path, default=Path("runs/furuta_table"), help="folder of the runs")
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/furuta_table"), help="folder of the runs"
+    )
     options = parser.parse_args()
     policies: dict[str, list[Any]] = {name: [] for name in TRAINED}
     for seed in range(options.seeds):
         for name, given in TRAINED.items():
             others = {key: value for key, value in given.items() if key != "actuator"}
             changes: dict[str, Any] = {"seed": seed, "total_steps": options.total_steps}
-            config = TrainConfig.preset("furuta", "ppo", "default", given["actuator"], others, **changes)
+            config = TrainConfig.preset(
+                "furuta", "ppo", "default", given["actuator"], others, **changes
+            )
             run = options.out / f"{name.replace(', ', '_').replace(' ', '')}-{seed}"
-            policies[name].append(load_policy(train(config, run, resume=True, accept_changes=True, tensorboard=False)))
-    print("| run on | " + " | ".join(f"trained {'on' if name == 'ideal' else 'at'} {name}" for name in TRAINED) + " |")
+            policies[name].append(
+                load_policy(train(config, run, resume=True, accept_changes=True, tensorboard=False))
+            )
+    print(
+        "| run on | "
+        + " | ".join(f"trained {'on' if name == 'ideal' else 'at'} {name}" for name in TRAINED)
+        + " |"
+    )
     print("| --- |" + " ---: |" * len(TRAINED))
     for condition, given in TESTED.items():
         cells = []
         for ones in policies.values():
             found = [
-                evaluate(one, EnvConfig("furuta", **given), options.episodes, EVALUATION_SEED).returns.mean
+                evaluate(
+                    one, EnvConfig("furuta", **given), options.episodes, EVALUATION_SEED
+                ).returns.mean
                 for one in ones
             ]
             cells.append(f"{sum(found) / len(found):.0f} ({min(found):.0f} to {max(found):.0f})")

@@ -1,9 +1,10 @@
 """Kills trainings at random moments, continues them, and compares what they come to with uninterrupted ones.
 
-Every training is `codrl-mj train` as a program. It is ended by SIGTERM, SIGINT or `kill -9` at a moment drawn between
-its start and the end of the uninterrupted one, in processor time, which other programs do not change, and continued by
-`codrl-mj train --resume`. The status is 1 if anything
-is not as docs/training.md says: exit status and message, steps lost, files left behind, and the result, bit for bit.
+Every training is `codrl-mj train` as a program. It is ended by SIGTERM, SIGINT or `kill -9` at a
+moment drawn between its start and the end of the uninterrupted one, in processor time, which other
+programs do not change, and continued by `codrl-mj train --resume`. The status is 1 if anything is
+not as docs/training.md says: exit status and message, steps lost, files left behind, and the
+result, bit for bit.
 """
 
 import argparse
@@ -30,7 +31,10 @@ INTERVAL = 1000
 """Environment steps between two checkpoints."""
 _OFTEN = f"--checkpoint-interval {INTERVAL} --evaluation-interval 5000 --evaluation-episodes 3"
 TRAININGS = {
-    "ppo": f"cartpole --actuator weaker --agent ppo --agent.rollout-steps 512 --total-steps 30000 {_OFTEN}",
+    "ppo": (
+        "cartpole --actuator weaker --agent ppo --agent.rollout-steps 512 --total-steps 30000"
+        f" {_OFTEN}"
+    ),
     "dqn": f"cartpole --agent dqn --total-steps 6000 {_OFTEN}",
     "sarsa": f"mountain_car --agent sarsa --total-episodes 80 --env.physics analytic {_OFTEN}",
 }
@@ -47,10 +51,16 @@ def outcome(run: Path) -> dict[str, Any]:
     files = ["policy.safetensors", "policy.json", "evaluation.json", "episodes.csv"]
     files += [f"best/{name}" for name in ("policy.safetensors", "policy.json", "evaluation.json")]
     with (run / "progress.csv").open() as file:
-        progress = [{name: row[name] for name in row if name not in TIME_COLUMNS} for row in csv.DictReader(file)]
+        progress = [
+            {name: row[name] for name in row if name not in TIME_COLUMNS}
+            for row in csv.DictReader(file)
+        ]
     result = read_json(run / "result.json", "result of a run")
     result.pop("seconds")
-    return {name: (run / name).read_bytes() for name in files} | {"progress.csv": progress, "result.json": result}
+    return {name: (run / name).read_bytes() for name in files} | {
+        "progress.csv": progress,
+        "result.json": result,
+    }
 
 
 def differing(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
@@ -101,7 +111,9 @@ class Kill:
 def start(arguments: str, folder: Path) -> subprocess.Popen[str]:
     """`codrl-mj train` in a folder."""
     line = [str(PROGRAM), "train", *arguments.split()]
-    return subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
 
 
 def seconds_used(pid: int) -> float:
@@ -110,7 +122,9 @@ def seconds_used(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def kill(agent: str, number: signal.Signals, moment: float, expected: dict[str, Any], folder: Path) -> Kill:
+def kill(
+    agent: str, number: signal.Signals, moment: float, expected: dict[str, Any], folder: Path
+) -> Kill:
     """Kill a training and continue it.
 
     Args:
@@ -126,7 +140,12 @@ def kill(agent: str, number: signal.Signals, moment: float, expected: dict[str, 
         time.sleep(0.005)
     training.send_signal(number)
     _, error = training.communicate()
-    status, reported, saved, left = training.returncode, reported_steps(run), saved_steps(run), len(hidden_files(run))
+    status, reported, saved, left = (
+        training.returncode,
+        reported_steps(run),
+        saved_steps(run),
+        len(hidden_files(run)),
+    )
     begun, finished = (run / "config.json").exists(), (run / "result.json").exists()
     if status != STATUS[number] and not (finished and status == 0) and (begun or status != -number):
         problems.append(f"exit status {status}")
@@ -148,12 +167,16 @@ def kill(agent: str, number: signal.Signals, moment: float, expected: dict[str, 
 
 def main() -> int:
     """Kill as often as asked, and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     arguments = parser.parse_args()
     moments = random.Random(arguments.seed)
-    table = Table("agent", "signal", "at [CPU s]", "status", "reported", "saved", "files left", "same result")
+    table = Table(
+        "agent", "signal", "at [CPU s]", "status", "reported", "saved", "files left", "same result"
+    )
     kills = []
     with tempfile.TemporaryDirectory() as root:
         expected, seconds = {}, {}
@@ -161,7 +184,12 @@ def main() -> int:
             before = os.times()
             _, error = start(f"{line} --out {agent}", Path(root)).communicate()
             after = os.times()
-            seconds[agent] = after.children_user - before.children_user + after.children_system - before.children_system
+            seconds[agent] = (
+                after.children_user
+                - before.children_user
+                + after.children_system
+                - before.children_system
+            )
             if error:
                 raise RuntimeError(f"the uninterrupted training of {agent} failed: {error}")
             expected[agent] = outcome(Path(root) / agent)
@@ -172,11 +200,22 @@ def main() -> int:
             folder.mkdir()
             one = kill(agent, number, moments.uniform(0, seconds[agent]), expected[agent], folder)
             kills.append(one)
-            row = [one.agent, one.signal, f"{one.moment:.2f}", one.status, one.reported, one.saved, one.left]
+            row = [
+                one.agent,
+                one.signal,
+                f"{one.moment:.2f}",
+                one.status,
+                one.reported,
+                one.saved,
+                one.left,
+            ]
             table.add_row(*map(str, row), "; ".join(one.problems) or "yes")
     console().print(table)
     bad = sum(bool(one.problems) for one in kills)
-    print(f"{len(kills) - bad} of {len(kills)} trainings came to the uninterrupted result, bit for bit")
+    print(
+        f"{len(kills) - bad} of {len(kills)} trainings came to the uninterrupted result, bit"
+        " for bit"
+    )
     return 1 if bad else 0
 
 

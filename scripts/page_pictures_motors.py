@@ -1,6 +1,7 @@
 """Pictures of the pages on motors, actuators and environments; `make pictures` makes them with the others.
 
-PICTURES has a function for each, which takes the path to write. All but two are what a command of its page draws.
+PICTURES has a function for each, which takes the path to write. All but two are what a command of
+its page draws.
 """
 
 import re
@@ -32,13 +33,24 @@ def smaller(picture: Path, out: Path, width: int = 840) -> None:
     with Image.open(picture) as image:
         width = min(width, image.width)
         size = width, round(image.height * width / image.width)
-        image.convert("RGB").resize(size, Image.Resampling.LANCZOS).quantize(256).save(out, optimize=True)
+        image.convert("RGB").resize(size, Image.Resampling.LANCZOS).quantize(256).save(
+            out, optimize=True
+        )
 
 
 def motor_design(out: Path) -> None:
     """The loop that docs/motors.md designs: gain and phase, with margins."""
     with tempfile.TemporaryDirectory() as made:
-        run("motor", "design", "quanser-qube-servo-2", "--bandwidth", "1500", "--delayed", "--out", made)
+        run(
+            "motor",
+            "design",
+            "quanser-qube-servo-2",
+            "--bandwidth",
+            "1500",
+            "--delayed",
+            "--out",
+            made,
+        )
         smaller(Path(made, "bode.png"), out, 720)
 
 
@@ -57,7 +69,17 @@ def own_robot(out: Path) -> None:
     with tempfile.TemporaryDirectory() as made:
         trained, film = Path(made, "ball"), Path(made, "film")
         run("train", f"{example}:TASK", "--total-steps", "100000", "--out", str(trained))
-        run("render", str(trained), "--trust", "--seed", "1", "--env.max-episode-steps", "50", "--out", str(film))
+        run(
+            "render",
+            str(trained),
+            "--trust",
+            "--seed",
+            "1",
+            "--env.max-episode-steps",
+            "50",
+            "--out",
+            str(film),
+        )
         strips = []
         for frame in (0, 4, 8, 12, 24):
             with Image.open(film / f"frame_{frame:05d}.png") as image:
@@ -87,7 +109,13 @@ def foreign(out: Path) -> None:
 
 def actuators(out: Path) -> None:
     """What families deliver of a torque that is asked for on a joint that turns freely, up to their speed limit."""
-    motor = GearMotor(resistance=1.0, inductance=1e-3, torque_constant=0.05, back_emf_constant=0.05, gear_ratio=10.0)
+    motor = GearMotor(
+        resistance=1.0,
+        inductance=1e-3,
+        torque_constant=0.05,
+        back_emf_constant=0.05,
+        gear_ratio=10.0,
+    )
     families: dict[str, Any] = {
         "drive": Drive(motor, SampledLoop(10e3), Supply(12.0)),
         "current_loop (weak)": named_actuator("weak", "pendulum"),
@@ -97,7 +125,8 @@ def actuators(out: Path) -> None:
     timestep, asked, inertia = 1e-3, 4.0, 0.2
     times = timestep * np.arange(1, 1501)
     curves = [
-        Curve(name, times, on_bench(one, timestep, inertia)(asked, times[-1])[:, 0]) for name, one in families.items()
+        Curve(name, times, on_bench(one, timestep, inertia)(asked, times[-1])[:, 0])
+        for name, one in families.items()
     ]
     ideal = Curve("ideal", times, np.full_like(times, asked), reference=True, dashed=True)
     title = "4 N·m asked for, on a joint that is free to turn"
@@ -108,13 +137,19 @@ def actuators(out: Path) -> None:
 def actuators_in_numbers(out: Path) -> None:
     """Shares of the largest force that the paper's actuators deliver on a blocked joint, on three tasks."""
     plots = []
-    for task in (one for one in OURS if one.name in ("pendulum", "cartpole", "acrobot", "mountain_car")):
+    for task in (
+        one for one in OURS if one.name in ("pendulum", "cartpole", "acrobot", "mountain_car")
+    ):
         timestep = task.step_duration / task.motor_inner_steps
         curves = []
         for name in ("paper", "weak", "weaker", "open_loop"):
-            torques = on_bench(named_actuator(name, task.name), timestep, BLOCKED)(float(task.max_forces[0]), 8.0)[:, 0]
+            torques = on_bench(named_actuator(name, task.name), timestep, BLOCKED)(
+                float(task.max_forces[0]), 8.0
+            )[:, 0]
             times = timestep * np.arange(len(torques) + 1)
-            curves.append(Curve(name, times, np.concatenate([[0.0], torques]) / float(task.max_forces[0])))
+            curves.append(
+                Curve(name, times, np.concatenate([[0.0], torques]) / float(task.max_forces[0]))
+            )
         plots.append(Plot(task.name, "time [s]", "share of the largest force", tuple(curves)))
     save(plots, out)
     smaller(out, out)

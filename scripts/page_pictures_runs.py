@@ -1,7 +1,8 @@
 """Make the pictures of the pages on logs, runs and checks: what their commands show, or what their tables say.
 
-`PICTURES` has what makes each, by its name in docs/pictures. Example: python scripts/page_pictures_runs.py
-disturbances.svg; all of them take some minutes. Pages are looked at by Chromium.
+`PICTURES` has what makes each, by its name in docs/pictures. Example: python
+scripts/page_pictures_runs.py disturbances.svg; all of them take some minutes. Pages are looked at
+by Chromium.
 """
 
 import argparse
@@ -27,7 +28,13 @@ from codrl_mj.cli import main as command
 DOCS = Path(__file__).parents[1] / "docs"
 BLUE, ORANGE, RED, GREY = "#0b62b8", "#bd5a0e", "#a8134a", "#5b6672"
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-CHROMIUM = ("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync")
+CHROMIUM = (
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-sync",
+)
 COLUMNS = "time=time:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
 BENCH = """name: maxon-ec45-flat-50w
 motor: {gear_ratio: 20.0, resistance: 1.13, torque_constant: 0.0311, back_emf_constant: 0.0311,
@@ -45,8 +52,15 @@ def run(*words: str) -> None:
 @contextmanager
 def drawing(width: float, height: float, **options: Any) -> Iterator[tuple[Any, Any]]:
     """A figure of so many inches and its axes."""
-    style = {"svg.hashsalt": "codrl_mj", "font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
-    with matplotlib.rc_context({**style, "axes.axisbelow": True, "axes.grid": True, "grid.color": "#e3e6ea"}):
+    style = {
+        "svg.hashsalt": "codrl_mj",
+        "font.size": 9,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+    }
+    with matplotlib.rc_context(
+        {**style, "axes.axisbelow": True, "axes.grid": True, "grid.color": "#e3e6ea"}
+    ):
         figure, axes = pyplot.subplots(figsize=(width, height), layout="constrained", **options)
         yield figure, axes
         pyplot.close(figure)
@@ -57,7 +71,9 @@ def save(figure: Any, path: Path) -> None:
     figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
-def shot(page: Path, selector: str, path: Path, width: int = 1100, height: int | None = None) -> None:
+def shot(
+    page: Path, selector: str, path: Path, width: int = 1100, height: int | None = None
+) -> None:
     """What Chromium shows of a page's element, to so many pixels down."""
     from playwright.sync_api import sync_playwright
 
@@ -69,12 +85,16 @@ def shot(page: Path, selector: str, path: Path, width: int = 1100, height: int |
         opened = browser.new_page(viewport={"width": width, "height": 900}, color_scheme="light")
         opened.emulate_media(reduced_motion="reduce")
         opened.goto(page.resolve().as_uri())
-        opened.evaluate("document.querySelectorAll('details').forEach(one => one.remove())")  # how long it took
+        opened.evaluate(
+            "document.querySelectorAll('details').forEach(one => one.remove())"
+        )  # how long it took
         picture = Path(made) / "shot.png"
         opened.locator(selector).first.screenshot(path=picture, timeout=300_000)
         browser.close()
         with Image.open(picture) as image:
-            seen = image.convert("RGB").crop((0, 0, image.width, min(height or image.height, image.height)))
+            seen = image.convert("RGB").crop(
+                (0, 0, image.width, min(height or image.height, image.height))
+            )
             seen.quantize(128).save(path, optimize=True)
 
 
@@ -82,7 +102,11 @@ def identified(path: Path) -> None:
     """How many draws identify each number under each excitation, from the table of docs/identify_measured.md."""
     with (DOCS / "identify_measured.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    logs = list(dict.fromkeys((row["excitation"], row["rows have"], row["rows a second [Hz]"]) for row in rows))
+    logs = list(
+        dict.fromkeys(
+            (row["excitation"], row["rows have"], row["rows a second [Hz]"]) for row in rows
+        )
+    )
     numbers = list(dict.fromkeys(row["number"] for row in rows))
     shares = np.full((len(logs), len(numbers)), np.nan)
     with drawing(8.6, 4.6) as (figure, axes):
@@ -91,7 +115,15 @@ def identified(path: Path) -> None:
             x, share = numbers.index(row["number"]), int(row["identified"]) / int(row["draws"])
             shares[y, x] = share
             error = f"\n{row['largest error [%]']} %" if row["largest error [%]"] else ""
-            axes.text(x, y, f"{share:.0%}{error}", ha="center", va="center", fontsize=6.5, linespacing=0.95)
+            axes.text(
+                x,
+                y,
+                f"{share:.0%}{error}",
+                ha="center",
+                va="center",
+                fontsize=6.5,
+                linespacing=0.95,
+            )
         axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.9, aspect="auto")
         axes.set_xticks(range(len(numbers)), numbers)
         names = [f"{kind}, {int(rate) // 1000} kHz, {having}" for kind, having, rate in logs]
@@ -114,17 +146,31 @@ def worked(path: Path) -> None:
                 for at, tested in enumerate(through):
                     own = (name, trained, tested)
                     keys = ("environment", "trained through", "tested on")
-                    got = [float(row["return"]) for row in rows if tuple(row[key] for key in keys) == own]
+                    got = [
+                        float(row["return"])
+                        for row in rows
+                        if tuple(row[key] for key in keys) == own
+                    ]
                     x = at + 0.22 * (place - 1)
                     one.plot([x, x], [min(got), max(got)], color=colour, linewidth=1.2, alpha=0.5)
                     one.plot([x] * len(got), got, "o", color=colour, markersize=2.5, alpha=0.5)
                     label = f"trained through {trained}" if at == 0 else None
-                    one.plot(x, np.mean(got), "_", color=colour, markersize=11, markeredgewidth=2.5, label=label)
+                    one.plot(
+                        x,
+                        np.mean(got),
+                        "_",
+                        color=colour,
+                        markersize=11,
+                        markeredgewidth=2.5,
+                        label=label,
+                    )
             one.set_title(name, loc="left", fontweight="bold", fontsize=9)
             one.set_xticks(range(3), [f"on {tested}" for tested in through])
             one.grid(visible=False, axis="x")
         axes[0].set_ylabel("return of three seeds, mean")
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+        figure.legend(
+            *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
+        )
         save(figure, path)
 
 
@@ -137,7 +183,11 @@ def disturbed(path: Path) -> None:
         "load pulses": {"pulse_force": 1.0, "pulse_duration": 0.15, "pulse_interval": 0.5},
     }
     step, steps = 0.05, 48
-    asked = 1.6 * np.sin(2.0 * np.pi * np.arange(steps) / 24.0) * np.sign(np.sin(2.0 * np.pi * np.arange(steps) / 32.0))
+    asked = (
+        1.6
+        * np.sin(2.0 * np.pi * np.arange(steps) / 24.0)
+        * np.sign(np.sin(2.0 * np.pi * np.arange(steps) / 32.0))
+    )
     time = step * np.arange(steps + 1)
     with drawing(8.6, 2.2, ncols=4, sharey=True) as (figure, axes):
         for one, (name, fields) in zip(axes, kinds.items(), strict=True):
@@ -150,21 +200,36 @@ def disturbed(path: Path) -> None:
                 delivered.append(float(info["actual_force"]))
                 pushed.append(float(physics.data.qfrc_applied[0]))
             env.close()
-            one.stairs(asked, time, color=BLUE, linewidth=1.0, linestyle="--", baseline=None, label="desired")
-            one.stairs(delivered, time, color=ORANGE, linewidth=1.4, baseline=None, label="delivered")
+            one.stairs(
+                asked,
+                time,
+                color=BLUE,
+                linewidth=1.0,
+                linestyle="--",
+                baseline=None,
+                label="desired",
+            )
+            one.stairs(
+                delivered, time, color=ORANGE, linewidth=1.4, baseline=None, label="delivered"
+            )
             if "pulse_force" in fields:
                 one.stairs(pushed, time, color=RED, fill=True, alpha=0.35, label="load pulses")
             one.set_title(name, loc="left", fontsize=7.5, fontweight="bold")
             one.set_xlabel("time [s]")
         axes[0].set_ylabel("torque [N·m]")
         handles = dict(zip(*reversed(axes[3].get_legend_handles_labels()), strict=True))
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3, frameon=False)
+        figure.legend(
+            handles.values(), handles.keys(), loc="outside lower center", ncols=3, frameon=False
+        )
         save(figure, path)
 
 
 def drawn(path: Path) -> None:
     """Answers of thirty drawn motors of CartPole to a step of the desired force."""
-    fields = {"motor.inductance": codrl_mj.Uniform(0.05, 0.2), "controller.kp": codrl_mj.LogUniform(0.5, 5.0)}
+    fields = {
+        "motor.inductance": codrl_mj.Uniform(0.05, 0.2),
+        "controller.kp": codrl_mj.LogUniform(0.5, 5.0),
+    }
     gains, answers = [], []
     env = gymnasium.make("codrl_mj/CartPole-v0", randomize=fields, inner_steps=20)
     for seed in range(30):
@@ -178,12 +243,16 @@ def drawn(path: Path) -> None:
     scale = matplotlib.colors.LogNorm(0.5, 5.0)
     with drawing(6.2, 2.6) as (figure, axes):
         for gain, answer in zip(gains, answers, strict=True):
-            axes.plot(0.02 * np.arange(len(answer)), answer, color=colour(scale(gain)), linewidth=0.9)
+            axes.plot(
+                0.02 * np.arange(len(answer)), answer, color=colour(scale(gain)), linewidth=0.9
+            )
         axes.axhline(10.0, color=GREY, linestyle="--", linewidth=1.0)
         axes.set_xlabel("time [s]")
         axes.set_ylabel("delivered force [N]")
         shown = matplotlib.cm.ScalarMappable(scale, colour)
-        figure.colorbar(shown, ax=axes, label="kp [V/A]", ticks=[0.5, 1, 2, 5], format="%g").minorticks_off()
+        figure.colorbar(
+            shown, ax=axes, label="kp [V/A]", ticks=[0.5, 1, 2, 5], format="%g"
+        ).minorticks_off()
         save(figure, path)
 
 
@@ -193,27 +262,80 @@ def fitted(path: Path) -> None:
         folder = Path(made)
         bench, logs = folder / "real.yaml", [str(folder / f"swing{seed}.csv") for seed in (1, 2, 3)]
         bench.write_text(BENCH)
-        voltage = ("--kind", "prbs", "--amplitude", "20", "--clock", "0.002", "--mean-voltage", "--duration", "4")
+        voltage = (
+            "--kind",
+            "prbs",
+            "--amplitude",
+            "20",
+            "--clock",
+            "0.002",
+            "--mean-voltage",
+            "--duration",
+            "4",
+        )
         sensors = ("--sensor", "current:noise=0.05", "position:resolution=0.001534")
         for seed, log in enumerate(logs, start=1):
-            run("identify", "simulate", str(bench), *voltage, *sensors, "--seed", str(seed), "--out", log)
-        known = ("--rig", "free", "--known", "gear_ratio=20", "load_inertia=0", "--motor", "maxon-ec45-flat-50w")
-        words = (*logs[:2], "--holdout", logs[2], "--columns", COLUMNS, *known, "--out", str(folder / "motor"))
+            run(
+                "identify",
+                "simulate",
+                str(bench),
+                *voltage,
+                *sensors,
+                "--seed",
+                str(seed),
+                "--out",
+                log,
+            )
+        known = (
+            "--rig",
+            "free",
+            "--known",
+            "gear_ratio=20",
+            "load_inertia=0",
+            "--motor",
+            "maxon-ec45-flat-50w",
+        )
+        words = (
+            *logs[:2],
+            "--holdout",
+            logs[2],
+            "--columns",
+            COLUMNS,
+            *known,
+            "--out",
+            str(folder / "motor"),
+        )
         run("identify", *words)
         shot(folder / "motor" / "report.html", "#held-out", path, height=392)
 
 
 def planned(path: Path) -> None:
     """The voltage that the plan of docs/identify_logs.md writes, and what a simulated bench answers to its like."""
-    motor, load, names = "maxon-ec45-flat-50w", ("--inertia", "1e-4"), ("voltage", "current", "velocity")
+    motor, load, names = (
+        "maxon-ec45-flat-50w",
+        ("--inertia", "1e-4"),
+        ("voltage", "current", "velocity"),
+    )
     with tempfile.TemporaryDirectory() as made:
         log = Path(made) / "log.csv"
         words = ("--kind", "prbs", "--amplitude", "5.1", "--clock", "0.002", "--rate", "1000")
-        run("identify", "simulate", motor, *load, *words, "--sensor", "current:noise=0.02", "--out", str(log))
+        run(
+            "identify",
+            "simulate",
+            motor,
+            *load,
+            *words,
+            "--sensor",
+            "current:noise=0.02",
+            "--out",
+            str(log),
+        )
         rows = np.genfromtxt(log, delimiter=",", names=True)
     rows = rows[rows["time"] <= 2.0]
     with drawing(7.0, 3.6, nrows=3, sharex=True) as (figure, axes):
-        for one, name, unit, colour in zip(axes, names, ("V", "A", "rad/s"), (BLUE, ORANGE, RED), strict=True):
+        for one, name, unit, colour in zip(
+            axes, names, ("V", "A", "rad/s"), (BLUE, ORANGE, RED), strict=True
+        ):
             one.step(rows["time"], rows[name], colour, linewidth=0.6, where="post")
             one.set_ylabel(f"{name} [{unit}]")
         axes[-1].set_xlabel("time [s]")
@@ -240,13 +362,25 @@ def converged(path: Path) -> None:
 
 def trained(folder: Path) -> Path:
     """The run of docs/training.md."""
-    run("train", "cartpole", "--actuator", "weaker", "--env.center-radius", "0.1", "--out", str(folder / "mine"))
+    run(
+        "train",
+        "cartpole",
+        "--actuator",
+        "weaker",
+        "--env.center-radius",
+        "0.1",
+        "--out",
+        str(folder / "mine"),
+    )
     return folder / "mine"
 
 
 def learnt(path: Path) -> None:
     """The learning curve that a training leaves."""
-    with tempfile.TemporaryDirectory() as made, Image.open(trained(Path(made)) / "learning_curve.png") as image:
+    with (
+        tempfile.TemporaryDirectory() as made,
+        Image.open(trained(Path(made)) / "learning_curve.png") as image,
+    ):
         image.convert("RGB").quantize(64).save(path, optimize=True)
 
 
@@ -275,8 +409,12 @@ PICTURES: Mapping[str, Callable[[Path], None]] = {
 """Name in docs/pictures -> what makes it at a path."""
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", choices=PICTURES, default=list(PICTURES), help="which of them")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "names", nargs="*", choices=PICTURES, default=list(PICTURES), help="which of them"
+    )
     for name in parser.parse_args().names:
         PICTURES[name](DOCS / "pictures" / name)
         print(f"wrote docs/pictures/{name}")

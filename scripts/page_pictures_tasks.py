@@ -1,7 +1,8 @@
 """Film every task of docs/environments: a policy that was trained through the task's motor, and what the motor does.
 
-A film has the first seconds of a typical episode, and under it the strip of torque and voltage. `PICTURES` has what
-makes each, by its path below docs. Example: python scripts/page_pictures_tasks.py furuta; all six take five minutes.
+A film has the first seconds of a typical episode, and under it the strip of torque and voltage.
+`PICTURES` has what makes each, by its path below docs. Example: python
+scripts/page_pictures_tasks.py furuta; all six take five minutes.
 """
 
 import argparse
@@ -41,7 +42,9 @@ class Scene(NamedTuple):
     @property
     def flags(self) -> str:
         """With which `codrl-mj train` trains the policy."""
-        return f"--agent {self.agent}" + f" --settings {self.settings}" * (self.settings != "default")
+        return f"--agent {self.agent}" + f" --settings {self.settings}" * (
+            self.settings != "default"
+        )
 
 
 SCENES: Mapping[str, Scene] = {
@@ -58,12 +61,18 @@ def make(task: str, path: Path) -> None:
     """Train a policy of a task through the task's own motor, and film a typical episode."""
     scene = SCENES[task]
     with tempfile.TemporaryDirectory() as made:
-        run = train(TrainConfig.preset(task, scene.agent, scene.settings), Path(made) / "run", tensorboard=False)
+        run = train(
+            TrainConfig.preset(task, scene.agent, scene.settings),
+            Path(made) / "run",
+            tensorboard=False,
+        )
         env = EnvConfig(task)
         if scene.steps is not None:
             env = dataclasses.replace(env, max_episode_steps=scene.steps)
         episodes = run_episodes(load_policy(run), env.make, 21, EVALUATION_SEED)
-        typical = episodes[int(np.argsort([episode.total for episode in episodes])[len(episodes) // 2])]
+        typical = episodes[
+            int(np.argsort([episode.total for episode in episodes])[len(episodes) // 2])
+        ]
         title = f"{scene.agent.upper()}, {len(typical.reward) * float(typical.time[0]):g} s"
         panel = Panel(task, typical, title=title)
         frames = film([panel], Path(made) / "film", WIDTH, HEIGHT, scene.camera)
@@ -73,7 +82,14 @@ def make(task: str, path: Path) -> None:
         shown = [round(DURATION / len(chosen))] * len(others) + [LAST]
         with writing(path) as temporary:
             first.save(
-                temporary, "webp", save_all=True, append_images=others, duration=shown, loop=0, quality=60, method=6
+                temporary,
+                "webp",
+                save_all=True,
+                append_images=others,
+                duration=shown,
+                loop=0,
+                quality=60,
+                method=6,
             )
 
 
@@ -84,7 +100,9 @@ PICTURES: Mapping[str, Callable[[Path], None]] = {
 
 def main() -> None:
     """Make the films of some tasks, or of all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("tasks", nargs="*", choices=[*SCENES, []], help="all unless some are named")
     options = parser.parse_args()
     for task in options.tasks or SCENES:

@@ -1,8 +1,8 @@
 """Make pictures of what comes out, for the README, the gallery and the pages; some are of pages, which takes Chromium.
 
-`PICTURES` has what makes each, by its name in docs/pictures, or by its path in docs where it has a folder. Those of the
-pages are in page_pictures_*.py beside this file. Example: python scripts/pictures.py motor.png log.png; or all, in
-half an hour.
+`PICTURES` has what makes each, by its name in docs/pictures, or by its path in docs where it has a
+folder. Those of the pages are in page_pictures_*.py beside this file. Example: python
+scripts/pictures.py motor.png log.png; or all, in half an hour.
 """
 
 import argparse
@@ -25,8 +25,19 @@ from codrl_mj.tasks import TASKS
 
 DOCS = Path(__file__).parents[1] / "docs"
 COLUMNS = "time=time:s,voltage=voltage:V,current=current:A,position=position:rad"
-CHROMIUM = ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--window-size=1280,860")
-CHROMIUM_OFFLINE = ("--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync")
+CHROMIUM = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--hide-scrollbars",
+    "--window-size=1280,860",
+)
+CHROMIUM_OFFLINE = (
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
 ROBOTS = {
     "HalfCheetah-v5": "maxon-ec45-flat-50w",
     "Ant-v5": "cubemars-ak80-6",
@@ -62,18 +73,34 @@ def smaller(picture: Image.Image | Path, out: Path, width: int = 960) -> None:
 
 def photographed(page: Path, out: Path, folder: Path) -> None:
     """Write what Chromium shows of a page."""
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    chromium = (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
     if chromium is None:
         raise SystemExit("Chromium is not installed: apt-get install chromium")
     shot, profile = folder / "shot.png", f"--user-data-dir={folder / 'profile'}"
-    subprocess.run([chromium, *CHROMIUM, *CHROMIUM_OFFLINE, profile, f"--screenshot={shot}", page.as_uri()], check=True)
+    subprocess.run(
+        [chromium, *CHROMIUM, *CHROMIUM_OFFLINE, profile, f"--screenshot={shot}", page.as_uri()],
+        check=True,
+    )
     smaller(shot, out)
 
 
 def motor(out: Path) -> None:
     """A motor under a task."""
     with tempfile.TemporaryDirectory() as made:
-        run("motor", "feasible", "maxon-ec45-flat-50w", "pendulum", "--gear-ratio", "20", "--out", made)
+        run(
+            "motor",
+            "feasible",
+            "maxon-ec45-flat-50w",
+            "pendulum",
+            "--gear-ratio",
+            "20",
+            "--out",
+            made,
+        )
         smaller(Path(made) / "torque_speed.png", out)
 
 
@@ -82,8 +109,26 @@ def log(out: Path) -> None:
     with tempfile.TemporaryDirectory() as made:
         logs = [str(Path(made) / f"swing{seed}.csv") for seed in (1, 2)]
         for seed, one in enumerate(logs, start=1):
-            words = ["--kind", "prbs", "--amplitude", "8", "--rate", "5000", "--sensor", "current:noise=0.05"]
-            run("identify", "simulate", "maxon-ec45-flat-50w", "--out", one, "--seed", str(seed), *words)
+            words = [
+                "--kind",
+                "prbs",
+                "--amplitude",
+                "8",
+                "--rate",
+                "5000",
+                "--sensor",
+                "current:noise=0.05",
+            ]
+            run(
+                "identify",
+                "simulate",
+                "maxon-ec45-flat-50w",
+                "--out",
+                one,
+                "--seed",
+                str(seed),
+                *words,
+            )
         words = ["--columns", COLUMNS, "--rig", "free", "--known", "load_inertia=0"]
         run("identify", *logs, *words, "--out", str(Path(made) / "found"))
         photographed(Path(made) / "found" / "report.html", out, Path(made))
@@ -92,7 +137,9 @@ def log(out: Path) -> None:
 def sheet(frames: Mapping[str, np.ndarray], columns: int) -> Image.Image:
     """Frames of one size side by side, each above its name."""
     width = next(iter(frames.values())).shape[1]
-    cells = [np.vstack([frame, draw_text(name, width, 40)[..., :3]]) for name, frame in frames.items()]
+    cells = [
+        np.vstack([frame, draw_text(name, width, 40)[..., :3]]) for name, frame in frames.items()
+    ]
     cells += [np.full_like(cells[0], 255)] * (-len(cells) % columns)
     rows = [np.hstack(cells[at : at + columns]) for at in range(0, len(cells), columns)]
     return Image.fromarray(np.vstack(rows))
@@ -143,9 +190,13 @@ def pictures() -> dict[str, Callable[[Path], None]]:
 
 def main() -> None:
     """Make those that are named, or all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     known = pictures()
-    parser.add_argument("names", nargs="*", choices=[*known, []], metavar="NAME", help=f"of {', '.join(known)}")
+    parser.add_argument(
+        "names", nargs="*", choices=[*known, []], metavar="NAME", help=f"of {', '.join(known)}"
+    )
     for name in parser.parse_args().names or known:
         known[name](DOCS / name if "/" in name else DOCS / "pictures" / name)
         print(f"wrote {name}", flush=True)

@@ -1,7 +1,7 @@
 """Writes docs/reference/: the command line, a page a verb; every public name, a page a room; every field of a setting.
 
-All of it comes from docstrings, the fields' own bounds and units, and `--help`. `make docs` runs this; what it writes
-is not kept. Only python.md is written by hand.
+All of it comes from docstrings, the fields' own bounds and units, and `--help`. `make docs` runs
+this; what it writes is not kept. Only python.md is written by hand.
 """
 
 import ast
@@ -50,11 +50,21 @@ ALONE = {
     "films": ("film.film", "film.Panel", "film.record"),
     "foreign": ("building.motorised", "dm_control.make_dm_control", "world.GymnasiumWorld"),
     "pages": (
-        *("report.report", "report.replays", "motor.motor_page", "identification.identification_page"),
+        *(
+            "report.report",
+            "report.replays",
+            "motor.motor_page",
+            "identification.identification_page",
+        ),
         *("certificate.write", "page.clocked"),
     ),
     "runs": (
-        *("policies.load_policy", "policies.save_policy", "summaries.find_runs", "summaries.read_run"),
+        *(
+            "policies.load_policy",
+            "policies.save_policy",
+            "summaries.find_runs",
+            "summaries.read_run",
+        ),
         *("summaries.compare", "files.writing"),
     ),
     "view": ("session.Session",),
@@ -68,7 +78,9 @@ def help_of(*words: str) -> str:
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         cli.main([*words, "--help"])
     lines = [re.sub(r"^╭─ (.*?) ─*╮$", r"\n\1:", line) for line in printed.getvalue().splitlines()]
-    kept = [line.strip("│").rstrip() for line in lines if not re.fullmatch(r"[│ ]*[╰─]+[╯│ ]*", line)]
+    kept = [
+        line.strip("│").rstrip() for line in lines if not re.fullmatch(r"[│ ]*[╰─]+[╯│ ]*", line)
+    ]
     long = int(WIDTH) + 5
     return "\n".join(
         textwrap.fill(one, int(WIDTH)) if len(one) > long and one[0] != " " else one for one in kept
@@ -102,7 +114,10 @@ def verbs_page() -> str:
     for verb in verbs():
         sentence = help_of(verb).split("\n\n")[1]
         rows.append((f"[`{verb}`](command_line/{verb}.md)", " ".join(sentence.split())))
-    return f"# Command line\n\n`codrl-mj VERB --help` says the same.\n\n{table(('verb', 'does'), rows)}"
+    return (
+        "# Command line\n\n`codrl-mj VERB --help` says the"
+        f" same.\n\n{table(('verb', 'does'), rows)}"
+    )
 
 
 def room_page(room: str) -> str:
@@ -113,12 +128,16 @@ def room_page(room: str) -> str:
         home, _, last = f"{module.__name__}.{name}".rpartition(".")
         found = getattr(importlib.import_module(home), last)
         made = inspect.unwrap(found) if callable(found) else found
-        if (inspect.isclass(made) or inspect.isfunction(made)) and made.__module__.startswith("codrl_mj."):
+        if (inspect.isclass(made) or inspect.isfunction(made)) and made.__module__.startswith(
+            "codrl_mj."
+        ):
             called.append(f"::: {made.__module__}.{made.__qualname__}")
         else:
             others.append((f"`{last}`", shortened(found), said_of(module.__name__, last, found)))
     parts = [f"# codrl_mj.{room}", (inspect.getdoc(module) or "").partition("\n\n")[0], *called]
-    return "\n\n".join([*parts, *(["## Constants", table(("name", "value", "is"), others)] if others else [])])
+    return "\n\n".join(
+        [*parts, *(["## Constants", table(("name", "value", "is"), others)] if others else [])]
+    )
 
 
 def shortened(value: Any) -> str:
@@ -134,16 +153,27 @@ def said_of(room: str, name: str, value: Any) -> str:
     for home, module in list(sys.modules.items()):
         if f"{home}.".startswith(f"{room}.") and vars(module).get(name) is value:
             for line, doc in itertools.pairwise(ast.parse(inspect.getsource(module)).body):
-                targets = line.targets if isinstance(line, ast.Assign) else [getattr(line, "target", None)]
+                targets = (
+                    line.targets
+                    if isinstance(line, ast.Assign)
+                    else [getattr(line, "target", None)]
+                )
                 named = [one.id for one in targets if isinstance(one, ast.Name)]
-                if name in named and isinstance(doc, ast.Expr) and isinstance(doc.value, ast.Constant):
+                if (
+                    name in named
+                    and isinstance(doc, ast.Expr)
+                    and isinstance(doc.value, ast.Constant)
+                ):
                     return " ".join(str(doc.value.value).split())
     return ""
 
 
 def settings() -> dict[str, list[type]]:
     """Every configuration, by what it is of."""
-    rooms = {room: importlib.import_module(f"codrl_mj.{room}") for room in ("actuators", "agents", "disturbances")}
+    rooms = {
+        room: importlib.import_module(f"codrl_mj.{room}")
+        for room in ("actuators", "agents", "disturbances")
+    }
     of = {
         room: [
             one
@@ -181,7 +211,13 @@ def rows_of(kind: type) -> Iterator[tuple[str, ...]]:
         if default is dataclasses.MISSING and field.default_factory is not dataclasses.MISSING:
             default = field.default_factory()
         said = f"{bound} or none" if bound and optional else bound
-        yield f"`{field.name}`", shown(default), field.metadata.get("unit", ""), said, docs.get(field.name, "")
+        yield (
+            f"`{field.name}`",
+            shown(default),
+            field.metadata.get("unit", ""),
+            said,
+            docs.get(field.name, ""),
+        )
 
 
 def shown(default: Any) -> str:
@@ -195,23 +231,34 @@ def shown(default: Any) -> str:
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """In Markdown, without the columns that are empty."""
-    columns = [column for column in zip(header, *rows, strict=True) if any(column[1:])]  # those that say something
+    columns = [
+        column for column in zip(header, *rows, strict=True) if any(column[1:])
+    ]  # those that say something
     head, *rest = zip(*columns, strict=True)
     lines = [head, ["---"] * len(head), *rest]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+    )
 
 
 def settings_page() -> str:
     """Every field of every configuration."""
     parts = [
         "# Settings",
-        "Every field, with its default, unit and bound. The same names are keyword arguments in Python, keys in files "
-        "and flags of the [command line](command_line.md): `max_voltage` is `--actuator.controller.max-voltage`.",
+        (
+            "Every field, with its default, unit and bound. The same names are keyword arguments in"
+            " Python, keys in files and flags of the [command line](command_line.md): `max_voltage`"
+            " is `--actuator.controller.max-voltage`."
+        ),
     ]
     for title, kinds in settings().items():
         parts.append(f"## {title}")
         for kind in kinds:
-            name = f"{kind.__module__.rpartition('.')[2]}.Options" if kind.__name__ == "Options" else kind.__name__
+            name = (
+                f"{kind.__module__.rpartition('.')[2]}.Options"
+                if kind.__name__ == "Options"
+                else kind.__name__
+            )
             told = (inspect.getdoc(kind) or "").partition("\n\n")[0]
             parts += [f"### {name}", " ".join(told.split())]
             parts.append(table(("field", "default", "unit", "bound", "is"), rows_of(kind)))

@@ -15,7 +15,9 @@ from codrl_mj.training import load_config
 
 def main() -> None:
     """Run an episode on each actuator and film them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("run", type=Path, help="run folder of a finished training")
     parser.add_argument("actuators", nargs="+", help="such as ideal or weaker")
     parser.add_argument("--seed", type=int, default=0, help="of the episode")

@@ -1,13 +1,12 @@
 """A million environment steps over randomised actuators: no growth of memory, no dependence on threads.
 
-Two vector environments whose actuators are drawn anew for every episode, one stepped on one thread and one on two, take
-the same random actions. Whatever they return must be equal bit for bit, each episode that ends and each unstable draw
-must be accounted for in the infos, no unstable actuator may be let through, and memory may not grow after the first
-tenth.
+Two vector environments whose actuators are drawn anew for every episode, one stepped on one thread
+and one on two, take the same random actions. Whatever they return must be equal bit for bit, each
+episode that ends and each unstable draw must be accounted for in the infos, no unstable actuator
+may be let through, and memory may not grow after the first tenth.
 """
 
-import codrl_mj  # isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
-
+# isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
 import argparse
 import hashlib
 import os
@@ -20,6 +19,7 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode
 
+import codrl_mj
 from codrl_mj import LogUniform
 from codrl_mj.actuators import spectral_radius
 from codrl_mj.cli.terminal import console
@@ -51,7 +51,10 @@ def unstable(env: ActuatedVectorEnv) -> int:
     """How many of the actuators in use have an unstable loop, each judged by itself."""
     drawn = env.randomization
     assert drawn is not None
-    nominal, timestep = named_actuator("paper", env.task.name), env.task.step_duration / env.setup.inner_steps
+    nominal, timestep = (
+        named_actuator("paper", env.task.name),
+        env.task.step_duration / env.setup.inner_steps,
+    )
     rows = ({name: float(drawn[name][row]) for name in RANDOMIZE} for row in range(env.num_envs))
     return sum(spectral_radius(nominal.replaced(values), timestep) >= 1.0 for values in rows)
 
@@ -78,9 +81,14 @@ def soak(task: str, num_envs: int, steps: int) -> int:
     generator = np.random.default_rng(0)
     limit = TASKS[task].max_episode_steps
     assert limit is not None
-    arguments: dict[str, Any] = {"max_episode_steps": limit, "autoreset_mode": AutoresetMode.SAME_STEP}
+    arguments: dict[str, Any] = {
+        "max_episode_steps": limit,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
     arguments["randomize"] = RANDOMIZE
-    envs = [ActuatedVectorEnv(num_envs, task, num_threads=threads, **arguments) for threads in (1, 2)]
+    envs = [
+        ActuatedVectorEnv(num_envs, task, num_threads=threads, **arguments) for threads in (1, 2)
+    ]
     first, _ = (env.reset(seed=0)[1] for env in envs)
     rejected = int(first["randomization"]["rejected"].sum())
     draws, let_through = num_envs, unstable(envs[0])
@@ -100,7 +108,10 @@ def soak(task: str, num_envs: int, steps: int) -> int:
         lengths += 1
         missing += int((lengths > limit).sum()) + int((truncated & (lengths != limit)).sum())
         if ends.any():
-            missing += int((infos["_final_obs"] != ends).sum() + (infos["final_info"]["_current"] != ends).sum())
+            missing += int(
+                (infos["_final_obs"] != ends).sum()
+                + (infos["final_info"]["_current"] != ends).sum()
+            )
             missing += sum(not np.isfinite(seen).all() for seen in infos["final_obs"][ends])
             missing += int((infos["_randomization"] != ends).sum())
             rejected += int(infos["randomization"]["rejected"][ends].sum())
@@ -116,19 +127,26 @@ def soak(task: str, num_envs: int, steps: int) -> int:
             rate = 2 * step * num_envs / (time.perf_counter() - start)
             growth = (resident() - base) / 2**20
             console().print(
-                f"{step * num_envs:>10,} steps on 1 and on 2 threads, {rate:,.0f} steps/s; {ended:,} episodes "
-                f"({truncations:,} to the limit); memory {growth:+.1f} MiB since the first tenth"
+                f"{step * num_envs:>10,} steps on 1 and on 2 threads, {rate:,.0f} steps/s;"
+                f" {ended:,} episodes ({truncations:,} to the limit); memory {growth:+.1f} MiB"
+                " since the first tenth"
             )
     missing += abs(finished_steps + int(lengths.sum()) - steps * num_envs)
-    same_end = all(np.array_equal(envs[0].snapshot()[name], value) for name, value in envs[1].snapshot().items())
+    same_end = all(
+        np.array_equal(envs[0].snapshot()[name], value)
+        for name, value in envs[1].snapshot().items()
+    )
     growth = resident() - base
     verdicts = {
-        f"memory grew by {growth / 2**20:.1f} MiB, must be <= {GROWTH / 2**20:.0f}": growth <= GROWTH,
+        f"memory grew by {growth / 2**20:.1f} MiB, must be <= {GROWTH / 2**20:.0f}": (
+            growth <= GROWTH
+        ),
         f"steps that differ between 1 and 2 threads: {differing}": differing == 0,
         "physics, generators and counters are equal at the end": same_end,
         f"episodes or steps unaccounted for: {missing}": missing == 0,
-        f"unstable actuators let through: {let_through} ({draws:,} drawn, {rejected:,} more rejected)": let_through == 0
-        and rejected > 0,
+        f"unstable actuators let through: {let_through} ({draws:,} drawn, {rejected:,} more rejected)": (
+            let_through == 0 and rejected > 0
+        ),
     }
     for verdict, fine in verdicts.items():
         console().print(f"{'ok  ' if fine else 'FAIL'} {verdict}")
@@ -137,11 +155,16 @@ def soak(task: str, num_envs: int, steps: int) -> int:
 
 def main() -> int:
     """Run the soak."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--task", choices=[task.name for task in OURS], default="cartpole")
     parser.add_argument("--num-envs", type=int, default=1024)
     parser.add_argument(
-        "--steps", type=int, default=1_000_000, help="environment steps in all, on each of 1 and 2 threads"
+        "--steps",
+        type=int,
+        default=1_000_000,
+        help="environment steps in all, on each of 1 and 2 threads",
     )
     options = parser.parse_args()
     for name in ("num_envs", "steps"):

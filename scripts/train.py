@@ -16,10 +16,14 @@ def report(progress: Progress) -> None:
 
 def main() -> None:
     """Train, or go on with a training that was stopped."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("task", help="such as cartpole; or module:NAME of your own")
     parser.add_argument("agent", help="such as ppo; or module:Class of your own")
-    parser.add_argument("actuator", help="such as paper, weak or lag; a YAML file; or module:NAME of your own")
+    parser.add_argument(
+        "actuator", help="such as paper, weak or lag; a YAML file; or module:NAME of your own"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--total-steps", type=int, default=200_000)
     parser.add_argument("--out", type=Path, required=True, help="run folder")

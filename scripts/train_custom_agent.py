@@ -1,7 +1,8 @@
 """Your own agent on our environments: proximal policy optimisation in plain torch, all of it in this file.
 
-Of ours it needs the registered environments, which `gym.make_vec` steps together, and nothing of any agent library.
-Copy it and change what you like. `docs/other_agents.md` says how the weights are used.
+Of ours it needs the registered environments, which `gym.make_vec` steps together, and nothing of
+any agent library. Copy it and change what you like. `docs/other_agents.md` says how the weights are
+used.
 
 Example: python scripts/train_custom_agent.py --task pendulum --actuator paper --total-steps 400000
 """
@@ -26,8 +27,24 @@ from torch.distributions import Categorical, Distribution, Independent, Normal
 from codrl_mj.runs.files import writing
 from codrl_mj.tasks import TASKS
 
-COUNTS = ("num_envs", "total_steps", "rollout", "epochs", "minibatches", "hidden", "eval_episodes")  # 1 or more
-AMOUNTS = ("seed", "learning_rate", "clip", "entropy", "target_kl", "gamma", "gae_lambda")  # 0 or more
+COUNTS = (
+    "num_envs",
+    "total_steps",
+    "rollout",
+    "epochs",
+    "minibatches",
+    "hidden",
+    "eval_episodes",
+)  # 1 or more
+AMOUNTS = (
+    "seed",
+    "learning_rate",
+    "clip",
+    "entropy",
+    "target_kl",
+    "gamma",
+    "gae_lambda",
+)  # 0 or more
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,9 +91,15 @@ class Options:
         for name in COUNTS + AMOUNTS:
             least, most = int(name in COUNTS), 1 if name in ("gamma", "gae_lambda") else math.inf
             if not least <= getattr(self, name) <= most:
-                raise ValueError(f"--{name.replace('_', '-')} {getattr(self, name)}: must be from {least} to {most}")
+                raise ValueError(
+                    f"--{name.replace('_', '-')} {getattr(self, name)}: must be from {least} to"
+                    f" {most}"
+                )
         if (size := self.num_envs * self.rollout) < 2 * self.minibatches:
-            raise ValueError(f"--minibatches {self.minibatches}: must be <= {size // 2}, half the steps of a rollout")
+            raise ValueError(
+                f"--minibatches {self.minibatches}: must be <= {size // 2}, half the steps of a"
+                " rollout"
+            )
 
 
 class Moments(nn.Module):
@@ -123,9 +146,15 @@ class Agent(nn.Module):
     def __init__(self, observations: gym.Space[Any], actions: Any, hidden: int) -> None:  # noqa: D107
         super().__init__()
         self.discrete = isinstance(actions, gym.spaces.Discrete)
-        inputs, outputs = math.prod(observations.shape or ()), int(actions.n) if self.discrete else actions.shape[0]
+        inputs, outputs = (
+            math.prod(observations.shape or ()),
+            int(actions.n) if self.discrete else actions.shape[0],
+        )
         self.seen = Moments(inputs)
-        self.actor, self.critic = network(inputs, hidden, outputs, 0.01), network(inputs, hidden, 1, 1.0)
+        self.actor, self.critic = (
+            network(inputs, hidden, outputs, 0.01),
+            network(inputs, hidden, 1, 1.0),
+        )
         if not self.discrete:
             self.log_std = nn.Parameter(torch.full((outputs,), -0.5))
             self.register_buffer("middle", torch.as_tensor(actions.high + actions.low) / 2)
@@ -136,7 +165,9 @@ class Agent(nn.Module):
         outputs = self.actor(self.seen(observations))
         if self.discrete:
             return Categorical(logits=outputs, validate_args=False)
-        return Independent(Normal(outputs, self.log_std.exp(), validate_args=False), 1, validate_args=False)
+        return Independent(
+            Normal(outputs, self.log_std.exp(), validate_args=False), 1, validate_args=False
+        )
 
     def value(self, observations: Tensor) -> Tensor:
         """The discounted return to expect, in units of `Trainer.returns`'s scale (...,)."""
@@ -147,17 +178,26 @@ class Agent(nn.Module):
         """Actions for observations (n, k): as the policy has them, and as the environments take them."""
         policy = self.policy(torch.as_tensor(observations))
         actions = policy.mode if greedy else policy.sample()
-        return actions, (actions if self.discrete else self.middle + self.reach * actions.clamp(-1, 1)).numpy()
+        return (
+            actions,
+            (actions if self.discrete else self.middle + self.reach * actions.clamp(-1, 1)).numpy(),
+        )
 
 
 def advantages(
-    rewards: Tensor, values: Tensor, next_values: Tensor, terminated: Tensor, ended: Tensor, gamma: float, lam: float
+    rewards: Tensor,
+    values: Tensor,
+    next_values: Tensor,
+    terminated: Tensor,
+    ended: Tensor,
+    gamma: float,
+    lam: float,
 ) -> Tensor:
     """Generalised advantage estimation (Schulman et al., arXiv 1506.02438); everything is of shape (T, N).
 
-    `values` are of the observation before each step, `next_values` of the one that it led to, which is the last of the
-    episode where that `ended`. Nothing comes after an episode that the task `terminated`; what would have come after
-    one that the time limit cut off counts.
+    `values` are of the observation before each step, `next_values` of the one that it led to, which
+    is the last of the episode where that `ended`. Nothing comes after an episode that the task
+    `terminated`; what would have come after one that the time limit cut off counts.
     """
     errors = rewards + gamma * next_values * ~terminated - values
     result, later = torch.zeros_like(rewards), torch.zeros_like(rewards[0])
@@ -168,7 +208,11 @@ def advantages(
 
 def make_envs(options: Options, num_envs: int) -> VectorEnv[Any, Any, Any]:
     """The environments, on one thread; one whose episode ends starts another in the same step."""
-    arguments: Any = {"actuator": options.actuator, "num_threads": 1, "autoreset_mode": AutoresetMode.SAME_STEP}
+    arguments: Any = {
+        "actuator": options.actuator,
+        "num_threads": 1,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
     env_id = TASKS[options.task].env_id
     return gym.make_vec(env_id, num_envs, vectorization_mode="vector_entry_point", **arguments)
 
@@ -197,18 +241,30 @@ def train(options: Options, on_rollout: Callable[[int, float], None] | None = No
             following, rewards, terminated, truncated, infos = envs.step(commands)
             ended, led_to = terminated | truncated, following.copy()
             if ended.any():
-                led_to[ended] = np.stack(infos["final_obs"][ended])  # `following` holds the next episode's first there
+                led_to[ended] = np.stack(
+                    infos["final_obs"][ended]
+                )  # `following` holds the next episode's first there
             discounted, undiscounted = rewards + options.gamma * discounted, rewards + undiscounted
             steps.append((observations, actions, rewards, led_to, terminated, ended, discounted))
             finished += undiscounted[ended].tolist()
-            discounted, undiscounted, observations = discounted * ~ended, undiscounted * ~ended, following
+            discounted, undiscounted, observations = (
+                discounted * ~ended,
+                undiscounted * ~ended,
+                following,
+            )
         columns = (torch.as_tensor(np.stack(column)) for column in zip(*steps, strict=True))
         seen, acted, earned, ahead, terminations, ends, sums = columns
         returns.update(sums.float().reshape(-1, 1))
         with torch.no_grad():
-            before, values, next_values = agent.policy(seen).log_prob(acted), agent.value(seen), agent.value(ahead)
+            before, values, next_values = (
+                agent.policy(seen).log_prob(acted),
+                agent.value(seen),
+                agent.value(ahead),
+            )
         earned = earned.float() / returns.scale()
-        gains = advantages(earned, values, next_values, terminations, ends, options.gamma, options.gae_lambda)
+        gains = advantages(
+            earned, values, next_values, terminations, ends, options.gamma, options.gae_lambda
+        )
         optimizer.param_groups[0]["lr"] = options.learning_rate * (1 - rollout / rollouts)
         batch = [tensor.flatten(0, 1) for tensor in (seen, acted, before, gains, gains + values)]
         improve(agent, optimizer, batch, options)
@@ -219,10 +275,13 @@ def train(options: Options, on_rollout: Callable[[int, float], None] | None = No
     return agent
 
 
-def improve(agent: Agent, optimizer: torch.optim.Optimizer, batch: list[Tensor], options: Options) -> None:
+def improve(
+    agent: Agent, optimizer: torch.optim.Optimizer, batch: list[Tensor], options: Options
+) -> None:
     """Climb PPO's clipped objective (Schulman et al., arXiv 1707.06347).
 
-    `batch` is n observations, actions, their log-probabilities when they were chosen, advantages, and returns.
+    `batch` is n observations, actions, their log-probabilities when they were chosen, advantages,
+    and returns.
     """
     for _ in range(options.epochs):
         moved = []
@@ -232,13 +291,17 @@ def improve(agent: Agent, optimizer: torch.optim.Optimizer, batch: list[Tensor],
             policy = agent.policy(seen)
             change = policy.log_prob(acted) - before
             ratio = change.exp()
-            objective = torch.minimum(ratio * gains, ratio.clamp(1 - options.clip, 1 + options.clip) * gains).mean()
+            objective = torch.minimum(
+                ratio * gains, ratio.clamp(1 - options.clip, 1 + options.clip) * gains
+            ).mean()
             error = (agent.value(seen) - targets).square().mean()
             optimizer.zero_grad()
             (error / 2 - objective - options.entropy * policy.entropy().mean()).backward()
             nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
             optimizer.step()
-            moved.append((ratio - 1 - change).mean().item())  # an estimate of the divergence that is never negative
+            moved.append(
+                (ratio - 1 - change).mean().item()
+            )  # an estimate of the divergence that is never negative
         if np.mean(moved) > options.target_kl:
             return
 
@@ -272,7 +335,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     returns = evaluate(agent, options)
-    print(f"greedy return: {returns.mean():.1f} (worst {returns.min():.1f}) over {len(returns)} episodes")
+    print(
+        f"greedy return: {returns.mean():.1f} (worst {returns.min():.1f}) over {len(returns)}"
+        " episodes"
+    )
     print(f"weights: {options.out}")
     return 0
 

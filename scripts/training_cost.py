@@ -3,8 +3,8 @@
     python scripts/training_cost.py cartpole pendulum --seeds 5
     python scripts/training_cost.py acrobot --actuator ideal --changes '{"num_envs": 8}'
 
-Compilation, which a process does once, is left out: a short training comes first. Processor time is that of all
-threads.
+Compilation, which a process does once, is left out: a short training comes first. Processor time is
+that of all threads.
 """
 
 import argparse
@@ -63,26 +63,34 @@ def run(config: TrainConfig, enough: float) -> tuple[Clock, dict[str, Any]]:
 
 def main() -> None:
     """Print a line for each training."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("tasks", nargs="+", choices=list(ENOUGH), metavar="TASK")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--agent", default="ppo")
     parser.add_argument("--actuator", default="default")
     parser.add_argument(
-        "--changes", type=json.loads, default={}, help="JSON of a configuration's keys to set otherwise"
+        "--changes",
+        type=json.loads,
+        default={},
+        help="JSON of a configuration's keys to set otherwise",
     )
     options = parser.parse_args()
     for task in options.tasks:
         changes = dict(options.changes)
         agent = {"name": options.agent, **changes.pop("agent", {})}
-        config = TrainConfig.from_mapping({"task": task, "actuator": options.actuator, "agent": agent, **changes})
+        config = TrainConfig.from_mapping(
+            {"task": task, "actuator": options.actuator, "agent": agent, **changes}
+        )
         run(dataclasses.replace(config, total_steps=1, total_episodes=None), 0.0)
         for seed in range(options.seeds):
             clock, result = run(dataclasses.replace(config, seed=seed), ENOUGH[task])
             print(
-                f"{task} {options.agent} {options.actuator} seed {seed}: learnt after {clock.learnt}; in all "
-                f"{result['steps']} steps {clock.seconds:5.1f} s, {result['steps'] / clock.seconds:5.0f} steps/s; "
-                f"evaluations {' '.join(clock.curve)}",
+                f"{task} {options.agent} {options.actuator} seed {seed}: learnt after"
+                f" {clock.learnt}; in all {result['steps']} steps {clock.seconds:5.1f} s,"
+                f" {result['steps'] / clock.seconds:5.0f} steps/s; evaluations"
+                f" {' '.join(clock.curve)}",
                 flush=True,
             )
 

@@ -1,7 +1,8 @@
 """How strict is 'upright and still'? Pendulum's success under other tolerances, of policies that the study trained.
 
-In the episodes that the study tests by. Writes docs/upright_tolerances.csv, and prints it as the table of
-docs/evaluation.md. The study's run folders have to be there: python scripts/study_actuators.py
+In the episodes that the study tests by. Writes docs/upright_tolerances.csv, and prints it as the
+table of docs/evaluation.md. The study's run folders have to be there: python
+scripts/study_actuators.py
 """
 
 import argparse
@@ -21,8 +22,20 @@ from codrl_mj.training import finished
 TOLERANCES = ((0.05, 0.05), (0.1, 0.1), (0.2, 0.1), (0.1, 0.2), (0.2, 0.5), (0.5, 1.0))
 """Angle [rad] and speed [rad/s]."""
 TRIALS = (
-    *("ideal on ideal", "ideal on paper", "paper on paper", "ideal on designed", "ideal on noise 0.8"),
-    *("noise on noise 0.8", "ideal on friction 0.1", "friction on friction 0.1", "ideal on lag 2", "lag on lag 2"),
+    *(
+        "ideal on ideal",
+        "ideal on paper",
+        "paper on paper",
+        "ideal on designed",
+        "ideal on noise 0.8",
+    ),
+    *(
+        "noise on noise 0.8",
+        "ideal on friction 0.1",
+        "friction on friction 0.1",
+        "ideal on lag 2",
+        "lag on lag 2",
+    ),
     *("weakness on weakness 0.25", "marginal motor on marginal motor", "weaker on weaker"),
 )
 """Trained on, and tested on."""
@@ -42,7 +55,9 @@ def row(name: str, study: ActuatorStudy) -> dict[str, object]:
             worst.append(np.array([np.abs(upright_angle(end.T)).max(), np.abs(end[:, 1]).max()]))
     reached = np.array(worst).reshape(-1, 2)
     shares = {
-        f"{angle:g} rad, {speed:g} rad/s": round(float(np.mean((reached < (angle, speed)).all(axis=1))), 3)
+        f"{angle:g} rad, {speed:g} rad/s": round(
+            float(np.mean((reached < (angle, speed)).all(axis=1))), 3
+        )
         for angle, speed in TOLERANCES
     }
     return {"policies": name, "seeds": len(policies), **shares}
@@ -50,14 +65,26 @@ def row(name: str, study: ActuatorStudy) -> dict[str, object]:
 
 def main() -> int:
     """Write the file and print it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--root", type=Path, default=Path("runs/actuators"), help="folder of the study's run folders")
-    parser.add_argument("--out", type=Path, default=Path("docs/upright_tolerances.csv"), help="file of the table")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--root",
+        type=Path,
+        default=Path("runs/actuators"),
+        help="folder of the study's run folders",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("docs/upright_tolerances.csv"), help="file of the table"
+    )
     options = parser.parse_args()
     study = ActuatorStudy(root=options.root, tasks=("pendulum",))
     rows = [found for name in TRIALS if (found := row(name, study))["seeds"]]
     if not rows:
-        print(f"no finished training in {options.root}: run python scripts/study_actuators.py first", file=sys.stderr)
+        print(
+            f"no finished training in {options.root}: run python scripts/study_actuators.py first",
+            file=sys.stderr,
+        )
         return 1
     write_csv(options.out, rows)
     lines = [list(rows[0]), ["---"] * len(rows[0]), *(found.values() for found in rows)]

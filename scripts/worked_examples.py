@@ -1,9 +1,9 @@
 """Environments of others through motors that `choose` finds, and through smaller ones: what is lost, what comes back.
 
-An agent learns each environment on ideal actuators; the motors are chosen for what the first seed's policy asks of
-them; the others are the strongest of the catalogue that lack something. Agents then learn through both, and every
-policy is tested on all three. Trainings that were interrupted go on. Writes docs/worked_examples.csv and prints its
-means; `--steps 0.01` tries it.
+An agent learns each environment on ideal actuators; the motors are chosen for what the first seed's
+policy asks of them; the others are the strongest of the catalogue that lack something. Agents then
+learn through both, and every policy is tested on all three. Trainings that were interrupted go on.
+Writes docs/worked_examples.csv and prints its means; `--steps 0.01` tries it.
 """
 
 import argparse
@@ -26,7 +26,12 @@ from codrl_mj.runs.files import writing  # noqa: E402
 from codrl_mj.runs.policies import load_policy  # noqa: E402
 from codrl_mj.training import TrainConfig, train  # noqa: E402
 
-SAC: dict[str, Any] = {"hidden": [64, 64], "batch_size": 128, "learning_starts": 2000, "learning_rate": 1e-3}
+SAC: dict[str, Any] = {
+    "hidden": [64, 64],
+    "batch_size": 128,
+    "learning_starts": 2000,
+    "learning_rate": 1e-3,
+}
 EXAMPLES: dict[str, tuple[str, int]] = {
     # name -> id, environment steps of a training
     "double pendulum": ("InvertedDoublePendulum-v5", 15_000),
@@ -35,24 +40,48 @@ EXAMPLES: dict[str, tuple[str, int]] = {
 }
 THROUGH = ("ideal", "chosen", "smaller")
 EPISODES, TEST_SEED = 20, 2_000_000
-COLUMNS = ("environment", "trained through", "seed", "tested on", "return", "saturated %", "heat J", "success")
+COLUMNS = (
+    "environment",
+    "trained through",
+    "seed",
+    "tested on",
+    "return",
+    "saturated %",
+    "heat J",
+    "success",
+)
 
 
 def main() -> None:
     """Train, choose, train, test, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "worked_examples", help="folder for the runs")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder for worked_examples.csv")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--runs", type=Path, default=ROOT / "runs" / "worked_examples", help="folder for the runs"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "docs", help="folder for worked_examples.csv"
+    )
     parser.add_argument("--seeds", type=int, default=3, help="trainings of each kind")
     parser.add_argument("--steps", type=float, default=1.0, help="share of the environment steps")
-    parser.add_argument("--only", nargs="*", choices=EXAMPLES, default=list(EXAMPLES), help="environments")
+    parser.add_argument(
+        "--only", nargs="*", choices=EXAMPLES, default=list(EXAMPLES), help="environments"
+    )
     options = parser.parse_args()
     for name in options.only:
         _example(name, options)
-    rows = [row for path in sorted(options.runs.glob("*/tests.json")) for row in json.loads(path.read_text())]
+    rows = [
+        row
+        for path in sorted(options.runs.glob("*/tests.json"))
+        for row in json.loads(path.read_text())
+    ]
     order = list(EXAMPLES)
     rows.sort(key=lambda row: order.index(row["environment"]))
-    with writing(options.out / "worked_examples.csv") as temporary, temporary.open("w", newline="") as file:
+    with (
+        writing(options.out / "worked_examples.csv") as temporary,
+        temporary.open("w", newline="") as file,
+    ):
         table = csv.DictWriter(file, COLUMNS)
         table.writeheader()
         table.writerows(rows)
@@ -85,17 +114,30 @@ def _example(name: str, options: Any) -> None:
     runs = {("ideal", seed): run("ideal", seed, ideal) for seed in range(options.seeds)}
     motors = {"ideal": ideal, **_motors(folder, runs["ideal", 0])}
     for through in THROUGH[1:]:
-        runs |= {(through, seed): run(through, seed, motors[through]) for seed in range(options.seeds)}
+        runs |= {
+            (through, seed): run(through, seed, motors[through]) for seed in range(options.seeds)
+        }
     rows = []
     for (through, seed), path in runs.items():
-        config = TrainConfig.from_mapping(json.loads((path / "config.json").read_text())["train"], whole=True)
+        config = TrainConfig.from_mapping(
+            json.loads((path / "config.json").read_text())["train"], whole=True
+        )
         for tested in THROUGH:
             env = dataclasses.replace(config.env, actuator=motors[tested])
             found = evaluate(load_policy(path), env, EPISODES, TEST_SEED)
             success = "" if found.success is None else found.success.mean
             heat = "" if found.copper_loss is None else round(found.copper_loss.mean, 2)
             saturated = "" if found.saturated_percent is None else round(found.saturated_percent, 2)
-            values = name, through, seed, tested, round(found.returns.mean, 3), saturated, heat, success
+            values = (
+                name,
+                through,
+                seed,
+                tested,
+                round(found.returns.mean, 3),
+                saturated,
+                heat,
+                success,
+            )
             rows.append(dict(zip(COLUMNS, values, strict=True)))
             print(*values, flush=True)
     with writing(folder / "tests.json") as temporary:
@@ -112,7 +154,10 @@ def _motors(folder: Path, ideal: Path) -> dict[str, Any]:
             for name, choice in (("chosen", ranked[0]), ("smaller", _smaller(ranked))):
                 found[name][motor] = choice, demand
                 verdict = choice.lacks or "does it"
-                print(f"{motor} {name}: {choice.name}, gear {choice.ratio:.4g}, {choice.power:.0f} W: {verdict}")
+                print(
+                    f"{motor} {name}: {choice.name}, gear {choice.ratio:.4g}, {choice.power:.0f} W:"
+                    f" {verdict}"
+                )
         for name, path in files.items():
             with writing(path) as temporary:
                 temporary.write_text(yaml.safe_dump(actuators_of(found[name]), sort_keys=False))
@@ -121,7 +166,9 @@ def _motors(folder: Path, ideal: Path) -> dict[str, Any]:
 
 def _smaller(ranked: list[Candidate]) -> Candidate:
     """The strongest motor of less power than the first that lacks a third of the voltage or the current for it."""
-    weaker = [one for one in ranked[1:] if one.power < ranked[0].power and one.feasibility.margin < -1 / 3]
+    weaker = [
+        one for one in ranked[1:] if one.power < ranked[0].power and one.feasibility.margin < -1 / 3
+    ]
     return max(weaker, key=lambda one: one.power) if weaker else ranked[-1]
 
 
@@ -136,9 +183,17 @@ def _table(rows: list[dict[str, Any]]) -> str:
             cells = []
             for tested in THROUGH:
                 own = (name, through, tested)
-                each = [row for row in rows if (row["environment"], row["trained through"], row["tested on"]) == own]
+                each = [
+                    row
+                    for row in rows
+                    if (row["environment"], row["trained through"], row["tested on"]) == own
+                ]
                 returns = [float(row["return"]) for row in each]
-                cells.append(f"{np.mean(returns):.1f} [{min(returns):.1f}, {max(returns):.1f}]" if returns else "–")
+                cells.append(
+                    f"{np.mean(returns):.1f} [{min(returns):.1f}, {max(returns):.1f}]"
+                    if returns
+                    else "–"
+                )
             lines.append(f"| {name} | {through} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -14,7 +14,9 @@ from codrl_mj.tasks import TASKS
 
 OURS = frozenset(TASKS)
 
-hypothesis.settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=100, database=None)
+hypothesis.settings.register_profile(
+    "deterministic", derandomize=True, deadline=None, max_examples=100, database=None
+)
 hypothesis.settings.load_profile("deterministic")
 
 

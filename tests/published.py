@@ -11,6 +11,7 @@ def folder_of(name):
     data = os.environ.get("CODRL_MJ_DATA")
     if not data or not Path(data, "bench_logs", name).is_dir():
         pytest.skip(
-            f"NOT RUN: no bench_logs/{name} in CODRL_MJ_DATA = {data!r}: codrl-mj data {name}, CODRL_MJ_DATA=data"
+            f"NOT RUN: no bench_logs/{name} in CODRL_MJ_DATA = {data!r}: codrl-mj data {name},"
+            " CODRL_MJ_DATA=data"
         )
     return Path(data, "bench_logs", name)

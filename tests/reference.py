@@ -7,13 +7,26 @@ import math
 
 
 def paper_loop(
-    *, r, inductance, kt, ke, kp, ki, kd, kff=0.0, u_max=math.inf, compensate=True, leak=0.0, td=0.0, arm=1.0
+    *,
+    r,
+    inductance,
+    kt,
+    ke,
+    kp,
+    ki,
+    kd,
+    kff=0.0,
+    u_max=math.inf,
+    compensate=True,
+    leak=0.0,
+    td=0.0,
+    arm=1.0,
 ):
     """Algorithm 1 (DCMotorENVStep) as a function (dt, i, I, e_old, force, velocity) -> (i, I, e, u, force delivered).
 
-    `leak` and `td` are the appendix's low-pass integral and high-pass derivative, by backward Euler:
-    (I - I_old)/dt = e - leak*I and (D - D_old)/dt*td + D = (e - e_old)/dt. With `td` the third state is the low-passed
-    error, y = e - td*D, for which D = (e - y_old)/(dt + td).
+    `leak` and `td` are the appendix's low-pass integral and high-pass derivative, by backward
+    Euler: (I - I_old)/dt = e - leak*I and (D - D_old)/dt*td + D = (e - e_old)/dt. With `td` the
+    third state is the low-passed error, y = e - td*D, for which D = (e - y_old)/(dt + td).
     """
 
     def step(dt, i, integral, e_old, force, velocity):
@@ -76,7 +89,9 @@ class MotorSimulation:
     def step(self, dt, force, velocity):
         """Advance by `dt`; returns the force delivered."""
         for _ in range(self._substeps):
-            *state, self.voltage, delivered = self._step(dt / self._substeps, *self.state, force, velocity)
+            *state, self.voltage, delivered = self._step(
+                dt / self._substeps, *self.state, force, velocity
+            )
             self.state = tuple(state)
         return delivered
 
@@ -112,4 +127,7 @@ def cartpole_rk4(state, force, dt):
     k2 = derivative(moved(k1, dt / 2))
     k3 = derivative(moved(k2, dt / 2))
     k4 = derivative(moved(k3, dt))
-    return [s + dt / 6 * (a + 2 * b + 2 * c + d) for s, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)]
+    return [
+        s + dt / 6 * (a + 2 * b + 2 * c + d)
+        for s, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)
+    ]

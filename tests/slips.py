@@ -25,7 +25,10 @@ FUNCTIONS = {
     "initial_state": ("draws", STATE.replace("state", "draws")),
     "observation": ("state", "state[0], np.sin(state[1]), state[2]"),
     "constrain": ("state, timestep", STATE),
-    "reward": ("state, force, next_state, options", "1.0 - next_state[0] * next_state[0] - 0.1 * force * force"),
+    "reward": (
+        "state, force, next_state, options",
+        "1.0 - next_state[0] * next_state[0] - 0.1 * force * force",
+    ),
     "terminated": ("state", "np.abs(state[0]) > 1.0"),
     "goal": ("state", "np.abs(state[1]) < 0.1"),
 }
@@ -40,7 +43,13 @@ def plain(state: Any) -> Any:
 def function(name: str, arguments: str, body: str) -> Any:
     """A function of these arguments; its body is an expression to be returned, or statements."""
     lines = body if "return" in body or "raise" in body else f"return {body}"
-    namespace: dict[str, Any] = {"np": np, "plain": plain, "tests": tests, "State": State, "Signals": Signals}
+    namespace: dict[str, Any] = {
+        "np": np,
+        "plain": plain,
+        "tests": tests,
+        "State": State,
+        "Signals": Signals,
+    }
     exec(compile(f"def {name}({arguments}):\n    {lines}", "slip.py", "exec"), namespace)
     return namespace[name]
 
@@ -68,7 +77,16 @@ def task(**changes: Any) -> Any:
     return codrl_mj.Task(**fields)
 
 
-NUMBERS = ("()", "(1.0, 2.0, 3.0, 4.0, 5.0)", "[1.0] * 3", "np.zeros(3)", "1.0", "None", "'abc'", "((1.0,), 2.0, 3.0)")
+NUMBERS = (
+    "()",
+    "(1.0, 2.0, 3.0, 4.0, 5.0)",
+    "[1.0] * 3",
+    "np.zeros(3)",
+    "1.0",
+    "None",
+    "'abc'",
+    "((1.0,), 2.0, 3.0)",
+)
 NOT_ONE = (
     *("(1.0,)", "None", "'a'", "1j", "np.zeros(1)", "np.nan", "[1.0]", "unknown", "state[7]"),
     "raise KeyError('gone')",
@@ -89,22 +107,46 @@ class Worded(NamedTuple):
 
 def pairs(table: dict[str, tuple]) -> list[tuple[str, Any]]:
     """Every field of a row's with each of its values."""
-    return [(field, value) for fields, values in table.items() for field in fields.split() for value in values]
+    return [
+        (field, value)
+        for fields, values in table.items()
+        for field in fields.split()
+        for value in values
+    ]
 
 
 TASKS = pairs(
     {
-        "initial_state observation constrain": (*NUMBERS, "(1.0, 'a', 1.0, 1.0)", "np.nan, 1.0, 1.0"),
+        "initial_state observation constrain": (
+            *NUMBERS,
+            "(1.0, 'a', 1.0, 1.0)",
+            "np.nan, 1.0, 1.0",
+        ),
         "reward terminated": NOT_ONE,
         "goal": (*NOT_ONE, "1.0 if state[0] > 0.0 else 0.0"),
-        "initial_state": ("return (1.0, draws[1], 0.0, 0.0) if draws[0] > 0.0 else (0.0, draws[1], 0.0, 0.0)",),
+        "initial_state": (
+            "return (1.0, draws[1], 0.0, 0.0) if draws[0] > 0.0 else (0.0, draws[1], 0.0, 0.0)",
+        ),
         "initial_bounds": (
-            *("np.zeros(4)", "np.zeros(3), np.zeros(4)", "np.ones(4), np.zeros(4)", "np.zeros(4), np.full(4, np.inf)"),
+            *(
+                "np.zeros(4)",
+                "np.zeros(3), np.zeros(4)",
+                "np.ones(4), np.zeros(4)",
+                "np.zeros(4), np.full(4, np.inf)",
+            ),
             "0.0, 1.0",
         ),
         " ".join(FUNCTIONS): (3, "raise ValueError('mine')", lambda: 0.0),
         "observation reward terminated": (None,),
-        "state_names observation_names motors": ((), ("a",) * 4, "abcd", ["a", "b", "c", "d"], (1, 2, 3, 4), None, 3),
+        "state_names observation_names motors": (
+            (),
+            ("a",) * 4,
+            "abcd",
+            ["a", "b", "c", "d"],
+            (1, 2, 3, 4),
+            None,
+            3,
+        ),
         "state_names": (("a", "b", "c"), ("a", "b", "c", "d", "e")),
         "observation_names": (("a",), ("a", "b"), ("a", "b", "c", "d")),
         "integrators": (("rk5",), (), "rk4", ("rk4", "rk4"), None),
@@ -112,7 +154,16 @@ TASKS = pairs(
         "motor_inner_steps ideal_inner_steps": (0, -1, 2.0, "2", None, True),
         "max_episode_steps": (0, -1, 2.0, "2", True),
         "max_force": (0.0, -1.0, np.nan, np.inf, "2", None, (1.0, 1.0), ()),
-        "forces": ((), (1.0, np.nan), ("a",), 3.0, "ab", ((1.0, 2.0), (3.0, 4.0)), (1.0, (2.0,)), (-2.1, 2.0)),
+        "forces": (
+            (),
+            (1.0, np.nan),
+            ("a",),
+            3.0,
+            "ab",
+            ((1.0, 2.0), (3.0, 4.0)),
+            (1.0, (2.0,)),
+            (-2.1, 2.0),
+        ),
         "qpos": ((1,), (0, 4), (0, 0), (1, 0), ("a", "b"), 3, (0, 1, 2)),
         "wrapped": ((4,), (-1,), ("a",), 3),
         "observation_space": (
@@ -180,7 +231,9 @@ def family(**changes: Any) -> Any:
     }
     for name, (arguments, body) in PARTS.items():
         change = changes.pop(name, body)
-        parts[name] = staticmethod(function(name, arguments, change) if isinstance(change, str) else change)
+        parts[name] = staticmethod(
+            function(name, arguments, change) if isinstance(change, str) else change
+        )
     gain = changes.pop("gain", real(1.0))
     made = type(
         "Slipped",
@@ -213,14 +266,44 @@ class Reserved(NamedTuple):
 FAMILIES = pairs(
     {
         "advance": (
-            *("state", "inputs.desired_torque", "None", "state, 1.0", "1.0, 1.0, 1.0", "state, 1.0, Signals(1.0), 1.0"),
-            *("(1.0,), 1.0, Signals(1.0)", "(1.0, 1.0, 1.0), 1.0, Signals(1.0)", "state, 1.0, ()", "state, 1.0, state"),
-            *(f"state, {torque}, Signals(1.0)" for torque in ("(1.0,)", "'a'", "1j", "None", "np.inf", "np.zeros(1)")),
+            *(
+                "state",
+                "inputs.desired_torque",
+                "None",
+                "state, 1.0",
+                "1.0, 1.0, 1.0",
+                "state, 1.0, Signals(1.0), 1.0",
+            ),
+            *(
+                "(1.0,), 1.0, Signals(1.0)",
+                "(1.0, 1.0, 1.0), 1.0, Signals(1.0)",
+                "state, 1.0, ()",
+                "state, 1.0, state",
+            ),
+            *(
+                f"state, {torque}, Signals(1.0)"
+                for torque in ("(1.0,)", "'a'", "1j", "None", "np.inf", "np.zeros(1)")
+            ),
             *(f"State({value}), 1.0, Signals(1.0)" for value in ("np.nan, 0.0", "'a', 1.0")),
             *(f"{state}, 1.0, Signals(1.0)" for state in ("[1.0, 1.0]", "np.zeros(2)")),
-            *("state, inputs.torque_wanted, Signals(1.0)", "state, unknown, Signals(1.0)", "raise KeyError('gone')", 3),
+            *(
+                "state, inputs.torque_wanted, Signals(1.0)",
+                "state, unknown, Signals(1.0)",
+                "raise KeyError('gone')",
+                3,
+            ),
         ),
-        "observe": ("()", "(1.0,)", "(1.0, 2.0, 3.0)", "1.0", "[1.0, 2.0]", "('a', 1.0)", "None", "unknown", 3),
+        "observe": (
+            "()",
+            "(1.0,)",
+            "(1.0, 2.0, 3.0)",
+            "1.0",
+            "[1.0, 2.0]",
+            "('a', 1.0)",
+            "None",
+            "unknown",
+            3,
+        ),
         "State": (One, Three, dict, 3),
         "Signals": (State, Three, Reserved, dict, 3),
         "OBSERVED": (("heat",), ("a", "b", "c")),
@@ -231,7 +314,10 @@ FAMILIES = pairs(
 )
 LATE_FAMILIES = [
     ("advance", "x = float(np.linalg.norm(inputs.desired_torque)); return state, x, Signals(1.0)"),
-    ("advance", "return (state, 1.0, Signals(1.0)) if state.a < 10.0 else ((1.0,), 1.0, Signals(1.0))"),
+    (
+        "advance",
+        "return (state, 1.0, Signals(1.0)) if state.a < 10.0 else ((1.0,), 1.0, Signals(1.0))",
+    ),
     ("advance", "return (state, 1.0, Signals(1.0)) if state.a < 10.0 else None"),
     ("observe", "return (1.0, 2.0) if signals.heat < 10.0 else (1.0, 2.0, 3.0)"),
     ("observe", "return (1.0, float(np.linalg.norm(signals.heat)))"),
@@ -255,7 +341,9 @@ def run(face: str, made: Any, actuator: Any = "ideal", **options: Any) -> None:
         if (parts := compiled_env(env.unwrapped)) is not None:
             parts.reset(env.unwrapped.np_random, parts.low, parts.high, parts.where)
     elif face == "vector":
-        envs = gymnasium.make_vec(made.env_id, 3, vectorization_mode="vector_entry_point", actuator=actuator, **options)
+        envs = gymnasium.make_vec(
+            made.env_id, 3, vectorization_mode="vector_entry_point", actuator=actuator, **options
+        )
         envs.reset(seed=0)
         for _ in range(3):
             envs.step(envs.action_space.sample())
@@ -270,9 +358,19 @@ def main(face: str, every: int) -> None:
     sound = codrl_mj.register(task())
     for field, body in LATE[every // 2 :: every]:
         if face == "single" or field != "initial_state":
-            told(field, body, lambda field=field, body=body: run(face, codrl_mj.register(late_task(field, body))))
+            told(
+                field,
+                body,
+                lambda field=field, body=body: run(face, codrl_mj.register(late_task(field, body))),
+            )
     for part, body in LATE_FAMILIES[every // 2 :: every]:
-        told(part, body, lambda part=part, body=body: run(face, sound, family(**{part: body})(), observe_actuator=True))
+        told(
+            part,
+            body,
+            lambda part=part, body=body: run(
+                face, sound, family(**{part: body})(), observe_actuator=True
+            ),
+        )
     run(face, sound, family()(), observe_actuator=True)
     print("the sound one runs")
 

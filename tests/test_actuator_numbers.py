@@ -16,7 +16,9 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 
 
-_SPEC = importlib.util.spec_from_file_location("actuator_numbers", ROOT / "scripts" / "actuator_numbers.py")
+_SPEC = importlib.util.spec_from_file_location(
+    "actuator_numbers", ROOT / "scripts" / "actuator_numbers.py"
+)
 SCRIPT = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(SCRIPT)
 
@@ -90,7 +92,9 @@ def test_a_motor_s_row_is_that_of_the_closed_forms():
         "stall_torque": constant * (24.0 / 0.942 - free),
         "no_load_speed": (24.0 - 0.942 * free) / numbers.back_emf_constant,
         "continuous_torque": constant * (2.52 - free),
-        "mechanical_time_constant_ms": 1e3 * 0.942 * 135e-7 / (constant * numbers.back_emf_constant),
+        "mechanical_time_constant_ms": (
+            1e3 * 0.942 * 135e-7 / (constant * numbers.back_emf_constant)
+        ),
     }
     assert {name: float(row[name]) for name in expected} == pytest.approx(expected, rel=1e-3)
 
@@ -116,10 +120,14 @@ def test_every_motor_of_the_catalogue_does_in_the_engine_what_its_datasheet_prin
     follows = {
         "stall_torque": ratio * (passed * volts / ohms - coulomb),
         "no_load_speed": (passed * volts / ohms - coulomb) / damping / ratio,
-        "mechanical_time_constant": math.nan if numbers.rotor_inertia is None else numbers.rotor_inertia / damping,
+        "mechanical_time_constant": (
+            math.nan if numbers.rotor_inertia is None else numbers.rotor_inertia / damping
+        ),
     }
     assert measured == pytest.approx(follows, rel=2e-3, nan_ok=True)
     for field in measured.keys() & printed.keys():
         at_motor = printed[field].shaft == "motor" and field != "mechanical_time_constant"
-        seen = printed[field].value * (ratio if field == "stall_torque" else 1.0 / ratio) ** at_motor
+        seen = (
+            printed[field].value * (ratio if field == "stall_torque" else 1.0 / ratio) ** at_motor
+        )
         assert measured[field] == pytest.approx(seen, rel=0.05), field

@@ -42,7 +42,10 @@ COMMANDS = [
     "motor show maxon-ec45-flat-50w",
     "motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20",
     "identify simulate maxon-ec45-flat-50w --duration 1 --out log.csv",
-    "identify check log.csv --columns time=time:s,voltage=voltage:V,current=current:A,position=position:rad",
+    (
+        "identify check log.csv --columns"
+        " time=time:s,voltage=voltage:V,current=current:A,position=position:rad"
+    ),
 ]
 """Verbs that neither train nor draw."""
 
@@ -70,7 +73,9 @@ def python(tmp_path_factory):
     """Run Python in a virtual environment that has this package and the core dependencies, and nothing else."""
     folder = tmp_path_factory.mktemp("core")
     venv.create(folder, symlinks=True)
-    library = Path(sysconfig.get_path("purelib", "venv", {"base": str(folder), "platbase": str(folder)}))
+    library = Path(
+        sysconfig.get_path("purelib", "venv", {"base": str(folder), "platbase": str(folder)})
+    )
     for name in [*_core_distributions(), "codrl-mj"]:
         distribution = importlib.metadata.distribution(name)
         for entry in {file.parts[0] for file in distribution.files} - {"..", "__pycache__"}:
@@ -82,7 +87,9 @@ def python(tmp_path_factory):
 
     def run(*arguments):
         line = [folder / "bin" / "python", *arguments]
-        return subprocess.run(line, cwd=folder, env=clean, capture_output=True, text=True, timeout=300, check=False)
+        return subprocess.run(
+            line, cwd=folder, env=clean, capture_output=True, text=True, timeout=300, check=False
+        )
 
     return run
 
@@ -99,7 +106,17 @@ def test_environments_work_with_the_core_dependencies_alone(python):
 
 
 def test_the_extras_are_really_missing_there(python):
-    modules = ["torch", "stable_baselines3", "matplotlib", "jinja2", "dm_control", "viser", "control", "onnx", "pytest"]
+    modules = [
+        "torch",
+        "stable_baselines3",
+        "matplotlib",
+        "jinja2",
+        "dm_control",
+        "viser",
+        "control",
+        "onnx",
+        "pytest",
+    ]
     program = f"import importlib.util as u; print([m for m in {modules} if u.find_spec(m)])"
     assert python("-c", program).stdout.strip() == "[]"
 
@@ -108,7 +125,9 @@ def test_verbs_that_neither_train_nor_draw_work_with_the_core_dependencies_alone
     program = "import sys; from codrl_mj.cli import main; import json\n"
     program += f"print([main(line.split()) for line in {COMMANDS}])"
     done = python("-c", program)
-    assert done.stdout.splitlines()[-1:] == [str([0] * len(COMMANDS))], done.stdout[-500:] + done.stderr
+    assert done.stdout.splitlines()[-1:] == [str([0] * len(COMMANDS))], (
+        done.stdout[-500:] + done.stderr
+    )
 
 
 def test_every_verb_explains_itself_with_the_core_dependencies_alone(python):
@@ -136,7 +155,9 @@ print(silent)
     ],
 )
 def test_a_verb_that_needs_an_extra_names_it(python, line, module, extra):
-    done = python("-c", f"import sys; from codrl_mj.cli import main; sys.exit(main({line.split()}))")
+    done = python(
+        "-c", f"import sys; from codrl_mj.cli import main; sys.exit(main({line.split()}))"
+    )
     assert done.returncode == 2
     assert f"pip install 'codrl-mj[{extra}]'" in done.stderr
     assert module in done.stderr.replace("-", "_")
@@ -154,13 +175,20 @@ def test_a_verb_that_needs_an_extra_names_it(python, line, module, extra):
 )
 def test_the_message_on_a_missing_module_names_the_extras_that_declare_it(module, brought_by):
     distribution = extras.DISTRIBUTIONS.get(module.partition(".")[0], module.partition(".")[0])
-    declaring = [name for name in brought_by if any(text.startswith(distribution) for text in EXTRAS[name])]
+    declaring = [
+        name for name in brought_by if any(text.startswith(distribution) for text in EXTRAS[name])
+    ]
     assert declaring == brought_by  # pyproject.toml says the same
-    text = extras.missing_module_message(ModuleNotFoundError(f"No module named {module!r}", name=module))
+    text = extras.missing_module_message(
+        ModuleNotFoundError(f"No module named {module!r}", name=module)
+    )
     assert all(f"'{name}'" in text or f"[{name}]" in text for name in brought_by)
     assert "dev" not in re.findall(r"'(\w+)'", text)
 
 
 def test_the_message_on_an_unknown_module_keeps_its_name():
     error = ModuleNotFoundError("No module named 'nothing_such'", name="nothing_such")
-    assert extras.missing_module_message(error) == "No module named 'nothing_such': install what provides it"
+    assert (
+        extras.missing_module_message(error)
+        == "No module named 'nothing_such': install what provides it"
+    )

@@ -88,6 +88,9 @@ def test_every_kind_of_failure_is_seen(corrupt, tmp_path, monkeypatch, program, 
 
 
 def test_a_case_is_drawn_from_its_name_alone(corrupt):
-    drawn = [corrupt.change_text(corrupt.MOTOR, random.Random(f"files/{seed}")) for seed in (0, 0, *range(1, 20))]
+    drawn = [
+        corrupt.change_text(corrupt.MOTOR, random.Random(f"files/{seed}"))
+        for seed in (0, 0, *range(1, 20))
+    ]
     assert drawn[0] == drawn[1]
     assert len(set(drawn)) > 15

@@ -13,7 +13,18 @@ from safetensors.torch import load_file
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 PAGE = (Path(__file__).parent.parent / "docs" / "other_agents.md").read_text()
-TINY = ["--num-envs", "4", "--rollout", "16", "--total-steps", "128", "--minibatches", "2", "--eval-episodes", "2"]
+TINY = [
+    "--num-envs",
+    "4",
+    "--rollout",
+    "16",
+    "--total-steps",
+    "128",
+    "--minibatches",
+    "2",
+    "--eval-episodes",
+    "2",
+]
 
 
 @pytest.fixture(scope="module")
@@ -28,12 +39,15 @@ def script():
 def test_it_learns_to_balance_and_the_file_holds_what_was_evaluated(script, tmp_path, capsys):
     out = tmp_path / "new" / "agent.safetensors"
     line = (
-        "--task cartpole --actuator paper --total-steps 40000 --num-envs 16 --rollout 128 --eval-episodes 20 --seed 0"
+        "--task cartpole --actuator paper --total-steps 40000 --num-envs 16 --rollout 128"
+        " --eval-episodes 20 --seed 0"
     )
     assert script.main([*line.split(), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     mean = float(re.search(r"greedy return: ([\d.]+)", printed)[1])
-    assert mean >= 195  # what Gymnasium's first CartPole called solved; doing nothing useful gives 10 to 25
+    assert (
+        mean >= 195
+    )  # what Gymnasium's first CartPole called solved; doing nothing useful gives 10 to 25
     assert str(out) in printed.replace("\n", "")
 
     options = script.Options(task="cartpole", actuator="paper", eval_episodes=20)
@@ -65,7 +79,9 @@ def test_advantages_are_the_discounted_sum_of_errors_within_each_episode(script)
     for row, start in itertools.product(range(2), range(7)):
         last = next((step for step in range(start, 7) if ended[step, row]), 6)
         weights = (0.9 * 0.7) ** torch.arange(last + 1 - start)
-        assert gains[start, row].item() == pytest.approx(float(weights @ errors[start : last + 1, row]), abs=1e-5)
+        assert gains[start, row].item() == pytest.approx(
+            float(weights @ errors[start : last + 1, row]), abs=1e-5
+        )
 
 
 def test_at_a_time_limit_the_episodes_own_last_observation_is_valued(script, monkeypatch):
@@ -77,8 +93,12 @@ def test_at_a_time_limit_the_episodes_own_last_observation_is_valued(script, mon
         return original(rewards, values, next_values, terminated, ended, gamma, lam)
 
     monkeypatch.setattr(script, "advantages", record)
-    monkeypatch.setattr(script.Agent, "value", lambda _, observations: observations[..., 2])  # the pendulum's speed
-    script.train(script.Options("pendulum", "ideal", num_envs=4, rollout=210, total_steps=1, minibatches=2))
+    monkeypatch.setattr(
+        script.Agent, "value", lambda _, observations: observations[..., 2]
+    )  # the pendulum's speed
+    script.train(
+        script.Options("pendulum", "ideal", num_envs=4, rollout=210, total_steps=1, minibatches=2)
+    )
     values, next_values, ended = recorded["values"], recorded["next_values"], recorded["ended"]
     assert ended.sum() == 4  # the limit of 200 steps
     assert not recorded["terminated"].any()
@@ -95,11 +115,16 @@ def test_at_a_time_limit_the_episodes_own_last_observation_is_valued(script, mon
         (["--gamma", "1.5"], "--gamma 1.5: must be from 0 to 1"),
         (["--learning-rate", "nan"], "--learning-rate nan: must be from 0 to inf"),
         (["--num-envs", "0"], "--num-envs 0: must be from 1 to inf"),
-        (["--num-envs", "2", "--rollout", "3"], "--minibatches 8: must be <= 3, half the steps of a rollout"),
+        (
+            ["--num-envs", "2", "--rollout", "3"],
+            "--minibatches 8: must be <= 3, half the steps of a rollout",
+        ),
         (["--actuator", "strong"], "strong"),
     ],
 )
-def test_bad_arguments_cost_one_line_and_leave_nothing(script, arguments, message, tmp_path, capsys):
+def test_bad_arguments_cost_one_line_and_leave_nothing(
+    script, arguments, message, tmp_path, capsys
+):
     assert script.main([*arguments, "--out", str(tmp_path / "agent.safetensors")]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")

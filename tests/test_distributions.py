@@ -11,8 +11,12 @@ from hypothesis import strategies as st
 from codrl_mj.envs.distributions import Choice, LogUniform, Uniform, parse
 
 bounds = st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 2).map(sorted)
-positive = st.tuples(*[st.floats(min_value=0.0, exclude_min=True, allow_infinity=False)] * 2).map(sorted)
-values = st.lists(st.one_of(st.booleans(), st.integers(), st.floats(allow_nan=False)), min_size=1, max_size=5)
+positive = st.tuples(*[st.floats(min_value=0.0, exclude_min=True, allow_infinity=False)] * 2).map(
+    sorted
+)
+values = st.lists(
+    st.one_of(st.booleans(), st.integers(), st.floats(allow_nan=False)), min_size=1, max_size=5
+)
 
 
 def _kinds(distribution):
@@ -20,7 +24,11 @@ def _kinds(distribution):
 
 
 @given(
-    st.one_of(bounds.map(lambda pair: Uniform(*pair)), positive.map(lambda pair: LogUniform(*pair)), values.map(Choice))
+    st.one_of(
+        bounds.map(lambda pair: Uniform(*pair)),
+        positive.map(lambda pair: LogUniform(*pair)),
+        values.map(Choice),
+    )
 )
 def test_what_is_written_is_read_exactly(distribution):
     read = parse(str(distribution))
@@ -61,8 +69,14 @@ EXPECTED = "must be uniform(LOW, HIGH), loguniform(LOW, HIGH) or choice(VALUE, .
     ("text", "message"),
     [
         ("gauss(0, 1)", f"'gauss(0, 1)' is no distribution: it {EXPECTED}"),
-        ("unifrom(0, 1)", f"'unifrom(0, 1)' is no distribution: did you mean 'uniform'? it {EXPECTED}"),
-        ("Uniform(low=0.0, high=1.0)", "'Uniform(low=0.0, high=1.0)' is no distribution: did you mean 'uniform'? it "),
+        (
+            "unifrom(0, 1)",
+            f"'unifrom(0, 1)' is no distribution: did you mean 'uniform'? it {EXPECTED}",
+        ),
+        (
+            "Uniform(low=0.0, high=1.0)",
+            "'Uniform(low=0.0, high=1.0)' is no distribution: did you mean 'uniform'? it ",
+        ),
         ("", f"'' is no distribution: {EXPECTED}"),
         ("0.3", f"'0.3' is no distribution: {EXPECTED}"),
         ("uniform(0, 1", f"'uniform(0, 1' is no distribution: {EXPECTED}"),
@@ -72,7 +86,10 @@ EXPECTED = "must be uniform(LOW, HIGH), loguniform(LOW, HIGH) or choice(VALUE, .
         (None, f"None is no distribution: {EXPECTED}"),
         ("uniform(0.3)", "'uniform(0.3)' has 1 values: must be uniform(LOW, HIGH)"),
         ("uniform()", "'uniform()' has 0 values: must be uniform(LOW, HIGH)"),
-        ("loguniform(1, 2, 3)", "'loguniform(1, 2, 3)' has 3 values: must be loguniform(LOW, HIGH)"),
+        (
+            "loguniform(1, 2, 3)",
+            "'loguniform(1, 2, 3)' has 3 values: must be loguniform(LOW, HIGH)",
+        ),
         ("uniform(1,)", "'uniform(1,)': '' must be a number"),
         ("uniform(a, 2)", "'uniform(a, 2)': 'a' must be a number"),
         ("choice(1, 1+1)", "'choice(1, 1+1)': '1+1' must be a number"),

@@ -36,11 +36,17 @@ TUTORIALS = {"docs/tutorial_log_to_policy.md", "docs/tutorial_datasheet_to_board
 OF_THEIR_OWN = ("own_robot", "training", "other_agents", "randomization")
 ELSEWHERE = {"README.md", *TUTORIALS, *(f"docs/{name}.md" for name in OF_THEIR_OWN)}
 """Pages whose Python has tests of its own, which look at what comes out."""
-WITH_PYTHON = [name for name, text in PAGES.items() if "```python" in text and name not in ELSEWHERE]
-LONG = {f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "motors", "see", "studies")}
+WITH_PYTHON = [
+    name for name, text in PAGES.items() if "```python" in text and name not in ELSEWHERE
+]
+LONG = {
+    f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "motors", "see", "studies")
+}
 """What takes more than three seconds even so."""
 COMMANDS = [
-    pytest.param(name, command.replace("\\\n", ""), marks=pytest.mark.matrix if name != "README.md" else [])
+    pytest.param(
+        name, command.replace("\\\n", ""), marks=pytest.mark.matrix if name != "README.md" else []
+    )
     for name, text in PAGES.items()
     if name not in TUTORIALS
     for command in re.findall(r"^(?:\$ )?codrl-mj ((?:.*\\\n)*.*)$", text, re.MULTILINE)
@@ -53,7 +59,12 @@ def trained(tmp_path_factory):
     """A run folder, after one rollout."""
     out = tmp_path_factory.mktemp("runs") / "mine"
     agent = PPOConfig(rollout_steps=64, batch_size=64, epochs=1)
-    train(TrainConfig(EnvConfig("cartpole"), agent, total_steps=64, num_envs=1, evaluation_episodes=1), out)
+    train(
+        TrainConfig(
+            EnvConfig("cartpole"), agent, total_steps=64, num_envs=1, evaluation_episodes=1
+        ),
+        out,
+    )
     return out
 
 
@@ -63,7 +74,9 @@ def folder_of_a_reader(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     Path("examples").symlink_to(ROOT / "examples")
-    Path("half_cheetah.xml").symlink_to(Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml")
+    Path("half_cheetah.xml").symlink_to(
+        Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml"
+    )
     for file, page, block in (
         ("my_motor.toml", "motors", "toml\n(.*?)"),
         ("car.yaml", "training", "yaml\n(.*?)"),
@@ -82,7 +95,9 @@ def folder_of_a_reader(trained, tmp_path, monkeypatch):
         sys.modules.pop(own, None)
 
 
-@pytest.mark.parametrize("page", but([name for name in WITH_PYTHON if name not in LONG], WITH_PYTHON))
+@pytest.mark.parametrize(
+    "page", but([name for name in WITH_PYTHON if name not in LONG], WITH_PYTHON)
+)
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_python_of_a_page_runs(page, monkeypatch):
     if "data/bench_logs/dfki_pendulum" in PAGES[page]:
@@ -116,7 +131,8 @@ SHORTER = {
 }
 """Verb -> flags with which a command takes seconds."""
 NEEDING_MORE = (
-    r"identify|data |view|validate (--model|--mutations|--out)|validate *(#.*)?$|.*policies/theirs|.*model.zip"
+    r"identify|data |view|validate (--model|--mutations|--out)|validate"
+    r" *(#.*)?$|.*policies/theirs|.*model.zip"
     "|board run|.*--backend ray|.*motor/actuator.yaml" + ("" if shutil.which("cc") else "|board")
 )
 """Commands that need logs, a browser, a cluster, a compiler, others' files or minutes: they are only parsed."""
@@ -154,7 +170,10 @@ RUN_ALL = {
     page: [command for name, command in (one.values for one in COMMANDS) if name == page]
     for page in dict.fromkeys(one.values[0] for one in COMMANDS)
 }
-RUN = {page: [one for one in lines if not re.match(NEEDING_MORE, one)] for page, lines in RUN_ALL.items()}
+RUN = {
+    page: [one for one in lines if not re.match(NEEDING_MORE, one)]
+    for page, lines in RUN_ALL.items()
+}
 
 
 def test_a_family_from_the_folder_of_a_reader_is_trained_through(tmp_path, monkeypatch):
@@ -210,17 +229,24 @@ def test_the_first_page_identifies_a_motor_as_typed(tmp_path):
     """From logs of a motor on its own, whose columns have the names of that line."""
     program = [str(Path(sys.executable).with_name("codrl-mj"))]
     simulate = shlex.split(
-        "identify simulate maxon-ec45-flat-50w --kind prbs --amplitude 4 --duration 2 --inertia 1e-5"
+        "identify simulate maxon-ec45-flat-50w --kind prbs --amplitude 4 --duration 2 --inertia"
+        " 1e-5"
     )
     for number in ("1", "2"):
         log = tmp_path / f"swing{number}.csv"
-        subprocess.run([*program, *simulate, "--seed", number, "--out", str(log)], check=True, capture_output=True)
+        subprocess.run(
+            [*program, *simulate, "--seed", number, "--out", str(log)],
+            check=True,
+            capture_output=True,
+        )
         header, rows = log.read_text().split("\n", 1)
         for name, column in (("time", "t"), ("voltage", "u"), ("current", "i"), ("position", "q")):
             header = re.sub(rf"\b{name}\b", column, header)
         log.write_text(f"{header}\n{rows}")
     (line,) = [command for command in RUN_ALL["README.md"] if command.startswith("identify")]
-    done = subprocess.run([*program, *shlex.split(line)], capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        [*program, *shlex.split(line)], capture_output=True, text=True, timeout=300, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "not to be used" not in done.stdout
     assert (tmp_path / "motor" / "actuator.yaml").is_file()
@@ -242,8 +268,15 @@ TEXTS = ("*.py", "*.toml", "*.xml", "*.jinja", "*.md", "*.html", "*.js", "*.yml"
 def test_every_page_that_code_assets_and_help_name_is_in_a_clone():
     folders = [ROOT / name for name in ("codrl_mj", "assets", "examples", "scripts")]
     files = [file for folder in folders for kind in TEXTS for file in folder.rglob(kind)]
-    files += [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "Makefile", "pyproject.toml", "zensical.toml")]
-    named = {page: file for file in files for page in re.findall(r"docs/[\w/]+\.md", file.read_text(errors="replace"))}
+    files += [
+        ROOT / name
+        for name in ("README.md", "CONTRIBUTING.md", "Makefile", "pyproject.toml", "zensical.toml")
+    ]
+    named = {
+        page: file
+        for file in files
+        for page in re.findall(r"docs/[\w/]+\.md", file.read_text(errors="replace"))
+    }
     assert "docs/motors.md" in named
     for page, file in named.items():
         assert (ROOT / page).is_file(), f"{file} names {page}"
@@ -253,7 +286,11 @@ def test_every_page_that_code_assets_and_help_name_is_in_a_clone():
 def test_the_file_of_upright_tolerances_has_the_pendulum_s_own():
     with (ROOT / "docs/upright_tolerances.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    angle, speed, page = f"{pendulum.GOAL_ANGLE:g} rad", f"{pendulum.GOAL_SPEED:g} rad/s", PAGES["docs/evaluation.md"]
+    angle, speed, page = (
+        f"{pendulum.GOAL_ANGLE:g} rad",
+        f"{pendulum.GOAL_SPEED:g} rad/s",
+        PAGES["docs/evaluation.md"],
+    )
     assert "(upright_tolerances.csv)" in page
     assert f"within {angle} of upright and slower than {speed}" in page
     assert all(0.0 <= float(row[f"{angle}, {speed}"]) <= 1.0 for row in rows)
@@ -263,9 +300,16 @@ def test_the_file_of_upright_tolerances_has_the_pendulum_s_own():
 def test_of_the_papers_statements_as_many_are_confirmed_as_the_results_say():
     results = ROOT / "docs" / "results"
     with (results / "reproduction" / "claims.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["source"] == "paper" and row["counted"] == "yes"]
+        rows = [
+            row
+            for row in csv.DictReader(file)
+            if row["source"] == "paper" and row["counted"] == "yes"
+        ]
     sure, near = (sum(row["verdict"] == one for row in rows) for one in ("confirmed", "compatible"))
-    said = f"{len(rows)} statements {sure} are confirmed, and {near}, read off one run, compatible with ours."
+    said = (
+        f"{len(rows)} statements {sure} are confirmed, and {near}, read off one run, compatible"
+        " with ours."
+    )
     assert said in PAGES["README.md"].replace("\n", " ")
     counted = f"**Of {len(rows)} statements: {sure} confirmed, {near} compatible, "
     assert counted in (results / "reproduction.md").read_text()

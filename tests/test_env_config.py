@@ -52,9 +52,15 @@ def test_every_form_is_the_same_configuration(given):
     assert config.randomize == WRITTEN
     assert hash(config) == hash(EnvConfig("cartpole", randomize=RANDOMIZE))
     arguments = config.as_arguments()["randomize"]
-    assert list(arguments.items()) == list(RANDOMIZE.items())  # the order too: it is that of the draws
+    assert list(arguments.items()) == list(
+        RANDOMIZE.items()
+    )  # the order too: it is that of the draws
     written = json.loads(json.dumps(config.as_mapping()))
-    assert EnvConfig.from_mapping(written) == EnvConfig.from_mapping(yaml.safe_load(yaml.safe_dump(written))) == config
+    assert (
+        EnvConfig.from_mapping(written)
+        == EnvConfig.from_mapping(yaml.safe_load(yaml.safe_dump(written)))
+        == config
+    )
 
 
 def test_environments_draw_from_it():
@@ -70,7 +76,9 @@ def test_nothing_is_drawn_by_default():
     drawn = EnvConfig("cartpole", randomize=WRITTEN)
     assert drawn != plain
     assert dataclasses.replace(drawn, randomize=None) == plain
-    assert "randomize" not in drawn.policy_fields  # it is no part of what an agent commands and sees
+    assert (
+        "randomize" not in drawn.policy_fields
+    )  # it is no part of what an agent commands and sees
 
 
 # -- every field --------------------------------------------------------------------------------------------
@@ -80,7 +88,12 @@ ACTUATORS = (
     st.sampled_from(["ideal", "paper", "weaker"])
     | st.builds(Lag, POSITIVE, POSITIVE)
     | st.builds(TorqueSpeed, POSITIVE, POSITIVE, POSITIVE)
-    | st.builds(Actuator, st.builds(Motor, POSITIVE), st.builds(CurrentLoop, kp=POSITIVE), st.builds(Supply, POSITIVE))
+    | st.builds(
+        Actuator,
+        st.builds(Motor, POSITIVE),
+        st.builds(CurrentLoop, kp=POSITIVE),
+        st.builds(Supply, POSITIVE),
+    )
 )
 
 
@@ -98,11 +111,17 @@ def configurations(draw):
         "observe_actuator": st.booleans(),
         "max_episode_steps": st.integers(1, 10_000),
         "allow_unstable": st.booleans(),
-        "disturbances": st.builds(Disturbances, POSITIVE, POSITIVE, POSITIVE, POSITIVE, POSITIVE, POSITIVE),
+        "disturbances": st.builds(
+            Disturbances, POSITIVE, POSITIVE, POSITIVE, POSITIVE, POSITIVE, POSITIVE
+        ),
         "joint": st.builds(Joint, POSITIVE, POSITIVE, POSITIVE),
         "randomize": st.just(RANDOMIZE),
         **(
-            {"options": st.fixed_dictionaries({"center_radius": POSITIVE, "sutton_barto_reward": st.booleans()})}
+            {
+                "options": st.fixed_dictionaries(
+                    {"center_radius": POSITIVE, "sutton_barto_reward": st.booleans()}
+                )
+            }
             if task == "cartpole"
             else {}
         ),
@@ -118,7 +137,10 @@ def test_a_configuration_survives_json_and_keyword_arguments(config, random):
     assert EnvConfig.from_mapping({}, config) == config
     names = random.sample(sorted(written), 5)
     part = EnvConfig.from_mapping({name: written[name] for name in ["task", *names]})
-    assert EnvConfig.from_mapping({name: written[name] for name in written if name not in names}, part) == config
+    assert (
+        EnvConfig.from_mapping({name: written[name] for name in written if name not in names}, part)
+        == config
+    )
     arguments = config.as_arguments()
     arguments.pop("max_episode_steps", None)
     again = EnvConfig.of(config.task, arguments.pop("actuator"), arguments)
@@ -158,7 +180,11 @@ POLE = EnvConfig(
     joint={"damping": 1.0},
     options={"center_radius": 0.3},
 )
-OF_ANY_TASK = {"action": "voltage", "disturbances": {"command_delay": 0.1}, "joint": {"damping": 1.0}}
+OF_ANY_TASK = {
+    "action": "voltage",
+    "disturbances": {"command_delay": 0.1},
+    "joint": {"damping": 1.0},
+}
 
 
 @pytest.mark.parametrize(
@@ -177,9 +203,17 @@ OF_ANY_TASK = {"action": "voltage", "disturbances": {"command_delay": 0.1}, "joi
         # of another task, what is not given is that task's
         ({"task": "pendulum"}, EnvConfig("pendulum", "paper", **OF_ANY_TASK)),
         (
-            {"task": "pendulum", "actuator": "weaker", "inner_steps": 2, "joint": {"friction": 0.5}},
+            {
+                "task": "pendulum",
+                "actuator": "weaker",
+                "inner_steps": 2,
+                "joint": {"friction": 0.5},
+            },
             EnvConfig(
-                "pendulum", "weaker", inner_steps=2, **OF_ANY_TASK | {"joint": {"damping": 1.0, "friction": 0.5}}
+                "pendulum",
+                "weaker",
+                inner_steps=2,
+                **OF_ANY_TASK | {"joint": {"damping": 1.0, "friction": 0.5}},
             ),
         ),
     ],
@@ -210,9 +244,14 @@ def test_numpys_numbers_are_numbers():
     assert json.dumps(EnvConfig("cartpole", timestep=np.float64(0.01)).as_mapping())
     listed = EnvConfig("cartpole", action="voltage", levels=[np.float64(-1), np.int64(1)])
     assert json.dumps(listed.as_mapping()["levels"]) == "[-1.0, 1]"
-    assert EnvConfig("cartpole", action="voltage", levels=np.array([-1.0, 1.0])).make().action_space.n == 2
+    assert (
+        EnvConfig("cartpole", action="voltage", levels=np.array([-1.0, 1.0])).make().action_space.n
+        == 2
+    )
     for number in (np.int64(0), np.float64(2.0), np.True_):
-        with pytest.raises(ValueError, match=rf"max_episode_steps = {number.item()!r}: must be an integer >= 1"):
+        with pytest.raises(
+            ValueError, match=rf"max_episode_steps = {number.item()!r}: must be an integer >= 1"
+        ):
             EnvConfig("cartpole", max_episode_steps=number)
     with pytest.raises(ValueError, match=r"center_radius = -1.0: must be a number > 0"):
         EnvConfig("cartpole", options={"center_radius": np.float32(-1.0)})
@@ -221,11 +260,23 @@ def test_numpys_numbers_are_numbers():
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [
-        ({"task": "cartpole", "inner_step": 3}, "unknown key env.inner_step; did you mean env.inner_steps?"),
-        ({"task": "cartpole", "center_radios": 3}, "unknown key env.center_radios; did you mean env.center_radius?"),
-        ({"task": "pendulum", "options": {"center_radius": 3}}, "unknown option 'center_radius' of pendulum: it has"),
+        (
+            {"task": "cartpole", "inner_step": 3},
+            "unknown key env.inner_step; did you mean env.inner_steps?",
+        ),
+        (
+            {"task": "cartpole", "center_radios": 3},
+            "unknown key env.center_radios; did you mean env.center_radius?",
+        ),
+        (
+            {"task": "pendulum", "options": {"center_radius": 3}},
+            "unknown option 'center_radius' of pendulum: it has",
+        ),
         ({"task": "cartpole", "center_radius": -1.0}, "center_radius = -1.0: must be a number > 0"),
-        ({"task": "cartpole", "sutton_barto_reward": 1}, "sutton_barto_reward = 1: must be True or False"),
+        (
+            {"task": "cartpole", "sutton_barto_reward": 1},
+            "sutton_barto_reward = 1: must be True or False",
+        ),
         ({"task": "cartpole", "center_radius": True}, "center_radius = True: must be a number > 0"),
         ({"inner_steps": 3}, "it has no task"),
         ("cartpole", "env = 'cartpole': must be a mapping"),
@@ -241,7 +292,16 @@ def test_what_is_no_configuration_is_named(mapping, message):
 
 def test_the_command_line_draws(tmp_path):
     def currents(*flags):
-        line = ["render", "pendulum", "--width", "160", "--height", "120", "--env.max-episode-steps", "3"]
+        line = [
+            "render",
+            "pendulum",
+            "--width",
+            "160",
+            "--height",
+            "120",
+            "--env.max-episode-steps",
+            "3",
+        ]
         folder = tmp_path / str(len([*tmp_path.iterdir()]))
         folder.mkdir()
         files = ["--out", str(folder / "frames"), "--trajectory", str(folder / "episode.npz")]
@@ -249,7 +309,11 @@ def test_the_command_line_draws(tmp_path):
         with np.load(folder / "episode.npz") as episode:
             return episode["trace/current"]
 
-    drawn = ["--env.randomize", "motor.inductance=uniform(0.3, 0.6)", "controller.kp=loguniform(0.1,10)"]
+    drawn = [
+        "--env.randomize",
+        "motor.inductance=uniform(0.3, 0.6)",
+        "controller.kp=loguniform(0.1,10)",
+    ]
     assert not np.array_equal(currents(*drawn), currents())
     found = currents("--env.randomize", "motor.inductance=choice(0.25)")
     np.testing.assert_array_equal(found, currents("--actuator.motor.inductance", "0.25"))
@@ -263,7 +327,10 @@ def test_the_command_line_draws(tmp_path):
     ],
 )
 def test_the_command_line_refuses_with_one_line(flag, message, capsys, tmp_path):
-    assert main(["render", "pendulum", "--out", str(tmp_path / "film.mp4"), "--env.randomize", flag]) == 2
+    assert (
+        main(["render", "pendulum", "--out", str(tmp_path / "film.mp4"), "--env.randomize", flag])
+        == 2
+    )
     error = capsys.readouterr().err
     assert error.startswith("codrl-mj: error: randomize")
     assert message in error
@@ -286,5 +353,8 @@ def test_python_files_and_flags_of_the_page_run(capsys):
     for command in commands:
         words = iter(shlex.split(command.replace("\\\n", "")))
         assert "--env.randomize" in words  # leaves what follows it
-        config = EnvConfig("cartpole", randomize=[*itertools.takewhile(lambda word: not word.startswith("--"), words)])
+        config = EnvConfig(
+            "cartpole",
+            randomize=[*itertools.takewhile(lambda word: not word.startswith("--"), words)],
+        )
         assert len(config.as_arguments()["randomize"]) == 2

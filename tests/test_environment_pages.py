@@ -22,7 +22,15 @@ from tests.tasks.faces import every_rebuilt
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "docs" / "environments"
-SECTIONS = ("Description", "Observation space", "Action space", "Reward", "Start", "End", "Arguments")
+SECTIONS = (
+    "Description",
+    "Observation space",
+    "Action space",
+    "Reward",
+    "Start",
+    "End",
+    "Arguments",
+)
 MORE = {"furuta": ("What to expect", "Where the numbers come from")}
 """What only one task's page has, at its end."""
 
@@ -52,16 +60,27 @@ def test_the_pages_are_what_the_code_says_and_there_are_no_others():
     assert pages.keys() == {"README.md", "arguments.md"} | {f"{task}.md" for task in TASKS}
     assert {path.name for path in FOLDER.glob("*.md")} == pages.keys()
     for name, text in pages.items():
-        assert (FOLDER / name).read_text() == text, f"docs/environments/{name} is stale: run make docs"
+        assert (FOLDER / name).read_text() == text, (
+            f"docs/environments/{name} is stale: run make docs"
+        )
 
 
 @pytest.mark.matrix
 def test_make_docs_writes_them(tmp_path):
-    command = [sys.executable, str(ROOT / "scripts" / "environment_pages.py"), "--out", str(tmp_path)]
+    command = [
+        sys.executable,
+        str(ROOT / "scripts" / "environment_pages.py"),
+        "--out",
+        str(tmp_path),
+    ]
     subprocess.run(command, check=True, capture_output=True, timeout=120)
     for path in FOLDER.glob("*.md"):
         assert (tmp_path / path.name).read_text() == path.read_text()
-    assert re.search(r"^docs: .*\n\t.*scripts/environment_pages\.py$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert re.search(
+        r"^docs: .*\n\t.*scripts/environment_pages\.py$",
+        (ROOT / "Makefile").read_text(),
+        re.MULTILINE,
+    )
 
 
 def test_the_index_links_to_every_page():
@@ -106,7 +125,10 @@ def test_an_argument_that_nobody_documents_is_noticed(monkeypatch):
 
 @every_task
 def test_every_argument_is_in_the_page_with_its_default_and_the_tasks_own_options_too(task):
-    rows = {row[0].strip("`"): row[1].strip("`") for row in _table((FOLDER / "arguments.md").read_text())}
+    rows = {
+        row[0].strip("`"): row[1].strip("`")
+        for row in _table((FOLDER / "arguments.md").read_text())
+    }
     assert "(arguments.md)" in _section(task, "Arguments")
     known = find_world(task).fields
     fields = {
@@ -114,11 +136,15 @@ def test_every_argument_is_in_the_page_with_its_default_and_the_tasks_own_option
         for field in dataclasses.fields(EnvConfig)[1:]  # without the task
         if field.name in known
     }
-    parameters = dict(list(inspect.signature(ActuatedEnv).parameters.items())[1:-1])  # and without **arguments
+    parameters = dict(
+        list(inspect.signature(ActuatedEnv).parameters.items())[1:-1]
+    )  # and without **arguments
     expected = {name: repr(parameter.default) for name, parameter in parameters.items()} | fields
     assert expected.pop("options") == "None"
     assert rows == {name: re.sub(r"\(.*\)$", "()", default) for name, default in expected.items()}
-    assert re.findall(r"`(\w+)`", _facts(task)["options of its own"]) == list(TASKS[task].options._fields)
+    assert re.findall(r"`(\w+)`", _facts(task)["options of its own"]) == list(
+        TASKS[task].options._fields
+    )
     for option in TASKS[task].options._fields:
         assert f"`{option}`" in _section(task, "Arguments")
 
@@ -144,7 +170,9 @@ def test_the_action_space_is_named(task):
     text = _section(task, "Action space")
     if isinstance(space, gymnasium.spaces.Discrete):
         assert f"`Discrete({space.n})`" in text
-        assert all(re.search(rf"(?<![\d.]){force:g}(?![\d.])", text) for force in TASKS[task].forces)
+        assert all(
+            re.search(rf"(?<![\d.]){force:g}(?![\d.])", text) for force in TASKS[task].forces
+        )
     else:
         assert f"`Box({space.low[0]:g}, {space.high[0]:g}, (1,), float32)`" in text
     assert _facts(task)["action space"] == f"`{space}`"
@@ -155,7 +183,9 @@ def test_the_time_limit_is_the_registered_one_and_gymnasiums(task):
     ours, theirs = gymnasium.spec(TASKS[task].env_id), gymnasium.spec(TASKS[task].gymnasium_id)
     assert ours.max_episode_steps == theirs.max_episode_steps == TASKS[task].max_episode_steps
     assert ours.reward_threshold == theirs.reward_threshold == TASKS[task].reward_threshold
-    steps, seconds = re.search(r"[Tt]runcated\safter\s(\d+)\ssteps\s\(([\d.]+)\ss\)", _section(task, "End")).groups()
+    steps, seconds = re.search(
+        r"[Tt]runcated\safter\s(\d+)\ssteps\s\(([\d.]+)\ss\)", _section(task, "End")
+    ).groups()
     assert int(steps) == ours.max_episode_steps
     assert float(seconds) == pytest.approx(int(steps) * TASKS[task].step_duration)
     facts = _facts(task)
@@ -171,4 +201,6 @@ def test_the_integration_steps_are_those_of_the_environment(task):
     for actuator, count in (("default", with_motor), ("ideal", without)):
         env = ActuatedEnv(task, actuator)
         assert env.physics.plant.inner_steps == count
-        assert env.model.opt.timestep == pytest.approx(float(facts["environment step"].split()[0]) / count)
+        assert env.model.opt.timestep == pytest.approx(
+            float(facts["environment step"].split()[0]) / count
+        )

@@ -27,7 +27,9 @@ class Leaner:
     def __init__(self, space=TASKS["cartpole"].action_space):
         """Choose from the ends of the space."""
         self.asked = []
-        self.ends = (space.low, space.high) if isinstance(space, gymnasium.spaces.Box) else (0, space.n - 1)
+        self.ends = (
+            (space.low, space.high) if isinstance(space, gymnasium.spaces.Box) else (0, space.n - 1)
+        )
 
     def predict(self, observation, *, deterministic=False):
         self.asked.append((len(observation), deterministic))
@@ -48,19 +50,31 @@ def assert_same(first, second):
         for name, values in one.items():
             np.testing.assert_array_equal(values, other[name], err_msg=name)
             assert values.dtype == other[name].dtype
-    assert (first.terminated, first.actuator, first.command) == (second.terminated, second.actuator, second.command)
+    assert (first.terminated, first.actuator, first.command) == (
+        second.terminated,
+        second.actuator,
+        second.command,
+    )
 
 
 def stepped(env, seed, policy):
     """The columns of an episode, and whether the task ended it, from single steps."""
     observation, _ = env.reset(seed=seed)
-    columns = collections.defaultdict(list, {"observation": [observation], "state": [env.unwrapped.state]})
+    columns = collections.defaultdict(
+        list, {"observation": [observation], "state": [env.unwrapped.state]}
+    )
     ended = (False, False)
     while not any(ended):
         action = policy.predict(observation[None])[0][0]
         observation, reward, *ended, info = env.step(action)
         trace, state = env.unwrapped.physics.trace.copy(), env.unwrapped.state
-        now = {"observation": observation, "state": state, "reward": reward, "action": action, "trace": trace}
+        now = {
+            "observation": observation,
+            "state": state,
+            "reward": reward,
+            "action": action,
+            "trace": trace,
+        }
         for name, value in {**now, **info}.items():
             columns[name].append(value)
     return columns, ended[0]
@@ -73,7 +87,9 @@ def test_episodes_are_those_of_stepping_one_environment_at_a_time(task, actuator
     definition, family = TASKS[task], {"ideal": Ideal, "paper": Actuator}[actuator]
     count = max(3, definition.motor_inner_steps)
     make = EnvConfig(task, actuator, inner_steps=count, max_episode_steps=60).make
-    for seed, episode in enumerate(run_episodes(Leaner(definition.action_space), make, 4, seed=10), 10):
+    for seed, episode in enumerate(
+        run_episodes(Leaner(definition.action_space), make, 4, seed=10), 10
+    ):
         columns, terminated = stepped(make(), seed, Leaner(definition.action_space))
         steps = len(columns["reward"])
         for name in ("observation", "state", "action", "reward"):
@@ -86,9 +102,13 @@ def test_episodes_are_those_of_stepping_one_environment_at_a_time(task, actuator
         whole = np.stack(list(episode.trace.values()), axis=-1)
         np.testing.assert_array_equal(whole[:, np.newaxis], np.concatenate(columns["trace"]))
         for name in episode.trace.keys() & episode.signals.keys():
-            np.testing.assert_array_equal(episode.trace[name][count - 1 :: count], episode.signals[name])
+            np.testing.assert_array_equal(
+                episode.trace[name][count - 1 :: count], episode.signals[name]
+            )
         assert episode.terminated is terminated
-        assert episode.total == pytest.approx(math.fsum(columns["reward"]), rel=1e-12)  # in another order
+        assert episode.total == pytest.approx(
+            math.fsum(columns["reward"]), rel=1e-12
+        )  # in another order
         assert episode.inner_steps == count
         assert episode.timestep == pytest.approx(definition.step_duration / count, rel=1e-15)
         assert episode.signals["saturated"].dtype == bool
@@ -96,9 +116,13 @@ def test_episodes_are_those_of_stepping_one_environment_at_a_time(task, actuator
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
-def test_the_policy_is_asked_once_a_step_for_the_episodes_still_running_which_are_reported(deterministic):
+def test_the_policy_is_asked_once_a_step_for_the_episodes_still_running_which_are_reported(
+    deterministic,
+):
     policy, reports = Leaner(), []
-    episodes = run_episodes(policy, cartpole(), 3, 0, deterministic, on_step=lambda *counts: reports.append(counts))
+    episodes = run_episodes(
+        policy, cartpole(), 3, 0, deterministic, on_step=lambda *counts: reports.append(counts)
+    )
     lengths = [len(episode.reward) for episode in episodes]
     assert len(set(lengths)) > 1  # they end at different times
     running = [sum(step < length for length in lengths) for step in range(max(lengths) + 1)]
@@ -110,7 +134,11 @@ class Sampler:
     """Draws actions from torch's generator, as Stable-Baselines3's policies do, unless it is to be deterministic."""
 
     def predict(self, observation, *, deterministic=False):
-        chosen = torch.zeros(len(observation)) if deterministic else torch.randint(2, (len(observation),))
+        chosen = (
+            torch.zeros(len(observation))
+            if deterministic
+            else torch.randint(2, (len(observation),))
+        )
         return chosen.numpy().astype(int), None
 
 
@@ -123,7 +151,9 @@ def test_sampled_actions_repeat_with_their_seed_and_disturb_no_other():
     np.testing.assert_array_equal(torch.rand(4), expected)
     for episode, again in zip(first, run(5), strict=True):
         assert_same(episode, again)
-    assert len({episode.action[:8].tobytes() for episode in (*first, *run(8))}) == 6  # all of them differ
+    assert (
+        len({episode.action[:8].tobytes() for episode in (*first, *run(8))}) == 6
+    )  # all of them differ
 
 
 # -- whatever the environment -------------------------------------------------------------------------------
@@ -131,7 +161,9 @@ def test_sampled_actions_repeat_with_their_seed_and_disturb_no_other():
 
 def test_episodes_know_what_was_drawn_for_them_and_what_was_commanded():
     drawn = {"motor.resistance": Uniform(0.5, 2.0)}
-    make = EnvConfig("pendulum", "paper", randomize=drawn, action="current", max_episode_steps=3).make
+    make = EnvConfig(
+        "pendulum", "paper", randomize=drawn, action="current", max_episode_steps=3
+    ).make
     policy = RandomPolicy(make().action_space)
     episodes = run_episodes(policy, make, 4)
     resistances = [episode.actuator.motor.resistance for episode in episodes]
@@ -150,7 +182,8 @@ def test_analytic_physics_disturbed_runs_the_same_episodes():
     )
     options = {"disturbances": {"command_delay": 0.03}, "max_episode_steps": 40}
     ours, theirs = (
-        run_episodes(Leaner(), cartpole(paper, physics=physics, **options), 3) for physics in ("mujoco", "analytic")
+        run_episodes(Leaner(), cartpole(paper, physics=physics, **options), 3)
+        for physics in ("mujoco", "analytic")
     )
     for one, other in zip(ours, theirs, strict=True):
         for name, values in one.trace.items():
@@ -202,7 +235,9 @@ SPECIAL = {"motor": {"arm_radius": 0.1}, "controller": {"max_voltage": float("in
 
 
 def swing(actuator="ideal"):
-    (episode,) = run_episodes(RandomPolicy("pendulum"), EnvConfig("pendulum", actuator, max_episode_steps=7).make, 1)
+    (episode,) = run_episodes(
+        RandomPolicy("pendulum"), EnvConfig("pendulum", actuator, max_episode_steps=7).make, 1
+    )
     return episode
 
 
@@ -236,7 +271,13 @@ def flipped(whole):
 
 
 @pytest.mark.parametrize(
-    "change", [without_most, flipped, lambda whole: whole[: len(whole) // 2], lambda _: pickle.dumps({"time": 1})]
+    "change",
+    [
+        without_most,
+        flipped,
+        lambda whole: whole[: len(whole) // 2],
+        lambda _: pickle.dumps({"time": 1}),
+    ],
 )
 def test_what_is_no_trajectory_is_refused(tmp_path, change):
     path = tmp_path / "swing.npz"

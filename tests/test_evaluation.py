@@ -60,18 +60,35 @@ class Constant:
 MOTOR = Actuator()
 
 
-def made_up(task="cartpole", actuator=MOTOR, states=None, rows=(), reward=None, terminated=True, desired=None):
+def made_up(
+    task="cartpole",
+    actuator=MOTOR,
+    states=None,
+    rows=(),
+    reward=None,
+    terminated=True,
+    desired=None,
+):
     """An episode from the little that a measure reads, of which `rows` are the trace's, with the entries of `ROW`.
 
-    There is a step for each row unless states say otherwise; desired in a step is by default what its end delivers.
+    There is a step for each row unless states say otherwise; desired in a step is by default what
+    its end delivers.
     """
     definition = TASKS[task]
     steps = len(rows) if states is None else len(states) - 1
-    states = np.zeros((steps + 1, len(definition.state_names))) if states is None else np.array(states, dtype=float)
+    states = (
+        np.zeros((steps + 1, len(definition.state_names)))
+        if states is None
+        else np.array(states, dtype=float)
+    )
     rows = np.zeros((steps, len(ROW))) if len(rows) == 0 else np.array(rows, dtype=float)
     trace = {name: np.zeros(len(rows)) for name in TRACE} | dict(zip(ROW, rows.T, strict=True))
     inner_steps = len(rows) // steps
-    ends = {name: values[inner_steps - 1 :: inner_steps] for name, values in trace.items() if name != "speed"}
+    ends = {
+        name: values[inner_steps - 1 :: inner_steps]
+        for name, values in trace.items()
+        if name != "speed"
+    }
     asked = ends["actual_force"] if desired is None else np.array(desired, dtype=float)
     return Episode(
         time=definition.step_duration * np.arange(1, steps + 1),
@@ -93,12 +110,21 @@ def made_up(task="cartpole", actuator=MOTOR, states=None, rows=(), reward=None, 
 def test_returns_and_lengths_are_counted():
     episodes = [
         made_up(rows=[(0, 0, 0, 0, 0)] * len(rewards), reward=rewards, terminated=over)
-        for rewards, over in (([1.0, 2.0], True), ([0.0], False), ([5.0, 1.0, 4.0], True), ([-7.0], True))
+        for rewards, over in (
+            ([1.0, 2.0], True),
+            ([0.0], False),
+            ([5.0, 1.0, 4.0], True),
+            ([-7.0], True),
+        )
     ]
     summary = summarize("cartpole", episodes)
     assert (summary.task, summary.episodes, summary.terminated) == ("cartpole", 4, 3)
     assert summary.returns.low < summary.returns.mean == (3 + 0 + 10 - 7) / 4 < summary.returns.high
-    assert (summary.returns_median, summary.returns_interquartile_mean, summary.length.mean) == (1.5, 1.5, 7 / 4)
+    assert (summary.returns_median, summary.returns_interquartile_mean, summary.length.mean) == (
+        1.5,
+        1.5,
+        7 / 4,
+    )
     assert summary.episode_returns == (3, 0, 10, -7)
     assert summary.episode_times_to_goal == (None, 0, None, None)
 
@@ -113,14 +139,24 @@ def arriving(goal):
     """Of a car after 7 s, after 9 s, over the flag and back, and not at all."""
     beyond = goal + 0.01
     late = ([ROLLING] * 9 + [[goal, 0.0]], True)
-    return [([ROLLING] * 7 + [[beyond, 0.01]], True), late, ([ROLLING, [beyond, -0.01]], False), (SHORT, False)]
+    return [
+        ([ROLLING] * 7 + [[beyond, 0.01]], True),
+        late,
+        ([ROLLING, [beyond, -0.01]], False),
+        (SHORT, False),
+    ]
 
 
 @pytest.mark.parametrize(
     ("task", "episodes", "share", "quartiles"),
     [
         # a pole that stands at the time limit
-        ("cartpole", [(STANDING, False), (FALLEN, True), (FALLEN, True), (STANDING, False)], 0.5, None),
+        (
+            "cartpole",
+            [(STANDING, False), (FALLEN, True), (FALLEN, True), (STANDING, False)],
+            0.5,
+            None,
+        ),
         # a car at its flag, an acrobot at its height, and when
         ("mountain_car", arriving(0.5), 0.5, (8.0, 7.5, 8.5)),
         ("mountain_car_continuous", arriving(0.45), 0.5, (8.0, 7.5, 8.5)),
@@ -135,9 +171,13 @@ def arriving(goal):
     ],
 )
 def test_an_episode_succeeds_as_its_task_says_from_when_it_does(task, episodes, share, quartiles):
-    summary = summarize(task, [made_up(task, IDEAL, states, terminated=over) for states, over in episodes])
+    summary = summarize(
+        task, [made_up(task, IDEAL, states, terminated=over) for states, over in episodes]
+    )
     assert summary.success.mean == share
-    assert summary.failure == pytest.approx((1 - share, 1 - summary.success.high, 1 - summary.success.low))
+    assert summary.failure == pytest.approx(
+        (1 - share, 1 - summary.success.high, 1 - summary.success.low)
+    )
     times = [time for time in summary.episode_times_to_goal if time is not None]
     assert len(times) == share * len(episodes)
     assert summary.time_to_goal == (quartiles if quartiles is None else pytest.approx(quartiles))
@@ -153,16 +193,27 @@ def pushing(*forces):
 def test_the_tracking_error_is_that_of_every_integration_step_in_torques_at_the_shaft():
     arm = 0.25
     actuator = Actuator(Motor(arm_radius=arm))
-    # two environment steps of two integration steps each: 10 N, then -10 N are desired throughout; and one more
-    first = made_up("cartpole", actuator, np.zeros((3, 4)), pushing(8.0, 10.0, -4.0, -10.0), desired=[10.0, -10.0])
+    # two environment steps of two integration steps each: 10 N, then -10 N are desired throughout;
+    # and one more
+    first = made_up(
+        "cartpole",
+        actuator,
+        np.zeros((3, 4)),
+        pushing(8.0, 10.0, -4.0, -10.0),
+        desired=[10.0, -10.0],
+    )
     second = made_up("cartpole", actuator, np.zeros((2, 4)), pushing(9.0, 10.0), desired=[10.0])
     summary = summarize("cartpole", [first, second])
-    error = math.sqrt((2.0**2 + 6.0**2 + 1.0**2) / 6) * arm  # N*m; the steps' ends are without error
+    error = (
+        math.sqrt((2.0**2 + 6.0**2 + 1.0**2) / 6) * arm
+    )  # N*m; the steps' ends are without error
     assert summary.tracking_rms == pytest.approx(error, rel=1e-12)
     assert summary.tracking_percent == pytest.approx(100 * error / (10.0 * arm), rel=1e-12)
     assert summary.tracking_max == pytest.approx(6.0 * arm, rel=1e-12)
     delivered = (8.0, 10.0, -4.0, -10.0, 9.0, 10.0)
-    assert summary.torque_rms == pytest.approx(math.sqrt(sum(f**2 for f in delivered) / 6) * arm, rel=1e-12)
+    assert summary.torque_rms == pytest.approx(
+        math.sqrt(sum(f**2 for f in delivered) / 6) * arm, rel=1e-12
+    )
     duration = float(first.time[-1] + second.time[-1])
     assert summary.reversals == pytest.approx(1 / duration, rel=1e-12)  # none between episodes
 
@@ -177,14 +228,20 @@ def test_tracking_is_weighed_over_all_steps_and_not_per_episode():
 
 def test_a_desired_torque_of_zero_has_no_relative_error_and_no_delay():
     summary = summarize("cartpole", [made_up(rows=pushing(*[0.5] * 4), desired=[0.0] * 4)])
-    assert (summary.tracking_rms, summary.tracking_percent, summary.tracking_lag) == (0.5, None, None)
+    assert (summary.tracking_rms, summary.tracking_percent, summary.tracking_lag) == (
+        0.5,
+        None,
+        None,
+    )
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.15])
 def test_the_lag_of_an_ideal_actuator_is_the_delay_of_its_commands(delay):
     env = EnvConfig("pendulum", "ideal", disturbances=Disturbances(command_delay=delay))
     result = evaluate(RandomPolicy("pendulum"), env, episodes=5)
-    assert result.tracking_lag == pytest.approx(delay, abs=0.001)  # noise beside the peak: 1/sqrt(1000) steps of 0.05 s
+    assert result.tracking_lag == pytest.approx(
+        delay, abs=0.001
+    )  # noise beside the peak: 1/sqrt(1000) steps of 0.05 s
     assert (result.tracking_rms > 0) == (delay > 0)
 
 
@@ -198,7 +255,13 @@ def test_the_ideal_actuator_tracks_perfectly_and_has_no_motor():
 def test_a_voltage_that_the_agent_commands_asks_for_no_torque():
     env = EnvConfig("pendulum", action="voltage", max_episode_steps=5)
     result = evaluate(Constant(1.0), env, episodes=2)
-    assert result.tracking_rms is result.tracking_percent is result.tracking_max is result.tracking_lag is None
+    assert (
+        result.tracking_rms
+        is result.tracking_percent
+        is result.tracking_max
+        is result.tracking_lag
+        is None
+    )
     assert result.peak_voltage == 1.0
 
 
@@ -227,7 +290,9 @@ class Position(ActuatorModel):
 
 
 def test_an_angle_that_is_asked_for_is_no_torque_that_could_be_missed():
-    env = EnvConfig("Reacher-v5", {"joint0": Position(), "joint1": Lag(time_constant=0.1)}, max_episode_steps=4)
+    env = EnvConfig(
+        "Reacher-v5", {"joint0": Position(), "joint1": Lag(time_constant=0.1)}, max_episode_steps=4
+    )
     (episode,) = run_episodes(RandomPolicy(env.action_space, 0), env.make, 1, 3)
     assert episode.tracks == (False, True)
     result = summarize(env.task, [episode])
@@ -239,13 +304,26 @@ def test_an_angle_that_is_asked_for_is_no_torque_that_could_be_missed():
     assert result.motors["joint1"]["tracking_rms"] == result.tracking_rms
     shown = [Shown("run", env, episode, None, None, 3)]
     plots = {plot.title: plot for plot in _motor_plots(_lines(shown, list(episode.motors)))}
-    for title, name in (("Torque at the shaft", "desired"), ("Error: desired less actual", "desired less actual")):
-        assert [curve.label for curve in plots[title].curves if name in curve.label] == [f"joint1: {name}"]
+    for title, name in (
+        ("Torque at the shaft", "desired"),
+        ("Error: desired less actual", "desired less actual"),
+    ):
+        assert [curve.label for curve in plots[title].curves if name in curve.label] == [
+            f"joint1: {name}"
+        ]
     alone = EnvConfig("Reacher-v5", Position(), max_episode_steps=4)
     (episode,) = run_episodes(RandomPolicy(alone.action_space, 0), alone.make, 1, 3)
     result = summarize(alone.task, [episode])
-    assert result.tracking_rms is result.tracking_percent is result.tracking_max is result.tracking_lag is None
-    plots = _motor_plots(_lines([Shown("run", alone, episode, None, None, 3)], list(episode.motors)))
+    assert (
+        result.tracking_rms
+        is result.tracking_percent
+        is result.tracking_max
+        is result.tracking_lag
+        is None
+    )
+    plots = _motor_plots(
+        _lines([Shown("run", alone, episode, None, None, 3)], list(episode.motors))
+    )
     assert "Error: desired less actual" not in [plot.title for plot in plots]
 
 
@@ -254,7 +332,9 @@ def test_a_film_shows_the_voltage_of_every_family_that_has_one(monkeypatch):
     assert strip._signal(IDEAL) == (None, "u [V]")
     assert strip._signal(Lag()) == (None, "")
     drawn = []
-    monkeypatch.setattr(strip, "_pixels", lambda figure: drawn.append(figure) or np.zeros((1, 1, 3), np.uint8))
+    monkeypatch.setattr(
+        strip, "_pixels", lambda figure: drawn.append(figure) or np.zeros((1, 1, 3), np.uint8)
+    )
     env = EnvConfig("Reacher-v5", Position(), max_episode_steps=4)
     (episode,) = run_episodes(RandomPolicy(env.action_space, 0), env.make, 1, 3)
     strip.draw_strip(env.task, episode, 0, 300, 1.0, 1.0)
@@ -272,27 +352,46 @@ def test_the_saturated_share_is_that_of_voltages_at_the_limit(max_voltage):
     episodes = run_episodes(Leaner(), make, episodes=3)
     voltages = np.concatenate([episode.trace["voltage"] for episode in episodes])
     summary = summarize("cartpole", episodes)
-    assert summary.saturated_percent == pytest.approx(100 * np.mean(np.abs(voltages) == max_voltage), rel=1e-12)
+    assert summary.saturated_percent == pytest.approx(
+        100 * np.mean(np.abs(voltages) == max_voltage), rel=1e-12
+    )
     assert summary.peak_voltage <= max_voltage
     assert (summary.saturated_percent > 0) == (max_voltage <= 1.0)
 
 
 def test_a_stalled_motor_is_measured_as_its_closed_form_says():
     """No back-EMF, a constant voltage: i(k) = u/R*(1 - q^k) with q = 1 - R*dt/L; every sum below is geometric."""
-    motor, voltage, steps, count = Motor(resistance=2.0, inductance=1.5, back_emf_constant=0.0), 0.5, 6, 20
-    env = EnvConfig("mountain_car_continuous", Actuator(motor), action="voltage", max_episode_steps=steps)
+    motor, voltage, steps, count = (
+        Motor(resistance=2.0, inductance=1.5, back_emf_constant=0.0),
+        0.5,
+        6,
+        20,
+    )
+    env = EnvConfig(
+        "mountain_car_continuous", Actuator(motor), action="voltage", max_episode_steps=steps
+    )
     result = evaluate(Constant(voltage), env, episodes=3)
     dt, n, final = 1.0 / count, steps * count, voltage / motor.resistance
     q = 1 - motor.resistance * dt / motor.inductance
     ones, squares = (1 - q**n) / (1 - q), (1 - q ** (2 * n)) / (1 - q**2)
     drawn = voltage * final * dt * (n - (1 + q) / 2 * ones)
-    heat = motor.resistance * final**2 * dt / 3 * (3 * n - 3 * (1 + q) * ones + (1 + q + q * q) * squares)
+    heat = (
+        motor.resistance
+        * final**2
+        * dt
+        / 3
+        * (3 * n - 3 * (1 + q) * ones + (1 + q + q * q) * squares)
+    )
     assert result.energy_drawn.mean == pytest.approx(drawn, rel=1e-12)
     assert result.energy_returned.mean == 0.0
     assert result.copper_loss.mean == pytest.approx(heat, rel=1e-12)
-    assert result.magnetic_energy.mean == pytest.approx(motor.inductance / 2 * (final * (1 - q**n)) ** 2, rel=1e-12)
+    assert result.magnetic_energy.mean == pytest.approx(
+        motor.inductance / 2 * (final * (1 - q**n)) ** 2, rel=1e-12
+    )
     assert result.peak_current == pytest.approx(final * (1 - q**n), rel=1e-12)
-    assert result.rms_current == pytest.approx(math.sqrt(heat / motor.resistance / (n * dt)), rel=1e-12)
+    assert result.rms_current == pytest.approx(
+        math.sqrt(heat / motor.resistance / (n * dt)), rel=1e-12
+    )
     assert (result.peak_voltage, result.saturated_percent) == (voltage, 0.0)
     # and the motor itself, not its Euler steps: they err by dt/T = 1/15 of the transient
     time, constant = n * dt, motor.electrical_time_constant
@@ -326,7 +425,9 @@ def test_a_drive_draws_what_becomes_heat_and_work_though_its_winding_is_far_fast
     spent = result.copper_loss.mean + result.magnetic_energy.mean + result.mechanical_work.mean
     assert drawn == pytest.approx(spent, rel=5e-3)
     duration = 100 * 0.05
-    assert result.rms_current == pytest.approx(math.sqrt(result.copper_loss.mean / 8.4 / duration), rel=1e-12)
+    assert result.rms_current == pytest.approx(
+        math.sqrt(result.copper_loss.mean / 8.4 / duration), rel=1e-12
+    )
     assert result.saturated_percent == result.current_saturated_percent == 100.0
     assert 0.0 < result.voltage_saturated_percent < 50.0  # while the current turns round
     assert result.temperature_saturated_percent == 0.0
@@ -335,9 +436,16 @@ def test_a_drive_draws_what_becomes_heat_and_work_though_its_winding_is_far_fast
 def test_work_energies_and_peaks_are_those_of_the_shaft():
     motor = Motor(arm_radius=0.5, resistance=2.0)
     # force, current, voltage, speed, saturated; then it brakes
-    rows = [(3.0, 1.0, 6.0, 0.5, 0), (1.0, -4.0, -7.0, -0.8, 1), (0.0, -4.0, 3.0, -0.8, 1), (0.0, 0.0, 0.0, -0.8, 0)]
+    rows = [
+        (3.0, 1.0, 6.0, 0.5, 0),
+        (1.0, -4.0, -7.0, -0.8, 1),
+        (0.0, -4.0, 3.0, -0.8, 1),
+        (0.0, 0.0, 0.0, -0.8, 0),
+    ]
     states = [[0.0, -0.9, 0.0, 0.0]] * 5  # before the first step the cart moves at -0.9 m/s
-    result = summarize("cartpole", [made_up(actuator=Actuator(motor), states=states, rows=rows)] * 2)
+    result = summarize(
+        "cartpole", [made_up(actuator=Actuator(motor), states=states, rows=rows)] * 2
+    )
     dt = 0.02
     assert result.mechanical_work.mean == pytest.approx((3.0 * -0.2 + 1.0 * -0.15) * dt, rel=1e-12)
     assert result.energy_drawn.mean == pytest.approx((6.0 * 0.5 + -7.0 * -1.5) * dt, rel=1e-12)
@@ -356,12 +464,20 @@ def test_every_episode_is_measured_with_the_motor_that_was_drawn_for_it():
     arms = [episode.actuator.motor.arm_radius for episode in episodes]
     assert len(set(arms)) == 3
     alone = [summarize("pendulum", [episode]) for episode in episodes]
-    errors = [np.repeat(e.signals["desired_force"], e.inner_steps) - e.trace["actual_force"] for e in episodes]
+    errors = [
+        np.repeat(e.signals["desired_force"], e.inner_steps) - e.trace["actual_force"]
+        for e in episodes
+    ]
     assert result.tracking_max == pytest.approx(np.abs(np.array(errors).T * arms).max(), rel=1e-12)
     fastest = [max(abs(e.state[0, 1]), np.abs(e.trace["speed"]).max()) for e in episodes]
     assert result.peak_speed == pytest.approx(max(np.array(fastest) / arms), rel=1e-12)
-    powers = [e.actuator.motor.resistance * one.rms_current**2 for e, one in zip(episodes, alone, strict=True)]
-    assert result.copper_loss.mean == pytest.approx(np.mean(powers) * episodes[0].time[-1], rel=1e-12)
+    powers = [
+        e.actuator.motor.resistance * one.rms_current**2
+        for e, one in zip(episodes, alone, strict=True)
+    ]
+    assert result.copper_loss.mean == pytest.approx(
+        np.mean(powers) * episodes[0].time[-1], rel=1e-12
+    )
 
 
 # -- the whole ----------------------------------------------------------------------------------------------
@@ -372,11 +488,18 @@ def test_an_evaluation_is_the_summary_of_its_episodes_and_says_what_it_was_measu
     late = {"command_delay": 0.01}
     env = EnvConfig("cartpole", actuator, "analytic", inner_steps=2, disturbances=late)
     make = functools.partial(
-        gymnasium.make, "codrl_mj/CartPole-v0", actuator=actuator, physics="analytic", inner_steps=2, disturbances=late
+        gymnasium.make,
+        "codrl_mj/CartPole-v0",
+        actuator=actuator,
+        physics="analytic",
+        inner_steps=2,
+        disturbances=late,
     )
     for deterministic in (True, False):
         result = evaluate(Leaner(), env, 3, seed=9, deterministic=deterministic)
-        expected = summarize("cartpole", run_episodes(Leaner(), make, 3, seed=9, deterministic=deterministic))
+        expected = summarize(
+            "cartpole", run_episodes(Leaner(), make, 3, seed=9, deterministic=deterministic)
+        )
         for name in MEASURES:
             assert getattr(result, name) == getattr(expected, name), name
         assert EnvConfig.from_mapping(result.conditions["env"]) == env
@@ -384,10 +507,16 @@ def test_an_evaluation_is_the_summary_of_its_episodes_and_says_what_it_was_measu
 
 
 def test_an_evaluation_is_json_with_a_unit_for_every_measure():
-    result = evaluate(Constant(0.4), EnvConfig("pendulum", "weak", max_episode_steps=30), episodes=2)
+    result = evaluate(
+        Constant(0.4), EnvConfig("pendulum", "weak", max_episode_steps=30), episodes=2
+    )
     mapping = result.as_mapping()
     assert json.loads(json.dumps(mapping)) == mapping
-    assert mapping["returns"] == {"mean": result.returns.mean, "low": result.returns.low, "high": result.returns.high}
+    assert mapping["returns"] == {
+        "mean": result.returns.mean,
+        "low": result.returns.low,
+        "high": result.returns.high,
+    }
     assert mapping["units"].keys() == MEASURES.keys() <= mapping.keys()
     assert (mapping["units"]["energy_drawn"], mapping["units"]["tracking_rms"]) == ("J", "N*m")
     assert {"tracking_lag", "mechanical_work", "time_to_goal", "success"} < MEASURES.keys()

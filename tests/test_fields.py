@@ -37,11 +37,15 @@ NOT_REAL = st.sampled_from([True, False, np.True_, "1", None, [1.0], (1.0,), 1j,
 
 def _settings(field):
     """A class of one field, checked when it is made."""
-    return dataclasses.make_dataclass("Settings", [("field", object, field)], frozen=True, bases=(Checked,))
+    return dataclasses.make_dataclass(
+        "Settings", [("field", object, field)], frozen=True, bases=(Checked,)
+    )
 
 
 def _refusal(kind, value):
-    with pytest.raises(ValueError, match=rf"^Settings\.field = {re.escape(repr(value))}: must be ") as refused:
+    with pytest.raises(
+        ValueError, match=rf"^Settings\.field = {re.escape(repr(value))}: must be "
+    ) as refused:
         kind(field=value)
     return str(refused.value).partition(": must be ")[2]
 
@@ -131,7 +135,12 @@ def test_a_choice_is_one_of_its_words():
 @pytest.mark.parametrize(
     ("field", "good", "bad", "bound"),
     [
-        (units((64,)), [(1,), (), (2, 3)], [(0,), (1.5,), [64], (True,), 64], "a tuple of integers >= 1"),
+        (
+            units((64,)),
+            [(1,), (), (2, 3)],
+            [(0,), (1.5,), [64], (True,), 64],
+            "a tuple of integers >= 1",
+        ),
         (
             factors(),
             [(1.0, 2), None],
@@ -176,7 +185,11 @@ class Outer(Checked):
 
 @given(st.floats(0, 10), st.integers(1, 9), st.none() | st.floats(0, 10))
 def test_nested_mappings_build_what_they_say(gain, size, other):
-    mapping = {"size": size, "always": {"gain": gain}, "maybe": None if other is None else {"gain": other}}
+    mapping = {
+        "size": size,
+        "always": {"gain": gain},
+        "maybe": None if other is None else {"gain": other},
+    }
     expected = Outer(size, Inner(gain), None if other is None else Inner(other))
     assert build(Outer, mapping, "field") == expected
     assert build(Outer, dataclasses.asdict(expected), "field") == expected
@@ -224,23 +237,47 @@ def test_names_are_refused_exactly_if_they_are_not_known(given_names, known):
 
 
 FLAGS = [
-    *("--actuators", "--env.levels", "--env.timestep", "--env.disturbances.command-delay", "--actuator.supply.voltage"),
-    *(f"--actuator.motor.{one}" for one in ("resistance", "inductance", "coulomb-friction", "viscous-friction")),
-    *("--actuator.motor.arm-radius", "--actuator.motor.rotor-inertia", "--actuator.controller.max-current"),
+    *(
+        "--actuators",
+        "--env.levels",
+        "--env.timestep",
+        "--env.disturbances.command-delay",
+        "--actuator.supply.voltage",
+    ),
+    *(
+        f"--actuator.motor.{one}"
+        for one in ("resistance", "inductance", "coulomb-friction", "viscous-friction")
+    ),
+    *(
+        "--actuator.motor.arm-radius",
+        "--actuator.motor.rotor-inertia",
+        "--actuator.controller.max-current",
+    ),
 ]
 
 
 @pytest.mark.parametrize(
     ("flag", "near"),
     {
-        "--actuator.motor.friction": ["--actuator.motor.coulomb-friction", "--actuator.motor.viscous-friction"],
+        "--actuator.motor.friction": [
+            "--actuator.motor.coulomb-friction",
+            "--actuator.motor.viscous-friction",
+        ],
         "--actuator.motor.inertia": ["--actuator.motor.rotor-inertia"],
         "--actuator.controller.current": ["--actuator.controller.max-current"],
         "--actuator.motor.inductanse": ["--actuator.motor.inductance"],
         "--actuator.motr.inductance": ["--actuator.motor.inductance"],
         "--env.delay": ["--env.disturbances.command-delay"],
         "--env.time-step": ["--env.timestep"],
-        **{flag: [] for flag in ("--actuator.backlash", "--actuator.motor.backlash", "--backlash", "--env.encoder")},
+        **{
+            flag: []
+            for flag in (
+                "--actuator.backlash",
+                "--actuator.motor.backlash",
+                "--backlash",
+                "--env.encoder",
+            )
+        },
     }.items(),
 )
 def test_a_suggestion_means_the_same_and_where_nothing_does_there_is_none(flag, near):

@@ -35,7 +35,9 @@ def test_an_exception_leaves_the_folder_as_it_was(tmp_path, error, existing):
     with pytest.raises(error), writing(target) as temporary:  # noqa: PT012 - half of the block must run
         temporary.write_text("half of it")
         raise error
-    assert [path.read_text() for path in tmp_path.iterdir()] == ([] if existing is None else [existing])
+    assert [path.read_text() for path in tmp_path.iterdir()] == (
+        [] if existing is None else [existing]
+    )
 
 
 def test_a_full_disk_while_writing_json_leaves_nothing(tmp_path, monkeypatch):
@@ -57,7 +59,9 @@ def test_failing_to_replace_a_folder_leaves_no_temporary_file(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
-@pytest.mark.parametrize(("mask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664), (0, 0o666)])
+@pytest.mark.parametrize(
+    ("mask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664), (0, 0o666)]
+)
 def test_permissions_follow_the_umask(tmp_path, mask, mode):
     before = os.umask(mask)
     try:
@@ -72,7 +76,12 @@ def test_permissions_follow_the_umask(tmp_path, mask, mode):
 def test_json_is_indented_in_folders_that_are_made_and_survives_the_round_trip(tmp_path):
     write_json(tmp_path / "a" / "b" / "c.json", [1])
     assert (tmp_path / "a" / "b" / "c.json").read_text() == "[\n  1\n]\n"
-    content = {"text": "ω [rad/s]", "list": [1, 2.5, None, True], "nested": {"limit": float("inf")}, "small": 1e-17}
+    content = {
+        "text": "ω [rad/s]",
+        "list": [1, 2.5, None, True],
+        "nested": {"limit": float("inf")},
+        "small": 1e-17,
+    }
     write_json(tmp_path / "a.json", content)
     assert read_json(tmp_path / "a.json", "thing") == content
 
@@ -85,7 +94,9 @@ def test_what_is_sealed_is_read_as_it_was_and_its_order_does_not_matter(tmp_path
     write_json(tmp_path / "sealed.json", sealed(CONTENT))
     content = json.loads((tmp_path / "sealed.json").read_text())
     write_json(tmp_path / "turned.json", dict(reversed(content.items())))
-    plain, read, turned = (read_json(tmp_path / f"{name}.json", "thing") for name in ("plain", "sealed", "turned"))
+    plain, read, turned = (
+        read_json(tmp_path / f"{name}.json", "thing") for name in ("plain", "sealed", "turned")
+    )
     assert repr(read) == repr(plain)  # NaN is not equal to itself
     assert sorted(turned) == sorted(plain)
 
@@ -106,7 +117,10 @@ def test_what_is_sealed_and_was_changed_is_refused_until_its_seal_is_deleted(tmp
     path, content = tmp_path / "a.json", sealed(CONTENT)
     change(content)
     write_json(path, content)
-    with pytest.raises(ValueError, match=r"a\.json is not the thing that was written: .* delete its entry sha256 if"):
+    with pytest.raises(
+        ValueError,
+        match=r"a\.json is not the thing that was written: .* delete its entry sha256 if",
+    ):
         read_json(path, "thing")
     del content["sha256"]
     write_json(path, content)
@@ -119,7 +133,11 @@ def test_what_is_sealed_and_was_changed_is_refused_until_its_seal_is_deleted(tmp
         (b"", ValueError, "{path} is not a run configuration: it is truncated or not JSON"),
         (b'{"a": 1', ValueError, "{path} is not a run configuration: it is truncated or not JSON"),
         (b"not json", ValueError, "{path} is not a run configuration: it is truncated or not JSON"),
-        (b"\xff\xfe\x00binary", ValueError, "{path} is not a run configuration: it is truncated or not JSON"),
+        (
+            b"\xff\xfe\x00binary",
+            ValueError,
+            "{path} is not a run configuration: it is truncated or not JSON",
+        ),
         (None, FileNotFoundError, "no run configuration at {path}"),
         ("a folder", FileNotFoundError, "no run configuration at {path}"),
     ],

@@ -29,7 +29,9 @@ print(json.dumps(found | {"board": loaded()}))
 def found():
     """What a process without a display has after one import and the next."""
     clean = {
-        name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
     }
     line = [sys.executable, "-c", PROGRAM]
     done = subprocess.run(line, env=clean, capture_output=True, text=True, timeout=120, check=True)
@@ -67,9 +69,18 @@ def test_rendering_goes_through_egl(found):
         ({"MUJOCO_GL": "osmesa"}, False, "osmesa"),
         ({}, True, None),  # too late: mujoco has read it
     ],
-    ids=["no display", "X11", "Wayland", "empty display", "chosen by the user", "mujoco imported first"],
+    ids=[
+        "no display",
+        "X11",
+        "Wayland",
+        "empty display",
+        "chosen by the user",
+        "mujoco imported first",
+    ],
 )
-def test_but_not_where_there_is_a_display_or_another_was_chosen(monkeypatch, environment, imported, expected):
+def test_but_not_where_there_is_a_display_or_another_was_chosen(
+    monkeypatch, environment, imported, expected
+):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
@@ -82,7 +93,9 @@ def test_but_not_where_there_is_a_display_or_another_was_chosen(monkeypatch, env
 
 
 def test_every_public_name_can_be_had_and_listed():
-    assert all(getattr(codrl_mj, name) is not None and name in dir(codrl_mj) for name in codrl_mj.__all__)
+    assert all(
+        getattr(codrl_mj, name) is not None and name in dir(codrl_mj) for name in codrl_mj.__all__
+    )
 
 
 def test_an_unknown_name_is_an_attribute_error():

@@ -68,7 +68,9 @@ def printed(cache, program, *words):
     """What a new process prints that keeps its code in a folder."""
     environment = {**os.environ, "CODRL_MJ_CACHE": str(cache)}
     command = [sys.executable, "-c", program, *map(str, words)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300).stdout
+    return subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=True, timeout=300
+    ).stdout
 
 
 def function(factor):
@@ -120,7 +122,9 @@ LONG        return factor * value + 0.0 * total
     return outer
 
 print([made(float(word))(1.0) for word in sys.argv[1:]])
-""".replace("LONG", "        total += math.sin(value) + math.cos(total) * math.exp(-total * total)\n" * 40)
+""".replace(
+    "LONG", "        total += math.sin(value) + math.cos(total) * math.exp(-total * total)\n" * 40
+)
 
 
 def test_functions_of_one_name_that_two_processes_compiled_stay_apart(place):
@@ -131,7 +135,9 @@ def test_functions_of_one_name_that_two_processes_compiled_stay_apart(place):
     assert printed(place, TWINS, 5.0, 3.0, 2.0).strip() == "[30.0, 18.0, 12.0]"
 
 
-@pytest.mark.parametrize(("length", "more"), [(-1, b""), (0, b""), (32, b"x" * 500), (0, bytes(range(200)))])
+@pytest.mark.parametrize(
+    ("length", "more"), [(-1, b""), (0, b""), (32, b"x" * 500), (0, bytes(range(200)))]
+)
 def test_what_is_damaged_is_compiled_anew(place, length, more):
     function(6.0)(1.0)
     (file,) = place.iterdir()
@@ -147,7 +153,11 @@ def test_two_that_write_at_once_leave_whole_files(place):
     kept._write(place / "one.code", contents[0])
     with ThreadPoolExecutor(3) as pool:
         for content in contents:
-            pool.submit(lambda content=content: [kept._write(place / "one.code", content) for _ in range(30)])
+            pool.submit(
+                lambda content=content: [
+                    kept._write(place / "one.code", content) for _ in range(30)
+                ]
+            )
         found = [*pool.map(lambda _: kept._read(place / "one.code"), range(60))]
     assert set(found) <= set(contents)
     assert [path.name for path in place.iterdir()] == ["one.code"]
@@ -201,13 +211,19 @@ def entry_of(table):
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        ((lambda: function(2.0)(3.0), 6.0), (lambda: function(4.0)(3.0), 12.0)),  # what it closes over
+        (
+            (lambda: function(2.0)(3.0), 6.0),
+            (lambda: function(4.0)(3.0), 12.0),
+        ),  # what it closes over
         ((lambda: function(2.0)(3.0), 6.0), (lambda: function(2.0)(3), 6.0)),  # types
         (
             (lambda: kept.njit(divided, error_model="numpy")(2.0), 0.5),
             (lambda: kept.njit(divided)(2.0), 0.5),
         ),  # options
-        ((lambda: entry_of(np.arange(3.0))(1), 1.0), (lambda: entry_of(np.arange(3.0) + 1.0)(1), 2.0)),  # contents
+        (
+            (lambda: entry_of(np.arange(3.0))(1), 1.0),
+            (lambda: entry_of(np.arange(3.0) + 1.0)(1), 2.0),
+        ),  # contents
     ],
 )
 def test_what_is_the_same_is_compiled_once_and_what_is_another_anew(place, one, other):
@@ -256,7 +272,9 @@ ANOTHER = type("Other", (str,), {"flatten": str})("another")
         lambda _: (kept._PACKAGE / "a.py").write_text("x = 2"),
     ],
 )
-def test_versions_cpu_settings_and_this_packages_source_are_in_the_key(place, tmp_path, monkeypatch, change):
+def test_versions_cpu_settings_and_this_packages_source_are_in_the_key(
+    place, tmp_path, monkeypatch, change
+):
     monkeypatch.setattr(kept, "_PACKAGE", tmp_path)
     (tmp_path / "a.py").write_text("x = 1")
     kept._foundation.cache_clear()

@@ -19,7 +19,9 @@ def test_a_policy_does_what_it_did(name):
     Not to the last bit: a network's float32 sums are in another order on another processor.
     """
     run = RUNS / name
-    now = evaluate(load_policy(run), load_config(run).evaluation_env, 2, EVALUATION_SEED).as_mapping()
+    now = evaluate(
+        load_policy(run), load_config(run).evaluation_env, 2, EVALUATION_SEED
+    ).as_mapping()
     then = json.loads((run / "evaluation.json").read_text())
     then["units"], now["units"] = None, None  # there are more measures now
     kept = then.keys() - {"conditions"}
@@ -36,4 +38,6 @@ def check_close(ours, theirs, where):
         for key in keys:
             check_close(ours[key], theirs[key], f"{where}/{key}")
     else:
-        assert ours == (pytest.approx(theirs, rel=1e-6) if isinstance(theirs, float) else theirs), where
+        assert ours == (pytest.approx(theirs, rel=1e-6) if isinstance(theirs, float) else theirs), (
+            where
+        )

@@ -12,7 +12,8 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "codrl_mj"
 
 ALLOWED = {
-    # a layer: a room, a module at the top, or a module that stands lower than its room -> the layers it may import
+    # a layer: a room, a module at the top, or a module that stands lower than its room -> the
+    # layers it may import
     "fields": set(),
     "own_code": {"fields"},
     "actuators": {"catalogue", "fields", "own_code"},
@@ -28,11 +29,28 @@ ALLOWED = {
     "envs.worlds": {"actuators", "engine", "own_code", "tasks"},
     "envs.config": {"actuators", "disturbances", "envs.distributions", "envs.worlds", "fields"},
     "envs": {
-        *("actuators", "disturbances", "engine", "envs.config", "envs.distributions", "envs.worlds", "fields"),
+        *(
+            "actuators",
+            "disturbances",
+            "engine",
+            "envs.config",
+            "envs.distributions",
+            "envs.worlds",
+            "fields",
+        ),
         *("kept", "own_code", "physics", "tasks"),
     },
     "foreign": {
-        *("actuators", "disturbances", "engine", "envs", "envs.config", "envs.distributions", "fields", "physics"),
+        *(
+            "actuators",
+            "disturbances",
+            "engine",
+            "envs",
+            "envs.config",
+            "envs.distributions",
+            "fields",
+            "physics",
+        ),
         *("envs.worlds", "own_code", "tasks"),
     },
     "making": {"envs", "envs.config", "envs.worlds", "foreign"},
@@ -44,7 +62,16 @@ ALLOWED = {
     "runs.policies": {"actuators", "agents", "envs.config", "runs.files", "runs"},
     "evaluation.measures": set(),
     "evaluation": {
-        *("actuators", "envs", "envs.config", "envs.worlds", "evaluation.measures", "fields", "physics", "runs.files"),
+        *(
+            "actuators",
+            "envs",
+            "envs.config",
+            "envs.worlds",
+            "evaluation.measures",
+            "fields",
+            "physics",
+            "runs.files",
+        ),
         *("runs.policies", "tasks"),
     },
     "deploy": {
@@ -55,7 +82,16 @@ ALLOWED = {
     "replay": {"envs", "envs.config", "evaluation", "runs.files"},
     "view": {"actuators", "envs.config", "evaluation", "fields", "replay"},
     "training": {
-        *("actuators", "agents", "disturbances", "envs", "envs.config", "evaluation", "runs.files", "runs"),
+        *(
+            "actuators",
+            "agents",
+            "disturbances",
+            "envs",
+            "envs.config",
+            "evaluation",
+            "runs.files",
+            "runs",
+        ),
         *("runs.policies", "tasks", "own_code", "fields", "foreign", "pages.plots"),
     },
     "drives": {
@@ -63,20 +99,63 @@ ALLOWED = {
         *("runs.policies", "tasks", "training"),
     },
     "pages.plots": {"runs.files"},
-    "validation": {"actuators", "catalogue", "engine", "pages.plots", "physics", "runs.files", "tasks", "own_code"},
+    "validation": {
+        "actuators",
+        "catalogue",
+        "engine",
+        "pages.plots",
+        "physics",
+        "runs.files",
+        "tasks",
+        "own_code",
+    },
     "study": {
-        *("actuators", "disturbances", "envs.config", "evaluation", "evaluation.measures", "fields", "films"),
+        *(
+            "actuators",
+            "disturbances",
+            "envs.config",
+            "evaluation",
+            "evaluation.measures",
+            "fields",
+            "films",
+        ),
         *("drives", "engine", "runs.files", "runs.policies", "tasks", "training"),
     },
     "rl_zoo3": set(),
     "identify": {"actuators", "catalogue", "fields", "kept", "runs.files", "own_code"},
     "pages": {
-        *("__init__", "actuators", "catalogue", "drives", "evaluation", "films", "foreign", "identify"),
-        *("pages.plots", "replay", "runs.files", "runs", "runs.policies", "runs.summaries", "tasks", "training"),
+        *(
+            "__init__",
+            "actuators",
+            "catalogue",
+            "drives",
+            "evaluation",
+            "films",
+            "foreign",
+            "identify",
+        ),
+        *(
+            "pages.plots",
+            "replay",
+            "runs.files",
+            "runs",
+            "runs.policies",
+            "runs.summaries",
+            "tasks",
+            "training",
+        ),
         "validation",
     },
     "cli": {
-        *("actuators", "agents", "catalogue", "disturbances", "envs.config", "envs.worlds", "evaluation"),
+        *(
+            "actuators",
+            "agents",
+            "catalogue",
+            "disturbances",
+            "envs.config",
+            "envs.worlds",
+            "evaluation",
+        ),
         *("deploy", "evaluation.measures", "fields", "films", "kept", "own_code"),
         *(
             "foreign",
@@ -164,7 +243,9 @@ def _modules(path):
 @functools.cache
 def _ours(path):
     """Our layers that a file imports; names that are no module or package of ours are attributes of it."""
-    names = {name.removeprefix("codrl_mj.") for name in _modules(path) if name.startswith("codrl_mj.")}
+    names = {
+        name.removeprefix("codrl_mj.") for name in _modules(path) if name.startswith("codrl_mj.")
+    }
     return {_layer(name) for name in names if _is_module(name)}
 
 
@@ -204,17 +285,24 @@ def test_no_layers_import_each_other_in_a_circle():
 @pytest.mark.parametrize("layer", FOREIGN)
 def test_a_layer_imports_only_its_own_libraries(layer):
     for path in _files(layer):
-        roots = {name.split(".")[0] for name in _modules(path)} - {"codrl_mj"} - set(sys.stdlib_module_names)
+        roots = (
+            {name.split(".")[0] for name in _modules(path)}
+            - {"codrl_mj"}
+            - set(sys.stdlib_module_names)
+        )
         assert roots <= FOREIGN[layer], path
 
 
 def test_tasks_take_from_gymnasium_only_spaces_reset_bounds_and_its_registry():
     for path in _files("tasks"):
-        names = {name for name in _modules(path) if name.startswith("gymnasium.")}  # twins make environments
+        names = {
+            name for name in _modules(path) if name.startswith("gymnasium.")
+        }  # twins make environments
         packages = {name for other in GYMNASIUM_IN_TASKS for name in (other.rpartition(".")[0],)}
-        assert all(name in packages or any(name.startswith(good) for good in GYMNASIUM_IN_TASKS) for name in names), (
-            path
-        )
+        assert all(
+            name in packages or any(name.startswith(good) for good in GYMNASIUM_IN_TASKS)
+            for name in names
+        ), path
 
 
 def test_nothing_imports_the_command_line():

@@ -32,11 +32,17 @@ REACHER = {".*": "lag"}
     [
         (("pendulum", "weak"), lambda: gym.make("codrl_mj/Pendulum-v0", actuator="weak")),
         (("codrl_mj/Pendulum-v0",), lambda: gym.make("codrl_mj/Pendulum-v0")),
-        ((codrl_mj.EnvConfig("pendulum", "weak"),), lambda: gym.make("codrl_mj/Pendulum-v0", actuator="weak")),
+        (
+            (codrl_mj.EnvConfig("pendulum", "weak"),),
+            lambda: gym.make("codrl_mj/Pendulum-v0", actuator="weak"),
+        ),
         (("InvertedPendulum-v5",), lambda: gym.make("InvertedPendulum-v5")),
         (("Reacher-v5", "lag"), lambda: codrl_mj.EnvConfig("Reacher-v5", REACHER).make()),
         (("Reacher-v5", REACHER), lambda: codrl_mj.make("Reacher-v5", Lag())),
-        ((functools.partial(gym.make, "Reacher-v5"), "lag"), lambda: codrl_mj.make("Reacher-v5", "lag")),
+        (
+            (functools.partial(gym.make, "Reacher-v5"), "lag"),
+            lambda: codrl_mj.make("Reacher-v5", "lag"),
+        ),
     ],
     ids=["task", "id", "configuration", "without motors", "one for all", "by pattern", "function"],
 )
@@ -62,7 +68,9 @@ def test_many_are_as_one_by_one(given, options, kind):
     assert isinstance(envs, kind)
     seen, _ = envs.reset(seed=7)
     envs.single_action_space.seed(0)
-    actions = [np.stack([envs.single_action_space.sample() for _ in range(num_envs)]) for _ in range(3)]
+    actions = [
+        np.stack([envs.single_action_space.sample() for _ in range(num_envs)]) for _ in range(3)
+    ]
     for index in range(num_envs):
         alone = codrl_mj.make(env, *actuator, **options)
         np.testing.assert_array_equal(alone.reset(seed=7 + index)[0], seen[index])
@@ -79,7 +87,13 @@ def test_a_time_limit_that_is_given_is_the_one_that_holds(limit):
         codrl_mj.make_vec("HalfCheetah-v5", 1, "lag", max_episode_steps=limit),
         codrl_mj.make_vec(codrl_mj.EnvConfig("HalfCheetah-v5", "lag"), 1, max_episode_steps=limit),
         codrl_mj.make_sb3_vec_env(
-            "HalfCheetah-v5", 1, actuator="lag", max_episode_steps=limit, render_mode="rgb_array", width=64, height=48
+            "HalfCheetah-v5",
+            1,
+            actuator="lag",
+            max_episode_steps=limit,
+            render_mode="rgb_array",
+            width=64,
+            height=48,
         ),
     )
     for env in faces:
@@ -100,11 +114,15 @@ def test_what_is_given_beside_a_configuration_is_set_over_it(view):
         assert env.spec.max_episode_steps == 7
     envs = codrl_mj.make_vec(config, 2, "weak", max_episode_steps=7, **view)
     envs.reset()
-    assert [envs.step(np.zeros((2, 1), np.float32))[3].all() for _ in range(7)] == [False] * 6 + [True]
+    assert [envs.step(np.zeros((2, 1), np.float32))[3].all() for _ in range(7)] == [False] * 6 + [
+        True
+    ]
     envs.close()
 
 
-@pytest.mark.parametrize("made", [codrl_mj.make, lambda env, *actuator: codrl_mj.make_vec(env, 1, *actuator)])
+@pytest.mark.parametrize(
+    "made", [codrl_mj.make, lambda env, *actuator: codrl_mj.make_vec(env, 1, *actuator)]
+)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

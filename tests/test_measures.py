@@ -23,8 +23,13 @@ from codrl_mj.evaluation.measures import (
 
 @pytest.mark.parametrize("count", [2, 3, 10, 57, 1000])
 def test_means_and_their_intervals_are_scipys_to_the_bit(count):
-    for values in (np.random.default_rng(count).gamma(4.0, 30.0, size=count), np.arange(float(count)) ** 2):
-        theirs = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+    for values in (
+        np.random.default_rng(count).gamma(4.0, 30.0, size=count),
+        np.arange(float(count)) ** 2,
+    ):
+        theirs = scipy.stats.bootstrap(
+            (values,), np.mean, method="percentile", rng=0
+        ).confidence_interval
         assert bootstrap_mean(values) == (np.mean(values), theirs.low, theirs.high)
         assert interquartile_mean(values) == scipy.stats.trim_mean(values, 0.25)
 
@@ -36,7 +41,9 @@ def test_the_interval_of_a_rate_is_scipys_to_the_bit(trials):
         assert wilson_rate(successes, trials) == (successes / trials, theirs.low, theirs.high)
 
 
-@pytest.mark.parametrize("values", [[500.0] * 100, [-3.25], [0.1] * 3], ids=["many", "one", "three"])
+@pytest.mark.parametrize(
+    "values", [[500.0] * 100, [-3.25], [0.1] * 3], ids=["many", "one", "three"]
+)
 def test_values_without_spread_have_an_interval_without_width(values):
     mean, low, high = bootstrap_mean(np.array(values))
     assert low == mean == high == pytest.approx(values[0], rel=1e-15)
@@ -59,7 +66,10 @@ def test_a_condition_holds_from_its_last_breach_on(held):
 
 def swing(times):
     """Three sinusoids of incommensurate periods (from 12 samples), each of which a delay shifts."""
-    return sum(weight * np.sin(rate * times + rate) for rate, weight in ((0.13, 1.0), (0.31, 0.7), (0.52, 0.4)))
+    return sum(
+        weight * np.sin(rate * times + rate)
+        for rate, weight in ((0.13, 1.0), (0.31, 0.7), (0.52, 0.4))
+    )
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.2, 0.5, 0.8, 2.25, 7.0, 13.4])
@@ -80,20 +90,26 @@ def test_the_delay_through_a_first_order_lag_is_that_of_its_phase(rate):
 @pytest.mark.parametrize("shift", [4.0, 9.7])
 def test_the_delay_of_a_sinusoid_is_within_its_period(shift):
     times = np.arange(20_000)
-    assert delay([np.sin(0.5 * times)], [np.sin(0.5 * (times - shift))], 1.0) == pytest.approx(shift, abs=0.01)
+    assert delay([np.sin(0.5 * times)], [np.sin(0.5 * (times - shift))], 1.0) == pytest.approx(
+        shift, abs=0.01
+    )
 
 
 def test_the_delay_is_that_of_all_episodes_together():
     random = np.random.default_rng(3)
     desired = [random.normal(size=size) for size in (400, 3, 150, 1000)]
     actual = [np.concatenate([random.normal(size=6), signal])[: len(signal)] for signal in desired]
-    assert delay(desired, actual, 0.5) == pytest.approx(3.0, abs=0.05)  # noise beside the peak: 1/sqrt(1500) samples
+    assert delay(desired, actual, 0.5) == pytest.approx(
+        3.0, abs=0.05
+    )  # noise beside the peak: 1/sqrt(1500) samples
 
 
 def test_motors_whose_torques_have_means_of_their_own_lag_as_each_of_them():
     """A mean that one motor holds says nothing of lateness, and must not hide that of the others."""
     rng = np.random.default_rng(0)
-    desired = [offset + rng.normal(size=400) for _ in range(3) for offset in (20.0, -20.0)]  # two motors in turn
+    desired = [
+        offset + rng.normal(size=400) for _ in range(3) for offset in (20.0, -20.0)
+    ]  # two motors in turn
     actual = [np.concatenate([np.full(4, signal.mean()), signal[:-4]]) for signal in desired]
     alone = [delay(desired[motor::2], actual[motor::2], 0.01) for motor in (0, 1)]
     assert alone == pytest.approx([0.04, 0.04], abs=1e-3)
@@ -115,7 +131,9 @@ STILL = np.full(9, 2.0)
         (swing(np.arange(2000)), swing(np.arange(2000) + 0.4), 0.0),  # it leads
     ],
 )
-def test_what_does_not_follow_has_no_delay_and_what_leads_no_negative_one(desired, actual, expected):
+def test_what_does_not_follow_has_no_delay_and_what_leads_no_negative_one(
+    desired, actual, expected
+):
     assert delay([desired], [actual], 1.0) == expected
 
 

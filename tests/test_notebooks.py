@@ -7,7 +7,10 @@ import pytest
 
 FOLDER = Path(__file__).parent.parent / "examples"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-SHORT = {'preset("furuta", "ppo", seed=0)': 'preset("furuta", "ppo", seed=0, total_steps=4096)', "40_000": "4096"}
+SHORT = {
+    'preset("furuta", "ppo", seed=0)': 'preset("furuta", "ppo", seed=0, total_steps=4096)',
+    "40_000": "4096",
+}
 """What takes a reader a minute -> what takes a test seconds."""
 
 
@@ -32,7 +35,9 @@ def test_a_notebook_is_kept_as_it_ran_and_small(path):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_links_to_what_exists(path):
-    text = "".join("".join(cell["source"]) for cell in cells_of(path) if cell["cell_type"] == "markdown")
+    text = "".join(
+        "".join(cell["source"]) for cell in cells_of(path) if cell["cell_type"] == "markdown"
+    )
     links = [part.partition(")")[0] for part in text.split("](")[1:]]
     assert links
     for link in links:
@@ -51,4 +56,6 @@ def test_a_notebook_runs(path, tmp_path, monkeypatch):
     for cell in notebook.cells:
         for long, short in SHORT.items():
             cell.source = cell.source.replace(long, short)
-    client.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    client.NotebookClient(
+        notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()

@@ -45,7 +45,9 @@ def test_a_task_with_a_slip_is_refused_when_it_is_made(field, value):
 
 
 @pytest.mark.parametrize(("part", "value"), slips.FAMILIES, ids=name_of)
-def test_a_family_with_a_slip_is_refused_at_every_door_before_it_is_compiled(part, value, monkeypatch):
+def test_a_family_with_a_slip_is_refused_at_every_door_before_it_is_compiled(
+    part, value, monkeypatch
+):
     family = slips.family(**{part: value})
     monkeypatch.setattr(sys.modules[__name__], "FOUND", family)
     begins = r"slips?\.py:\d+, in |Slipped|unknown (signal SIGNAL_UNITS|field RANDOM)"
@@ -60,7 +62,10 @@ def test_a_family_that_is_no_dataclass_or_has_no_advance_is_refused():
     class Idle(codrl_mj.actuators.ActuatorModel):
         pass
 
-    refused(lambda: load_family(Undecorated), "Undecorated: must be decorated with @dataclasses.dataclass")
+    refused(
+        lambda: load_family(Undecorated),
+        "Undecorated: must be decorated with @dataclasses.dataclass",
+    )
     refused(lambda: load_family(Idle), "Idle: has no `advance`")
 
 
@@ -82,7 +87,11 @@ def test_what_only_numba_can_refuse_is_a_sentence_too(name, body):
 def test_the_message_has_what_numba_says_of_it_and_where():
     task = slips.task(reward="x = next_state[0]\n    return float(np.linalg.norm(x))")
     told = refused(lambda: compiled_outcomes(task))
-    assert told == "slip.py:3, in reward: numba does not compile it: np.linalg.norm() only supported for array types"
+    assert (
+        told
+        == "slip.py:3, in reward: numba does not compile it: np.linalg.norm() only supported for"
+        " array types"
+    )
 
 
 @pytest.mark.parametrize("called", ["plain(state)", "tests.slips.plain(state)"])
@@ -91,7 +100,9 @@ def test_functions_that_a_function_calls_are_found_by_their_names_or_their_packa
     assert [terminated(np.array([position, 0.0, 0.0])) for position in (0.5, 1.5)] == [False, True]
 
 
-@pytest.mark.parametrize(("face", "every"), but([("vector", 4)], [("vector", 4), *((one, 1) for one in FACES)]))
+@pytest.mark.parametrize(
+    ("face", "every"), but([("vector", 4)], [("vector", 4), *((one, 1) for one in FACES)])
+)
 def test_no_slip_ends_the_process(face, every):
     program = [sys.executable, "-m", "tests.slips", face, str(every)]
     done = subprocess.run(program, capture_output=True, text=True, timeout=600, check=False)
@@ -112,7 +123,9 @@ def test_an_integer_or_a_flag_among_the_numbers_is_a_number():
     )
     codrl_mj.register(task)
     slips.run("single", task)
-    envs = gymnasium.make_vec(task.env_id, 2, vectorization_mode="vector_entry_point", actuator="ideal")
+    envs = gymnasium.make_vec(
+        task.env_id, 2, vectorization_mode="vector_entry_point", actuator="ideal"
+    )
     np.testing.assert_array_equal(envs.reset(seed=0)[0], [[0.0, 1.0, 0.5]] * 2)
     assert envs.step(np.zeros((2, 1), np.float32))[1].tolist() == [1.0, 1.0]
 
@@ -122,13 +135,33 @@ MODELS = [
     # what stands in the model, what takes its place, and what is said of it
     ("RK4", "Euler", ": its <option> has integrator EULER, so Task.integrators cannot have rk4"),
     (SHOULDER, 'site="tip"/', ": actuator 'shoulder' must drive a hinge or a slide joint"),
-    ('name="elbow" axis', 'type="ball" name="elbow" axis', " has 5 positions and 4 velocities, and slip"),
+    (
+        'name="elbow" axis',
+        'type="ball" name="elbow" axis',
+        " has 5 positions and 4 velocities, and slip",
+    ),
     ("<worldbody>", "<worldbdy>", ": XML parse error"),
     (SHOULDER, 'joint="shoulder" gear="5"/', ": actuator 'shoulder': leave out its gear; "),
-    (SHOULDER, 'joint="shoulder" forcerange="-1 1"/', ": actuator 'shoulder': leave out its forcerange"),
-    (SHOULDER, 'joint="shoulder" delay="0.1" nsample="9"/', ": actuator 'shoulder': leave out its delay"),
-    ("<joint name", '<joint actuatorfrcrange="-1 1" name', ": .*leave out the actuatorfrcrange of joint 'shoulder'"),
-    ("<option", '<option actuatorgroupdisable="0"', ": actuator 'shoulder': leave out its group, which <option> dis"),
+    (
+        SHOULDER,
+        'joint="shoulder" forcerange="-1 1"/',
+        ": actuator 'shoulder': leave out its forcerange",
+    ),
+    (
+        SHOULDER,
+        'joint="shoulder" delay="0.1" nsample="9"/',
+        ": actuator 'shoulder': leave out its delay",
+    ),
+    (
+        "<joint name",
+        '<joint actuatorfrcrange="-1 1" name',
+        ": .*leave out the actuatorfrcrange of joint 'shoulder'",
+    ),
+    (
+        "<option",
+        '<option actuatorgroupdisable="0"',
+        ": actuator 'shoulder': leave out its group, which <option> dis",
+    ),
 ]
 
 
@@ -149,7 +182,9 @@ def test_a_model_that_is_not_there_is_refused_when_the_task_is_made():
 def test_the_speeds_of_a_task_follow_from_its_model():
     assert slips.task().speeds == (2,)
     assert slips.task(motors=("elbow",)).speeds == (3,)
-    assert [task.speeds for task in codrl_mj.tasks.TASKS.values() if task.name == "acrobot"] == [(3,)]
+    assert [task.speeds for task in codrl_mj.tasks.TASKS.values() if task.name == "acrobot"] == [
+        (3,)
+    ]
 
 
 def reset(task, **options):
@@ -159,14 +194,26 @@ def reset(task, **options):
 @pytest.mark.parametrize(
     ("door", "given", "message"),
     [
-        (codrl_mj.motorise, ("arm.xml", {}), r"spec = 'arm\.xml': must be .* mujoco\.MjSpec\.from_file\('arm\.xml'\)"),
-        (environments.make, ("codrl_mj/Pendulum-v0", {}), r"codrl_mj/Pendulum-v0: .* gymnasium\.make\('codrl_mj/Pend"),
+        (
+            codrl_mj.motorise,
+            ("arm.xml", {}),
+            r"spec = 'arm\.xml': must be .* mujoco\.MjSpec\.from_file\('arm\.xml'\)",
+        ),
+        (
+            environments.make,
+            ("codrl_mj/Pendulum-v0", {}),
+            r"codrl_mj/Pendulum-v0: .* gymnasium\.make\('codrl_mj/Pend",
+        ),
         (
             lambda: reset("Pendulum", xinit=0.1),
             (),
             r"unknown reset option xinit; did you mean x_init\? known: x_init, y_",
         ),
-        (lambda: reset("CartPole", low=0.0, hgih=0.1), (), r"unknown reset option hgih; did you mean high\?"),
+        (
+            lambda: reset("CartPole", low=0.0, hgih=0.1),
+            (),
+            r"unknown reset option hgih; did you mean high\?",
+        ),
     ],
 )
 def test_other_doors_say_what_they_want(door, given, message):
@@ -194,7 +241,9 @@ def test_numbers_of_a_yaml_file_are_those_of_yaml_1_2_and_json(tmp_path, text, r
 def test_what_is_no_yaml_file_is_refused_with_its_line(tmp_path):
     file = tmp_path / "read.yaml"
     for content, message in {
-        b"a: 1\nb: \xb5m": r"line 2 has the byte 0xb5 \(µ in Windows-1252\).*save the file as UTF-8",
+        b"a: 1\nb: \xb5m": (
+            r"line 2 has the byte 0xb5 \(µ in Windows-1252\).*save the file as UTF-8"
+        ),
         b"a:\n  b: 1\n  c: 2\n  b: 3": "line 4: b is given twice",
         b"[1, 2": "expected",
     }.items():
@@ -212,10 +261,16 @@ def test_an_actuator_file_names_modules_only_with_trust(tmp_path, monkeypatch, c
         return int(environment(verb, "cartpole", verb.actuator_name, EnvConfig("cartpole")) is None)
 
     monkeypatch.setattr(find_verb("evaluate"), "run", made)
-    Path("of_theirs.py").write_text("open('executed', 'w').close()\nfrom codrl_mj.actuators import Lag as Theirs\n")
+    Path("of_theirs.py").write_text(
+        "open('executed', 'w').close()\nfrom codrl_mj.actuators import Lag as Theirs\n"
+    )
     Path("theirs.yaml").write_text("family: of_theirs:Theirs\n")
     Path("all.yaml").write_text("'.*': {family: 'of_theirs:Theirs'}\n")
-    for flags in (["--actuator", "theirs.yaml"], ["--actuators", ".*=theirs.yaml"], ["--actuators", "all.yaml"]):
+    for flags in (
+        ["--actuator", "theirs.yaml"],
+        ["--actuators", ".*=theirs.yaml"],
+        ["--actuators", "all.yaml"],
+    ):
         line = ["evaluate", "run", "--task", "cartpole", *flags]
         assert main(line) == 2
         assert "'of_theirs:Theirs': needs the module of_theirs" in capsys.readouterr().err
@@ -235,13 +290,18 @@ LOCATED = itertools.count()
         ("x = 1\n  y = 2\n", 2),
         ("import json\n\nx = json.loads('{')\n", 3),  # raised inside Python's own library
         ("import dataclasses\n\n\n@dataclasses.dataclass\nclass A:\n    x: list = []\n", 4),
-        ("import scipy.linalg\n\nx = scipy.linalg.inv([[1.0, 2.0]])\n", 3),  # inside an installed one
+        (
+            "import scipy.linalg\n\nx = scipy.linalg.inv([[1.0, 2.0]])\n",
+            3,
+        ),  # inside an installed one
         ("import codrl_mj\n\nx = codrl_mj.EnvConfig('pendulm')\n", 3),  # inside ours
         ("def f():\n    return 1 / 0\n\n\nf()\n", 2),
     ],
 )
 @pytest.mark.parametrize("imported", ["itself", "by another"])
-def test_an_error_in_a_users_module_is_at_its_own_file_and_line(tmp_path, monkeypatch, text, line, imported):
+def test_an_error_in_a_users_module_is_at_its_own_file_and_line(
+    tmp_path, monkeypatch, text, line, imported
+):
     monkeypatch.syspath_prepend(tmp_path)
     name = f"located{next(LOCATED)}"
     (tmp_path / f"{name}.py").write_text(text)
@@ -280,4 +340,7 @@ def test_a_default_that_is_no_number_is_refused_with_the_task():
     class Lost(NamedTuple):
         wind: float = float("nan")
 
-    refused(lambda: slips.task(options=Lost), "Task.options = .*a typing.NamedTuple of numbers and flags")
+    refused(
+        lambda: slips.task(options=Lost),
+        "Task.options = .*a typing.NamedTuple of numbers and flags",
+    )

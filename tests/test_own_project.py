@@ -28,8 +28,17 @@ from tests.matrix import but
 from tests.own_project import arm, series_elastic, slow_motion
 from tests.training.interruptions import TERMINATE, after, differing, outcome
 
-ID, AGENT, SOFT = arm.TASK.env_id, "tests.own_project.a2c:A2CConfig", "tests.own_project.series_elastic:SOFT"
-DISTURBED = {"command_delay": 0.013, "pulse_force": 0.5, "pulse_duration": 0.05, "pulse_interval": 0.2}
+ID, AGENT, SOFT = (
+    arm.TASK.env_id,
+    "tests.own_project.a2c:A2CConfig",
+    "tests.own_project.series_elastic:SOFT",
+)
+DISTURBED = {
+    "command_delay": 0.013,
+    "pulse_force": 0.5,
+    "pulse_duration": 0.05,
+    "pulse_interval": 0.2,
+}
 
 
 @pytest.fixture(autouse=True)
@@ -54,12 +63,16 @@ def made(actuator="ideal", **arguments):
 
 def other(task=arm.TASK, **fields):
     """A variation of a task, registered as another."""
-    return codrl_mj.register(dataclasses.replace(task, name="other", env_id="own_project/Other-v0", **fields))
+    return codrl_mj.register(
+        dataclasses.replace(task, name="other", env_id="own_project/Other-v0", **fields)
+    )
 
 
 def test_the_family_runs_in_the_engine_as_in_python():
     env = made(series_elastic.SOFT)
-    parameters = codrl_mj.actuators.parameters_type(series_elastic.SeriesElastic)(*series_elastic.SOFT.numbers)
+    parameters = codrl_mj.actuators.parameters_type(series_elastic.SeriesElastic)(
+        *series_elastic.SOFT.numbers
+    )
     states = [series_elastic.State(0.0, 0.0)] * 2
     for action in actions(20, 1)[:, 0]:
         before = env.state[2:]
@@ -76,7 +89,9 @@ def test_the_family_runs_in_the_engine_as_in_python():
 CURRENT_LOOP = codrl_mj.actuators.Actuator()
 
 
-@pytest.mark.parametrize("actuator", but([SOFT, CURRENT_LOOP], ["ideal", "lag", SOFT, CURRENT_LOOP]), ids=str)
+@pytest.mark.parametrize(
+    "actuator", but([SOFT, CURRENT_LOOP], ["ideal", "lag", SOFT, CURRENT_LOOP]), ids=str
+)
 def test_a_vector_of_arms_is_the_arms_alone(actuator):
     arguments = {"actuator": actuator, "disturbances": DISTURBED}
     mode = {"autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -91,7 +106,12 @@ def test_two_motors_have_two_forces_within_their_own_limits():
     info = made().step(np.array([99.0, -99.0], np.float32))[4]
     for force in ("desired_force", "actual_force"):
         np.testing.assert_array_equal(info[force], [8.0, -3.0])
-    assert made([series_elastic.SOFT, series_elastic.SeriesElastic(stiffness=80.0)]).actuator[1].stiffness == 80.0
+    assert (
+        made([series_elastic.SOFT, series_elastic.SeriesElastic(stiffness=80.0)])
+        .actuator[1]
+        .stiffness
+        == 80.0
+    )
 
 
 @pytest.mark.parametrize(
@@ -100,7 +120,10 @@ def test_two_motors_have_two_forces_within_their_own_limits():
         ({"actuator": ["lag", series_elastic.SOFT]}, "several families"),
         ({"actuator": ["lag"] * 3}, r"3 actuators, but arm has 2 motors \(shoulder, elbow\)"),
         ({"actuator": "lag", "physics": "analytic"}, "arm rebuilds no environment of Gymnasium's"),
-        ({"actuator": "weak"}, "'weak': a variation of the paper's actuator, of which arm has none"),
+        (
+            {"actuator": "weak"},
+            "'weak': a variation of the paper's actuator, of which arm has none",
+        ),
     ],
 )
 def test_what_the_arm_does_not_have_is_said(arguments, message):
@@ -164,7 +187,9 @@ def test_attributes_of_a_task_that_is_registered_late_are_the_models():
     assert not hasattr(cartpole, "upper_mass")
     # in another process too
     code = "import pickle, sys; print(pickle.load(sys.stdin.buffer).upper_mass)"
-    done = subprocess.run([sys.executable, "-c", code], input=pickle.dumps(env), capture_output=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", code], input=pickle.dumps(env), capture_output=True, timeout=120
+    )
     assert done.stdout.strip() == b"2.0", done.stderr
 
 
@@ -184,19 +209,31 @@ def codrl(line):
 
 def test_every_command_takes_the_arm_and_loads_it_when_it_is_trusted(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    flags = "--agent.rollout-steps 16 --total-steps 64 --num-envs 4 --evaluation-episodes 1 --env.effort-weight 0.1"
+    flags = (
+        "--agent.rollout-steps 16 --total-steps 64 --num-envs 4 --evaluation-episodes 1"
+        " --env.effort-weight 0.1"
+    )
     codrl(f"train {TASK} --actuator {SOFT} --agent {AGENT} {flags} --out run")
     assert read_run(tmp_path / "run").state == "finished"
     config = load_config(tmp_path / "run", trust=True)
-    assert (config.task, config.agent.rollout_steps, config.env.options.effort_weight) == (TASK, 16, 0.1)
+    assert (config.task, config.agent.rollout_steps, config.env.options.effort_weight) == (
+        TASK,
+        16,
+        0.1,
+    )
     assert config.actuator == (series_elastic.SOFT,) * 2
     codrl("evaluate run --trust --episodes 2 --env.effort-weight 0.2 --out evaluation.json")
     codrl("render run --trust --out film.gif --trajectory episode.npz")
     assert (tmp_path / "film.gif").stat().st_size > 1000
-    codrl(f"render {TASK} --actuator lag --env.effort-weight 0.2 --env.max-episode-steps 2 --out film.gif")
+    codrl(
+        f"render {TASK} --actuator lag --env.effort-weight 0.2 --env.max-episode-steps 2 --out"
+        " film.gif"
+    )
     codrl("runs .")
     assert "arm" in capsys.readouterr().out
-    assert main(["evaluate", "run", "--episodes", "1"]) == 2  # somebody's code is not loaded unasked
+    assert (
+        main(["evaluate", "run", "--episodes", "1"]) == 2
+    )  # somebody's code is not loaded unasked
     assert "--trust" in capsys.readouterr().err
 
 
@@ -205,11 +242,17 @@ def test_advice_for_a_run_of_the_arm_is_measured_when_it_is_trusted(tmp_path):
     write_json(tmp_path / "run" / "config.json", {"train": config.as_mapping()})
     with pytest.raises(ValueError, match="--trust"):
         measurement("lag", str(tmp_path / "run"), 2, tmp_path)
-    assert measurement("lag", str(tmp_path / "run"), 2, tmp_path, trust=True).home.env.task == config.task
+    assert (
+        measurement("lag", str(tmp_path / "run"), 2, tmp_path, trust=True).home.env.task
+        == config.task
+    )
 
 
 def test_a_training_of_the_arm_that_was_stopped_comes_to_the_same_weights(tmp_path):
-    flags = "--total-steps 320 --num-envs 4 --evaluation-episodes 1 --no-tensorboard --checkpoint-interval 64"
+    flags = (
+        "--total-steps 320 --num-envs 4 --evaluation-episodes 1 --no-tensorboard"
+        " --checkpoint-interval 64"
+    )
     line = f"train {TASK} --actuator {SOFT} --agent {AGENT} {flags} --out {tmp_path}"
     codrl(f"{line}/whole")
     stopped = tmp_path / "stopped"
@@ -229,16 +272,33 @@ def test_the_command_certifies_the_arm_as_python_does_and_says_what_it_left_out(
     codrl(f"validate {TASK} --quick --out {tmp_path}")
     content = json.loads((tmp_path / "certificate.json").read_text())
     assert (content["subject"], content["verdict"]) == ("arm", "passed")
-    names = {(check["group"], check["name"]) for check in content["checks"] if check["task"] == "arm"}
-    assert {("motor", f"{kind}: {motor}") for kind in ("stable", "steps") for motor in arm.TASK.motors} <= names
-    assert {("convergence", f"order, rk4, {case}") for case in ("ideal actuator", "motor in the loop")} <= names
-    assert {("energy", f"order, {kind} balance, rk4") for kind in ("electrical", "mechanical", "whole")} <= names
-    assert {("execution", name) for name in ("batched, 2 threads", "restored", "pickled, rk4")} <= names
-    reasons = {(skip["group"], skip["name"]): skip["reason"] for skip in content["skipped"] if skip["task"] == "arm"}
+    names = {
+        (check["group"], check["name"]) for check in content["checks"] if check["task"] == "arm"
+    }
+    assert {
+        ("motor", f"{kind}: {motor}") for kind in ("stable", "steps") for motor in arm.TASK.motors
+    } <= names
+    assert {
+        ("convergence", f"order, rk4, {case}") for case in ("ideal actuator", "motor in the loop")
+    } <= names
+    assert {
+        ("energy", f"order, {kind} balance, rk4") for kind in ("electrical", "mechanical", "whole")
+    } <= names
+    assert {
+        ("execution", name) for name in ("batched, 2 threads", "restored", "pickled, rk4")
+    } <= names
+    reasons = {
+        (skip["group"], skip["name"]): skip["reason"]
+        for skip in content["skipped"]
+        if skip["task"] == "arm"
+    }
     assert "rebuilds no environment" in reasons["dynamics", "all checks"]
     assert "rebuilds no environment" in reasons["trajectories", "all checks"]
     assert "default current loop" in reasons["motor", "the paper's actuators"]
-    found = {check.name: check.worst for check in validate("arm", quick=True, groups=["convergence", "energy"]).checks}
+    found = {
+        check.name: check.worst
+        for check in validate("arm", quick=True, groups=["convergence", "energy"]).checks
+    }
     told = [check for check in content["checks"] if check["group"] in ("convergence", "energy")]
     assert found == {check["name"]: check["worst"] for check in told}
     page = (tmp_path / "certificate.html").read_text()
@@ -251,7 +311,9 @@ def test_a_registered_task_changes_nothing_for_ours(monkeypatch):
         patch.delitem(TASKS, "arm")
         alone = validate("pendulum", quick=True, groups=["motor", "execution"]).checks
     beside = validate(["arm", "pendulum"], quick=True, groups=["motor", "execution"]).checks
-    ours, expected = ([dataclasses.replace(check, plots=()) for check in checks] for checks in (beside, alone))
+    ours, expected = (
+        [dataclasses.replace(check, plots=()) for check in checks] for checks in (beside, alone)
+    )
     assert [check for check in ours if check.task != "arm"] == expected
 
 
@@ -278,7 +340,9 @@ def test_the_arms_checks_can_fail(monkeypatch):
 
 
 def skipped(groups=("convergence", "energy")):
-    return [(skip.name, skip.reason) for skip in validate("other", quick=True, groups=groups).skipped]
+    return [
+        (skip.name, skip.reason) for skip in validate("other", quick=True, groups=groups).skipped
+    ]
 
 
 def test_a_run_that_is_not_smooth_is_left_out_and_said():
@@ -290,11 +354,15 @@ def test_a_run_that_is_not_smooth_is_left_out_and_said():
 
 def test_a_hill_without_a_twin_has_no_ledger_and_says_so():
     other(TASKS["mountain_car"], twin=None, paper=())
-    assert skipped(["energy"]) == [("all checks", "its model has a hill, whose height only a twin knows")]
+    assert skipped(["energy"]) == [
+        ("all checks", "its model has a hill, whose height only a twin knows")
+    ]
 
 
 def test_a_run_of_ones_own_is_taken():
-    trials = Trials((math.pi,) * 4, ((0.0,),) * 4, start=(0.3, 0.1, 0.0, 0.0), steps=4, balanced_steps=2)
+    trials = Trials(
+        (math.pi,) * 4, ((0.0,),) * 4, start=(0.3, 0.1, 0.0, 0.0), steps=4, balanced_steps=2
+    )
     other(trials=trials)
     result = validate("other", quick=True, groups=["convergence"])
     assert [skip.name for skip in result.skipped] == ["equations of motion that are not MuJoCo's"]

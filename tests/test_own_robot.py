@@ -37,7 +37,7 @@ def copied(tmp_path, monkeypatch):
 
 
 def test_the_page_has_the_task_whole_and_of_the_model_its_actuator():
-    (kinds, (part, module)) = zip(*FILES, strict=True)
+    kinds, (part, module) = zip(*FILES, strict=True)
     assert kinds == ("xml", "python")
     assert module == (FOLDER / "ball_and_beam.py").read_text()
     assert "<motor" in part
@@ -52,7 +52,9 @@ def test_the_page_has_every_field_of_a_task():
 def test_the_python_examples_run(capsys):
     namespace = {}
     for _, block in BLOCKS[2:]:
-        exec(compile(block, "own_robot.md", "exec"), namespace)  # one after the other, as a reader would
+        exec(
+            compile(block, "own_robot.md", "exec"), namespace
+        )  # one after the other, as a reader would
     of_one, of_thousands, drawn = capsys.readouterr().out.splitlines()
     desired, actual, _, voltage = map(float, of_one.split())
     assert 0.0 < abs(actual) < abs(desired)  # what the gear passes on
@@ -75,7 +77,13 @@ def test_the_training_runs():
 @pytest.mark.matrix
 def test_all_commands_run_one_after_the_other():
     run(*COMMANDS)
-    assert [command.split()[0] for command in COMMANDS] == ["train", "evaluate", "evaluate", "render", "validate"]
+    assert [command.split()[0] for command in COMMANDS] == [
+        "train",
+        "evaluate",
+        "evaluate",
+        "render",
+        "validate",
+    ]
     assert Path("ball.gif").stat().st_size > 1000
 
 
@@ -86,7 +94,9 @@ def test_the_ball_rolls_as_a_ball_does():
     data.qpos[:] = 0.3, 0.1
     mujoco.mj_forward(model, data)
     force = np.zeros(2)
-    mujoco.mj_mulM(model, data, force, np.array([0.0, 1.0]))  # of the ball's unit acceleration, the beam's being 0
+    mujoco.mj_mulM(
+        model, data, force, np.array([0.0, 1.0])
+    )  # of the ball's unit acceleration, the beam's being 0
     assert -data.qfrc_bias[1] / force[1] == pytest.approx(5 / 7 * 9.81 * math.sin(0.3), rel=1e-12)
 
 

@@ -59,17 +59,33 @@ def program(wheel, tmp_path_factory):
     venv.create(folder, symlinks=True)
     programs = folder / ("Scripts" if os.name == "nt" else "bin")
     python = programs / "python"
-    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps", wheel.filename]
+    install = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        str(python),
+        "install",
+        "--quiet",
+        "--no-deps",
+        wheel.filename,
+    ]
     subprocess.run(install, check=True, timeout=240)
     where = "import sysconfig; print(sysconfig.get_path('purelib'))"
-    own = Path(subprocess.run([python, "-c", where], capture_output=True, text=True, check=True).stdout.strip())
+    own = Path(
+        subprocess.run(
+            [python, "-c", where], capture_output=True, text=True, check=True
+        ).stdout.strip()
+    )
     paths = [path for path in sys.path if Path(path).name == "site-packages"]
     (own / "dependencies.pth").write_text("\n".join([*site.getsitepackages(), *paths]))
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
     def run(name, *arguments, cwd):
         words = [programs / name, *arguments]
-        done = subprocess.run(words, cwd=cwd, env=clean, capture_output=True, text=True, timeout=300, check=False)
+        done = subprocess.run(
+            words, cwd=cwd, env=clean, capture_output=True, text=True, timeout=300, check=False
+        )
         assert done.returncode == 0, f"{arguments}: {done.stdout[-1000:]}{done.stderr[-1000:]}"
         return done.stdout
 
@@ -93,13 +109,25 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
         assert len(found) >= least
         return found
 
-    models = {f"codrl_mj/_assets/{path.relative_to(assets).as_posix()}" for path in assets.rglob("*") if path.is_file()}
+    models = {
+        f"codrl_mj/_assets/{path.relative_to(assets).as_posix()}"
+        for path in assets.rglob("*")
+        if path.is_file()
+    }
     assert len(models) >= 5
-    pages = {f"codrl_mj/pages/{name}" for name in ("page.html.jinja", "parts.html.jinja", "page.css", "page.js")}
-    pages |= {f"codrl_mj/pages/uplot/{name}" for name in ("uPlot.iife.min.js", "uPlot.min.css", "LICENSE")}
+    pages = {
+        f"codrl_mj/pages/{name}"
+        for name in ("page.html.jinja", "parts.html.jinja", "page.css", "page.js")
+    }
+    pages |= {
+        f"codrl_mj/pages/uplot/{name}" for name in ("uPlot.iife.min.js", "uPlot.min.css", "LICENSE")
+    }
     pages |= {f"codrl_mj/replay/{name}" for name in ("page.html", "replay.css", "replay.js")}
     pages |= {f"codrl_mj/replay/three/{name}" for name in ("three.min.js", "LICENSE", "README.md")}
-    others = {"codrl_mj/py.typed", *(f"codrl_mj/_assets/study/{one}/runs.csv" for one in ("actuators", "insurance"))}
+    others = {
+        "codrl_mj/py.typed",
+        *(f"codrl_mj/_assets/study/{one}/runs.csv" for one in ("actuators", "insurance")),
+    }
     settings = of_ours("rl_zoo3/*.yml", 5) | of_ours("agents/presets/*.toml", 6)
     assert names >= of_ours("**/*.py", 30) | models | settings | pages | others
     assert not [name for name in names if name.startswith(("tests", "scripts", "assets", "docs"))]
@@ -108,13 +136,20 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
 def test_the_wheel_has_the_program_the_version_and_the_license(wheel, metadata):
     (info,) = {name.split("/")[0] for name in wheel.namelist() if ".dist-info/" in name}
     assert "codrl-mj = codrl_mj.cli:main" in wheel.read(f"{info}/entry_points.txt").decode()
-    version = (REPOSITORY / "codrl_mj" / "__init__.py").read_text().partition('__version__ = "')[2].partition('"')[0]
+    version = (
+        (REPOSITORY / "codrl_mj" / "__init__.py")
+        .read_text()
+        .partition('__version__ = "')[2]
+        .partition('"')[0]
+    )
     assert f"Version: {version}" in metadata
     assert f"{info}/licenses/LICENSE" in wheel.namelist()
 
 
 def test_the_training_and_rendering_libraries_are_extras(metadata):
-    needed = [line for line in metadata if line.startswith("Requires-Dist: ") and "extra ==" not in line]
+    needed = [
+        line for line in metadata if line.startswith("Requires-Dist: ") and "extra ==" not in line
+    ]
     core = {line.split()[1].split("<")[0].split(">")[0] for line in needed}
     assert core == {
         *("filelock", "gymnasium[mujoco]", "mujoco", "numba", "numpy"),
@@ -134,15 +169,29 @@ def test_the_source_distribution_has_what_the_checkout_has(built):
     (path,) = built.glob("*.tar.gz")
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    needed = {"README.md", "CHANGELOG.md", "LICENSE", "pyproject.toml", "examples/the_whole_idea.py", "docs/index.md"}
-    assert names >= needed | {"tests/conftest.py", "scripts/demo.py", "assets/cartpole.xml", "docs/pictures/demo.gif"}
+    needed = {
+        "README.md",
+        "CHANGELOG.md",
+        "LICENSE",
+        "pyproject.toml",
+        "examples/the_whole_idea.py",
+        "docs/index.md",
+    }
+    assert names >= needed | {
+        "tests/conftest.py",
+        "scripts/demo.py",
+        "assets/cartpole.xml",
+        "docs/pictures/demo.gif",
+    }
     assert not [name for name in names if name.startswith((".venv", "runs", "build"))]
 
 
 def test_an_index_would_take_both(built):
     pytest.importorskip("twine")
     files = sorted(map(str, built.iterdir()))
-    done = subprocess.run([sys.executable, "-m", "twine", "check", "--strict", *files], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "twine", "check", "--strict", *files], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("PASSED") == 2
 

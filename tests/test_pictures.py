@@ -10,7 +10,9 @@ def test_every_picture_that_is_made_is_kept():
     made = pictures.pictures()
     assert {"motor.png", "log.png", "tasks.png", "robots.png"} <= set(made)
     for name in made:
-        assert (pictures.DOCS / name if "/" in name else pictures.DOCS / "pictures" / name).is_file(), name
+        assert (
+            pictures.DOCS / name if "/" in name else pictures.DOCS / "pictures" / name
+        ).is_file(), name
 
 
 def test_names_that_are_not_known_are_refused(monkeypatch, capsys):

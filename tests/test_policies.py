@@ -25,7 +25,9 @@ HIGH = np.array([4.8, np.inf, 0.4, np.inf], np.float32)
 BOUNDED = spaces.Box(-HIGH, HIGH, dtype=np.float32)
 DISCRETE = spaces.Discrete(3)
 LIMITED = spaces.Box(-HIGH.clip(max=5), HIGH.clip(max=5), dtype=np.float32)
-CONTINUOUS = spaces.Box(np.array([-2.0, -1.0], np.float32), np.array([2.0, 0.5], np.float32), dtype=np.float32)
+CONTINUOUS = spaces.Box(
+    np.array([-2.0, -1.0], np.float32), np.array([2.0, 0.5], np.float32), dtype=np.float32
+)
 
 
 SMALL = PPOConfig(rollout_steps=8, batch_size=8, hidden=(8, 8))
@@ -94,7 +96,9 @@ def test_the_files_are_readable_by_plain_safetensors_json_and_sha256sum(folder):
     assert sorted(path.name for path in folder.iterdir()) == [DESCRIPTION, WEIGHTS]
     described = json.loads((folder / DESCRIPTION).read_text())
     assert described["agent"]["name"] == "ppo"
-    assert described["weights_sha256"] == hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+    assert (
+        described["weights_sha256"] == hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+    )
     shapes = {name: tuple(tensor.shape) for name, tensor in load_file(folder / WEIGHTS).items()}
     assert shapes["mlp_extractor.policy_net.0.weight"] == (8, 4)
     assert shapes["action_net.weight"] == (3, 8)
@@ -114,13 +118,17 @@ def without_digests(content, **changes):
     described = json.loads(content)
     kept = ("format", "agent", "observation_space", "action_space")
     described = {name: described[name] for name in kept} | changes
-    return json.dumps({name: value for name, value in described.items() if value != "left out"}).encode()
+    return json.dumps(
+        {name: value for name, value in described.items() if value != "left out"}
+    ).encode()
 
 
 def test_a_policy_from_before_there_were_digests_is_loaded(folder):
     (folder / DESCRIPTION).write_bytes(without_digests((folder / DESCRIPTION).read_bytes()))
     expected, _ = make_model().predict(observations(), deterministic=True)
-    np.testing.assert_array_equal(load_policy(folder).predict(observations(), deterministic=True)[0], expected)
+    np.testing.assert_array_equal(
+        load_policy(folder).predict(observations(), deterministic=True)[0], expected
+    )
 
 
 @pytest.mark.parametrize("name", [DESCRIPTION, WEIGHTS])
@@ -174,16 +182,35 @@ OTHER_FORMATS = ({}, [], 1, None, "codrl_mj policy 2", {"format": "codrl_mj poli
 @pytest.mark.parametrize(
     ("digests", "name", "change", "words"),
     [
-        *((False, WEIGHTS, lambda old, keep=keep: old[:keep], "truncated or not a safe") for keep in (0, 4, 40, -1)),
+        *(
+            (False, WEIGHTS, lambda old, keep=keep: old[:keep], "truncated or not a safe")
+            for keep in (0, 4, 40, -1)
+        ),
         (True, WEIGHTS, lambda old: old[:-1], "is truncated or damaged"),
         (True, WEIGHTS, wider, "do not belong together: its sha256 is not the one"),
         (False, WEIGHTS, wider, "do not belong together: "),
         (False, WEIGHTS, lambda _: save({"weight": torch.zeros(3)}), "do not belong together: "),
         (False, WEIGHTS, not_a_number, "holds weights that are not finite"),
-        *((True, DESCRIPTION, lambda old, keep=keep: old[:keep], "is truncated or not JSON") for keep in (0, 30, -3)),
-        *((True, DESCRIPTION, lambda _, it=it: json.dumps(it).encode(), "codrl_mj policy 2") for it in OTHER_FORMATS),
-        (True, DESCRIPTION, lambda old: old.replace(b'"sha256"', b'"sha257"'), "unknown entries: sha257"),
-        (True, DESCRIPTION, lambda old: old.replace(b'"weights_sha256"', b'"sha257"'), "is not the policy description"),
+        *(
+            (True, DESCRIPTION, lambda old, keep=keep: old[:keep], "is truncated or not JSON")
+            for keep in (0, 30, -3)
+        ),
+        *(
+            (True, DESCRIPTION, lambda _, it=it: json.dumps(it).encode(), "codrl_mj policy 2")
+            for it in OTHER_FORMATS
+        ),
+        (
+            True,
+            DESCRIPTION,
+            lambda old: old.replace(b'"sha256"', b'"sha257"'),
+            "unknown entries: sha257",
+        ),
+        (
+            True,
+            DESCRIPTION,
+            lambda old: old.replace(b'"weights_sha256"', b'"sha257"'),
+            "is not the policy description",
+        ),
     ],
 )
 def test_what_is_damaged_or_another_policys_is_named(folder, digests, name, change, words):
@@ -209,7 +236,9 @@ def test_a_policy_damaged_in_a_few_bytes_is_refused_or_is_what_it_was(folder, na
     for _ in range(150):
         path.write_bytes(damage(whole, random_))
         try:
-            assert content_of(load_policy(folder)) == expected  # such as a space for a line break in the JSON
+            assert (
+                content_of(load_policy(folder)) == expected
+            )  # such as a space for a line break in the JSON
         except ValueError as error:
             assert str(folder) in str(error)  # noqa: PT017 - most of them raise, not all
             refusals += 1
@@ -229,7 +258,12 @@ def test_a_pickle_in_place_of_a_file_is_refused_and_not_executed(folder, name, t
 
 
 def test_loading_never_calls_unpickling_code(folder, monkeypatch):
-    for module, name in ((pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"), (torch, "load")):
+    for module, name in (
+        (pickle, "load"),
+        (pickle, "loads"),
+        (pickle, "Unpickler"),
+        (torch, "load"),
+    ):
         monkeypatch.setattr(module, name, lambda *_, **__: pytest.fail("something was unpickled"))
     load_policy(folder)
 

@@ -30,8 +30,12 @@ def pages():
 def test_every_verb_has_a_page_with_its_help(pages):
     for verb in {name.split()[0] for name in cli.VERBS}:
         assert f"usage: codrl-mj {verb}" in pages[f"command_line/{verb}.md"]
-        assert not re.search(r"type: ignore|noqa", pages[f"command_line/{verb}.md"])  # for want of a docstring
-        assert re.search(rf"`{verb}`\]\(command_line/{verb}.md\) \| \w.+\.? \|", pages["command_line.md"])
+        assert not re.search(
+            r"type: ignore|noqa", pages[f"command_line/{verb}.md"]
+        )  # for want of a docstring
+        assert re.search(
+            rf"`{verb}`\]\(command_line/{verb}.md\) \| \w.+\.? \|", pages["command_line.md"]
+        )
     assert "## identify simulate" in pages["command_line/identify.md"]
     assert "## motor feasible" in pages["command_line/motor.md"]
 
@@ -43,7 +47,10 @@ def test_every_room_with_public_names_has_a_page_with_each_of_them(pages):
     for room in rooms:
         text = pages[f"rooms/{room}.md"]
         for name in importlib.import_module(f"codrl_mj.{room}").__all__:
-            assert re.search(rf"^(::: codrl_mj\.\S+\.|\| `){name}\b", text, re.MULTILINE), (room, name)
+            assert re.search(rf"^(::: codrl_mj\.\S+\.|\| `){name}\b", text, re.MULTILINE), (
+                room,
+                name,
+            )
 
 
 def test_every_public_name_of_the_package_is_on_the_first_page():
@@ -56,10 +63,15 @@ def test_every_field_of_a_setting_has_what_it_is(pages):
     text = pages["settings.md"]
     for kind in (EnvConfig, TrainConfig, Task):
         for field in dataclasses.fields(kind):
-            assert re.search(rf"^\| `{field.name}` \| .+ \| \S.+ \|$", text, re.MULTILINE), field.name
+            assert re.search(rf"^\| `{field.name}` \| .+ \| \S.+ \|$", text, re.MULTILINE), (
+                field.name
+            )
     for name in Inputs._fields:
         assert re.search(rf"^\| `{name}` \| .+ \| \S.+ \|$", text, re.MULTILINE), name
-    assert "| `resistance` | `1.0` | ohm | a finite number > 0 | Winding resistance R [ohm], > 0." in text
+    assert (
+        "| `resistance` | `1.0` | ohm | a finite number > 0 | Winding resistance R [ohm], > 0."
+        in text
+    )
     assert "| `center_radius` | `inf` |" in text
 
 
@@ -69,13 +81,19 @@ def test_the_site_has_every_page_in_its_navigation(pages):
     def listed(entry):
         if isinstance(entry, str):
             return [entry]
-        return [path for one in (entry.values() if isinstance(entry, dict) else entry) for path in listed(one)]
+        return [
+            path
+            for one in (entry.values() if isinstance(entry, dict) else entry)
+            for path in listed(one)
+        ]
 
     paths = listed(nav)
     assert len(paths) == len(set(paths))
     assert {f"reference/{name}" for name in pages} < set(paths)
     kept = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
-    parts = {f"results/{name}_conclusions.md" for name in ("actuators", "insurance", "reproduction")}
+    parts = {
+        f"results/{name}_conclusions.md" for name in ("actuators", "insurance", "reproduction")
+    }
     assert kept - set(paths) <= parts
     ignored = {f"reference/{name}" for name in pages}
     assert set(paths) - ignored <= kept

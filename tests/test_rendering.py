@@ -24,7 +24,9 @@ from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.tasks import TASKS, named_actuator
 
 WIDTH, HEIGHT = 200, 120
-FRAME_HEIGHT = 40 + HEIGHT + 24 + 120 + 8 + 60 + 26  # title, scene, and the strip's legend, plots and time axis
+FRAME_HEIGHT = (
+    40 + HEIGHT + 24 + 120 + 8 + 60 + 26
+)  # title, scene, and the strip's legend, plots and time axis
 PLOT_TOP = 40 + HEIGHT + 24
 DESIRED, ACTUAL, SATURATED, VOLTAGE = (0, 114, 178), (213, 94, 0), (204, 121, 167), (0, 158, 115)
 LIMITS = {"voltage": SATURATED, "current": (230, 159, 0), "temperature": (86, 180, 233)}
@@ -43,7 +45,11 @@ def made_up(desired, actual, *, saturated=False, arm=1.0, steps=40, terminated=F
     values = (desired, actual, actual, desired, 0.0, saturated)
     signals = {name: np.full(steps, value) for name, value in zip(SIGNALS, values, strict=True)}
     states = np.zeros((steps + 1, 4)) if states is None else states
-    actuator, trace, time = Actuator(Motor(arm_radius=arm)), {"speed": np.zeros(steps)}, 0.02 * np.arange(1, steps + 1)
+    actuator, trace, time = (
+        Actuator(Motor(arm_radius=arm)),
+        {"speed": np.zeros(steps)},
+        0.02 * np.arange(1, steps + 1),
+    )
     acted = np.zeros(steps), np.ones(steps), np.zeros(1)
     episode = Episode(time, states, states, *acted, trace, signals, terminated, actuator)
     return Panel("cartpole", episode, title="made up")
@@ -106,7 +112,9 @@ def test_an_mp4_is_h264_of_the_stated_size_rate_and_length(tmp_path):
     assert all(np.abs(frame.astype(int) - frames[0]).max() > 30 for frame in frames[1:])
 
 
-def test_a_gif_is_of_the_stated_size_rate_and_length_repeats_and_takes_the_place_of_another(tmp_path):
+def test_a_gif_is_of_the_stated_size_rate_and_length_repeats_and_takes_the_place_of_another(
+    tmp_path,
+):
     (tmp_path / "film.gif").write_text("old")
     out = film([played()], tmp_path / "film.gif", WIDTH, HEIGHT)
     assert list(tmp_path.iterdir()) == [out]
@@ -157,19 +165,29 @@ def test_the_strip_draws_desired_and_actual_at_their_heights(filmed, desired, ac
 
 
 @pytest.mark.parametrize(("volts", "limit_shown"), [(22.0, True), (5.0, False)])
-def test_the_strip_draws_the_voltage_at_its_height_and_a_limit_that_is_near(filmed, volts, limit_shown):
+def test_the_strip_draws_the_voltage_at_its_height_and_a_limit_that_is_near(
+    filmed, volts, limit_shown
+):
     panel = made_up(1.0, 0.5)
     panel.episode.signals["voltage"][:] = volts
     plot = strip(filmed(panel)[-1], 128, 60)[:, 62 : WIDTH - 12]
     span = 1.2 * volts  # the plot spans minus to plus this, over 60 px
-    drawn, found = (np.flatnonzero(like(plot, colour).mean(axis=1) > 0.3) for colour in (VOLTAGE, SATURATED))
+    drawn, found = (
+        np.flatnonzero(like(plot, colour).mean(axis=1) > 0.3) for colour in (VOLTAGE, SATURATED)
+    )
     assert drawn.mean() == pytest.approx(29.5 * (1 - volts / span), abs=1.5)
     limits = 29.5 * (1 - np.array([24.0, -24.0]) / span)
-    assert (np.abs(found[:, None] - limits) < 1.5).any(axis=0).all() if limit_shown else len(found) == 0
+    assert (
+        (np.abs(found[:, None] - limits) < 1.5).any(axis=0).all()
+        if limit_shown
+        else len(found) == 0
+    )
 
 
 def test_the_strip_shows_no_future(filmed):
-    coloured = [int(like(strip(frame), ACTUAL).any(axis=0).sum()) for frame in filmed(made_up(8.0, -4.0))]
+    coloured = [
+        int(like(strip(frame), ACTUAL).any(axis=0).sum()) for frame in filmed(made_up(8.0, -4.0))
+    ]
     assert coloured[0] <= 1
     assert coloured == sorted(coloured)
     assert coloured[-1] > 0.9 * (WIDTH - 62 - 10)
@@ -189,7 +207,9 @@ def test_saturation_is_marked_in_the_colour_of_its_limit(filmed, limit):
     """Of a drive the limit that is met, or none; of a current loop its only one."""
     panel = made_up(8.0, -4.0, saturated=limit != "")
     if limit is not None:
-        signals = panel.episode.signals | {f"{one}_saturated": np.full(40, float(one == limit)) for one in LIMITS}
+        signals = panel.episode.signals | {
+            f"{one}_saturated": np.full(40, float(one == limit)) for one in LIMITS
+        }
         driven = dataclasses.replace(panel.episode, actuator=Drive(), signals=signals)
         panel = dataclasses.replace(panel, episode=driven)
     plot = strip(filmed(panel)[-1])
@@ -215,7 +235,9 @@ def test_a_model_without_a_sky_is_drawn_on_ours(tmp_path):
 def test_the_scene_shows_the_states(filmed):
     states = np.zeros((3, 4))
     states[2, 0] = 1.5  # the cart is elsewhere
-    first, last = filmed(*(made_up(1.0, 1.0, steps=2, states=entries) for entries in (states, np.zeros((3, 4)))))
+    first, last = filmed(
+        *(made_up(1.0, 1.0, steps=2, states=entries) for entries in (states, np.zeros((3, 4))))
+    )
     scene = slice(40, 40 + HEIGHT - 40)  # without the line at the end
     assert np.abs(first[scene, :WIDTH].astype(int) - last[scene, :WIDTH]).max() > 50
     np.testing.assert_array_equal(first[scene, WIDTH:], last[scene, WIDTH:])
@@ -230,7 +252,9 @@ def test_a_shorter_episode_stands_still_and_is_marked_as_over(filmed):
         np.testing.assert_array_equal(scene, scenes[5])
     assert not np.array_equal(scenes[4], scenes[5])
     assert like(scenes[5][-40:], (0xB0, 0x3A, 0x2E), 60).any()  # it says when it ended, in red
-    np.testing.assert_array_equal(frames[1][40 : 40 + HEIGHT, :WIDTH], frames[1][40 : 40 + HEIGHT, WIDTH:])
+    np.testing.assert_array_equal(
+        frames[1][40 : 40 + HEIGHT, :WIDTH], frames[1][40 : 40 + HEIGHT, WIDTH:]
+    )
 
 
 @pytest.mark.parametrize("actuator", ["weaker", "ideal"])
@@ -300,17 +324,27 @@ def fail_after(count, error, function=lambda *_, **__: None):
     return failing
 
 
-@pytest.mark.parametrize(("where", "suffix"), [("renderer", ".mp4"), ("writer", ".mp4"), ("interrupt", ".gif")])
-def test_a_failure_midway_leaves_the_file_as_it_was_and_frees_the_contexts(tmp_path, monkeypatch, where, suffix):
+@pytest.mark.parametrize(
+    ("where", "suffix"), [("renderer", ".mp4"), ("writer", ".mp4"), ("interrupt", ".gif")]
+)
+def test_a_failure_midway_leaves_the_file_as_it_was_and_frees_the_contexts(
+    tmp_path, monkeypatch, where, suffix
+):
     out, on_frame, made, closed = tmp_path / f"film{suffix}", None, [], []
     if where != "renderer":
         out.write_text("old")
     make, close = OffscreenRenderer.__init__, OffscreenRenderer.close
-    monkeypatch.setattr(OffscreenRenderer, "__init__", lambda self, *a, **o: made.append(self) or make(self, *a, **o))
+    monkeypatch.setattr(
+        OffscreenRenderer,
+        "__init__",
+        lambda self, *a, **o: made.append(self) or make(self, *a, **o),
+    )
     monkeypatch.setattr(OffscreenRenderer, "close", lambda self: closed.append(self) or close(self))
     error = KeyboardInterrupt() if where == "interrupt" else OSError(28, "No space left on device")
     if where == "renderer":
-        monkeypatch.setattr(OffscreenRenderer, "render", fail_after(7, error, OffscreenRenderer.render))
+        monkeypatch.setattr(
+            OffscreenRenderer, "render", fail_after(7, error, OffscreenRenderer.render)
+        )
     elif where == "interrupt":
         on_frame = fail_after(3, error)
     else:
@@ -324,7 +358,9 @@ def test_a_failure_midway_leaves_the_file_as_it_was_and_frees_the_contexts(tmp_p
         monkeypatch.setattr(imageio, "get_writer", failing_writer)
     with pytest.raises(type(error)):
         film([made_up(1.0, 1.0), made_up(1.0, 1.0)], out, WIDTH, HEIGHT, on_frame=on_frame)
-    assert [path.read_text() for path in tmp_path.iterdir()] == ([] if where == "renderer" else ["old"])
+    assert [path.read_text() for path in tmp_path.iterdir()] == (
+        [] if where == "renderer" else ["old"]
+    )
     assert len(made) == 2
     assert all(renderer in closed for renderer in made)
 

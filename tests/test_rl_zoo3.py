@@ -36,7 +36,12 @@ def run(folder, *arguments):
     """Run Python in a folder, and return what it printed."""
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300
+        [sys.executable, *arguments],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr
     return done.stdout
@@ -46,9 +51,16 @@ def run(folder, *arguments):
 def trained(tmp_path_factory):
     """A folder in which rl-zoo3 trained PPO, in two processes, with scaled observations and evaluations."""
     folder = tmp_path_factory.mktemp("zoo")
-    (folder / "custom_envs.py").write_text("import codrl_mj\n")  # where rl-zoo3 looks for other people's environments
-    command = f"--algo ppo --env {ENV_ID} --conf-file codrl_mj.rl_zoo3.ppo --gym-packages codrl_mj --vec-env subproc"
-    options = "--env-kwargs actuator:'weaker' center_radius:0.1 --hyperparams n_envs:2 normalize:True"
+    (folder / "custom_envs.py").write_text(
+        "import codrl_mj\n"
+    )  # where rl-zoo3 looks for other people's environments
+    command = (
+        f"--algo ppo --env {ENV_ID} --conf-file codrl_mj.rl_zoo3.ppo --gym-packages codrl_mj"
+        " --vec-env subproc"
+    )
+    options = (
+        "--env-kwargs actuator:'weaker' center_radius:0.1 --hyperparams n_envs:2 normalize:True"
+    )
     budget = "-n 1000 --eval-freq 500 --eval-episodes 2 --num-threads 1 --seed 0 --device cpu"
     run(folder, "-m", "rl_zoo3.train", *command.split(), *options.split(), *budget.split())
     return folder
@@ -57,22 +69,37 @@ def trained(tmp_path_factory):
 def test_it_trains_in_processes_evaluates_and_keeps_the_scales(trained):
     (log,) = (trained / "logs" / "ppo").iterdir()
     assert log.name == "codrl_mj-CartPole-v0_1"
-    for kept in ("best_model.zip", "codrl_mj-CartPole-v0.zip", "codrl_mj-CartPole-v0/vecnormalize.pkl"):
+    for kept in (
+        "best_model.zip",
+        "codrl_mj-CartPole-v0.zip",
+        "codrl_mj-CartPole-v0/vecnormalize.pkl",
+    ):
         assert (log / kept).is_file()
     with np.load(log / "evaluations.npz") as evaluations:
         assert len(evaluations["timesteps"]) >= 2
-        assert (evaluations["results"] <= evaluations["ep_lengths"]).all()  # off the centre a step pays nothing
+        assert (
+            evaluations["results"] <= evaluations["ep_lengths"]
+        ).all()  # off the centre a step pays nothing
     assert "weaker" in (log / "codrl_mj-CartPole-v0" / "args.yml").read_text()
 
 
 def test_it_runs_the_trained_agent(trained):
-    command = f"--algo ppo --env {ENV_ID} --gym-packages codrl_mj -f logs --no-render -n 300 --device cpu"
+    command = (
+        f"--algo ppo --env {ENV_ID} --gym-packages codrl_mj -f logs --no-render -n 300 --device cpu"
+    )
     printed = run(trained, "-m", "rl_zoo3.enjoy", *command.split())
-    assert float(re.search(r"Mean episode length: ([\d.]+)", printed)[1]) >= 8  # a pole cannot fall faster
+    assert (
+        float(re.search(r"Mean episode length: ([\d.]+)", printed)[1]) >= 8
+    )  # a pole cannot fall faster
 
 
 def test_it_films_the_cart_and_the_pole(trained):
-    run(trained, "-m", "rl_zoo3.record_video", *f"--algo ppo --env {ENV_ID} -f logs -n 40 -o films".split())
+    run(
+        trained,
+        "-m",
+        "rl_zoo3.record_video",
+        *f"--algo ppo --env {ENV_ID} -f logs -n 40 -o films".split(),
+    )
     (film,) = (trained / "films").glob("*.mp4")
     with imageio.get_reader(film) as reader:
         assert reader.get_meta_data()["fps"] == 50
@@ -90,7 +117,9 @@ def test_it_films_the_cart_and_the_pole(trained):
 def test_every_setting_that_we_ship_makes_a_model(tmp_path):
     printed = run(tmp_path, "-c", EVERY_MODEL.format(algorithms=ALGORITHMS))
     built = [line.split() for line in printed.splitlines() if line.startswith("built ")]
-    assert all(kind.lower() == algorithm and asked == "True" for _, algorithm, _, kind, asked, _ in built)
+    assert all(
+        kind.lower() == algorithm and asked == "True" for _, algorithm, _, kind, asked, _ in built
+    )
     covered = {(algorithm, env_id) for _, algorithm, env_id, *_ in built}
     every = {registered.env_id for registered in OURS}
     continuous = {"codrl_mj/Pendulum-v0", "codrl_mj/MountainCarContinuous-v0"}

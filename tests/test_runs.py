@@ -27,7 +27,9 @@ GEARED = actuator_over(resolve("kraken-x60", None, "nobody"), {"motor": {"gear_r
 OWN = actuator_over(GEARED, {"motor": {"resistance": 0.5}})
 
 
-def make_run(folder, actuator="weaker", *, seed=3, task="cartpole", finished=True, evaluated=True, **train):
+def make_run(
+    folder, actuator="weaker", *, seed=3, task="cartpole", finished=True, evaluated=True, **train
+):
     """A run folder as trainings leave them."""
     motor = named_actuator(actuator, task) if isinstance(actuator, str) else actuator
     env = {"task": task, "actuator": mapping_of(motor), "disturbances": {"command_delay": 0.0}}
@@ -35,10 +37,14 @@ def make_run(folder, actuator="weaker", *, seed=3, task="cartpole", finished=Tru
     config = {"agent": agent, "seed": seed, "total_steps": 4000, "env": env} | train
     last = 4096 if finished else 2000
     write_json(folder / "config.json", {"train": config, "versions": {"torch": "2.13.0"}})
-    (folder / "progress.csv").write_text(f"{PROGRESS}1000,9,20.5,500,2.5\n{last},12,90.25,500,4.5\n")
+    (folder / "progress.csv").write_text(
+        f"{PROGRESS}1000,9,20.5,500,2.5\n{last},12,90.25,500,4.5\n"
+    )
     if finished:
         for place in (folder, folder / "best"):
-            write_json(place / "policy.json", {"weights_sha256": hashlib.sha256(b"weights").hexdigest()})
+            write_json(
+                place / "policy.json", {"weights_sha256": hashlib.sha256(b"weights").hexdigest()}
+            )
             (place / "policy.safetensors").write_bytes(b"weights")
         write_json(folder / "result.json", {"steps": 4096, "mean_return": 91.0, "seconds": 8.25})
     if evaluated:
@@ -56,15 +62,24 @@ def test_a_finished_run_says_what_it_was_and_what_it_came_to(tmp_path):
     assert (run.name, run.state, run.problem) == ("mine", "finished", None)
     assert (run.task, run.agent, run.actuator, run.seed) == ("cartpole", "ppo", "weaker", 3)
     assert (run.steps, run.total_steps, run.seconds) == (4096, 4000, 8.25)
-    assert (run.mean_return, run.evaluation_return) == (90.25, 403.0)  # the last report's, the evaluation's
+    assert (run.mean_return, run.evaluation_return) == (
+        90.25,
+        403.0,
+    )  # the last report's, the evaluation's
     assert run.configuration["env.disturbances.command_delay"] == 0.0
     assert run.configuration["versions.torch"] == "2.13.0"
     mapping = json.loads(json.dumps(run.as_mapping()))
-    assert run.modified == 1_700_000_000 + index == datetime.datetime.fromisoformat(mapping["modified"]).timestamp()
+    assert (
+        run.modified
+        == 1_700_000_000 + index
+        == datetime.datetime.fromisoformat(mapping["modified"]).timestamp()
+    )
     assert mapping["evaluation_return"] == 403.0
 
 
-@pytest.mark.parametrize("rest", ["", "3000,1", "3000,15,9"], ids=["whole", "half a row", "most of a row"])
+@pytest.mark.parametrize(
+    "rest", ["", "3000,1", "3000,15,9"], ids=["whole", "half a row", "most of a row"]
+)
 def test_an_unfinished_run_stands_where_its_last_whole_report_says(tmp_path, rest):
     folder = make_run(tmp_path / "mine", finished=False, evaluated=False)
     with (folder / "progress.csv").open("a") as file:
@@ -105,7 +120,12 @@ def test_motors_keep_the_names_that_the_run_was_told(tmp_path):
     config, folder = TrainConfig(EnvConfig("HalfCheetah-v5", patterns)), tmp_path / "told"
     begin(folder, config)
     run = read_run(folder)
-    assert run.actuator == load_config(folder).env.through == config.env.through == "kraken-x60, drawer, ideal"
+    assert (
+        run.actuator
+        == load_config(folder).env.through
+        == config.env.through
+        == "kraken-x60, drawer, ideal"
+    )
     sentence = " ".join(report._sentence(run).split())
     assert "PPO on HalfCheetah-v5 through the actuators kraken-x60, drawer, ideal" in sentence
     assert "labels" not in str(config.as_mapping()) + str(run.configuration)
@@ -127,17 +147,31 @@ def test_an_actuator_that_cannot_be_read_is_custom(tmp_path, actuator):
         ("config.json", b"\xff\xfe", "not JSON"),
         ("config.json", b"[" * 100_000, "recursion"),
         ("result.json", b'{"steps": 1', "result.json is not a result of a run"),
-        ("evaluation.json", b"3", "evaluation.json is not a policy evaluation: it is no JSON object"),
+        (
+            "evaluation.json",
+            b"3",
+            "evaluation.json is not a policy evaluation: it is no JSON object",
+        ),
         ("progress.csv", b"\xff\xfe\x00", "progress.csv"),
         ("progress.csv", b"a,b\n1,2\n", "progress.csv has no column 'steps'"),
         ("policy.safetensors", None, "policy.safetensors is missing"),
-        ("policy.safetensors", b"new", "policy.safetensors is truncated or damaged, or it and policy.json do not"),
+        (
+            "policy.safetensors",
+            b"new",
+            "policy.safetensors is truncated or damaged, or it and policy.json do not",
+        ),
         ("policy.json", b'{"format"', "policy.json is not a policy description: it is truncated"),
         ("best/policy.safetensors", b"weig", "best/policy.safetensors is truncated or damaged"),
-        ("progress.csv", PROGRESS.encode() + b"1000,9,20.5,500,2.5\n", "progress.csv ends at step 1000 of 4096"),
+        (
+            "progress.csv",
+            PROGRESS.encode() + b"1000,9,20.5,500,2.5\n",
+            "progress.csv ends at step 1000 of 4096",
+        ),
     ],
 )
-def test_a_damaged_run_is_listed_with_what_is_wrong_among_the_others(tmp_path, file, content, problem):
+def test_a_damaged_run_is_listed_with_what_is_wrong_among_the_others(
+    tmp_path, file, content, problem
+):
     make_run(tmp_path / "fine")
     folder = make_run(tmp_path / "hurt")
     (folder / file).unlink() if content is None else (folder / file).write_bytes(content)
@@ -153,7 +187,16 @@ def test_a_damaged_run_is_listed_with_what_is_wrong_among_the_others(tmp_path, f
     "content",
     [
         {"train": {}},
-        {"train": {"seed": "x", "task": 3, "agent": "ppo", "total_steps": None, "actuator": "weak", "env": 1}},
+        {
+            "train": {
+                "seed": "x",
+                "task": 3,
+                "agent": "ppo",
+                "total_steps": None,
+                "actuator": "weak",
+                "env": 1,
+            }
+        },
         {"train": {"agent": {}, "actuator": None}, "versions": 1},
     ],
 )
@@ -184,7 +227,9 @@ def test_runs_are_found_at_any_depth_but_not_in_each_other_nor_in_hidden_folders
 def test_runs_are_sorted_by_any_key_with_those_that_lack_it_last(tmp_path):
     make_run(tmp_path / "a", "weaker", seed=1)
     make_run(tmp_path / "b", "ideal", seed=2)
-    make_run(tmp_path / "c", "paper", finished=False, evaluated=False)  # its last training return: 90.25
+    make_run(
+        tmp_path / "c", "paper", finished=False, evaluated=False
+    )  # its last training return: 90.25
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "config.json").write_text("{")
     runs = find_runs(tmp_path)
@@ -203,7 +248,9 @@ def test_a_comparison_has_the_settings_that_differ_and_every_result(tmp_path):
     runs = [
         read_run(make_run(tmp_path / "a", "weaker", seed=1)),
         read_run(make_run(tmp_path / "b", weak, seed=2, num_envs=8)),
-        read_run(make_run(tmp_path / "c", weak, seed=2, num_envs=8, evaluated=False, finished=False)),
+        read_run(
+            make_run(tmp_path / "c", weak, seed=2, num_envs=8, evaluated=False, finished=False)
+        ),
     ]
     comparison = compare(runs)
     assert comparison.names == ("a", "b", "c")
@@ -216,7 +263,11 @@ def test_a_comparison_has_the_settings_that_differ_and_every_result(tmp_path):
     assert comparison.results["state"] == ("finished", "finished", "unfinished")
     assert comparison.results["steps"] == (4096, 4096, 2000)
     assert comparison.results["evaluation.tracking_rms"] == (0.1, 0.1, None)
-    assert [one and one["mean"] for one in comparison.results["evaluation.returns"]] == [401.0, 402.0, None]
+    assert [one and one["mean"] for one in comparison.results["evaluation.returns"]] == [
+        401.0,
+        402.0,
+        None,
+    ]
     assert "evaluation.peak_voltage" not in comparison.results  # none of them has it
     json.dumps(vars(comparison))
     assert comparison.units == {

@@ -56,7 +56,9 @@ def test_the_cross_validation():
 
 
 def test_the_table_of_furuta(tmp_path):
-    lines = run("furuta_table.py", "--seeds", 1, "--episodes", 1, "--total-steps", 512, "--out", tmp_path).splitlines()
+    lines = run(
+        "furuta_table.py", "--seeds", 1, "--episodes", 1, "--total-steps", 512, "--out", tmp_path
+    ).splitlines()
     assert len({line.count("|") for line in lines}) == 1
     assert len(lines) == 2 + 12
     for policy in ("ideal", "18V", "6V", "18V_6ms"):
@@ -67,12 +69,27 @@ def test_the_table_of_furuta(tmp_path):
 
 
 def test_the_worked_examples(tmp_path):
-    options = "--only", "servo arm", "--seeds", 1, "--steps", 0.01, "--runs", tmp_path / "runs", "--out", tmp_path
+    options = (
+        "--only",
+        "servo arm",
+        "--seeds",
+        1,
+        "--steps",
+        0.01,
+        "--runs",
+        tmp_path / "runs",
+        "--out",
+        tmp_path,
+    )
     printed = run("worked_examples.py", *options)
     rows = (tmp_path / "worked_examples.csv").read_text().splitlines()
     assert len(rows) == 1 + 3 * 3  # an agent for each way to train, on each
     assert printed.splitlines()[-1].startswith("| servo arm | smaller |")
-    assert {path.name for path in (tmp_path / "runs" / "servo_arm").glob("*-0")} == {"ideal-0", "chosen-0", "smaller-0"}
+    assert {path.name for path in (tmp_path / "runs" / "servo_arm").glob("*-0")} == {
+        "ideal-0",
+        "chosen-0",
+        "smaller-0",
+    }
     again = run("worked_examples.py", *options)  # nothing is left to do
     assert again.splitlines()[-1] == printed.splitlines()[-1]
 
@@ -81,7 +98,13 @@ def test_from_a_bench_log_to_a_policy(tmp_path):
     printed = run("bench_to_policy.py", "--seeds", 1, "--total-steps", 300, "--out", tmp_path)
     numbers = r"(\w+): \S+ \[(\S+), (\S+)\] .*identified; real (\d\S+)"
     found = {name: tuple(map(float, rest)) for name, *rest in re.findall(numbers, printed)}
-    assert {"resistance", "inductance", "back_emf_constant", "coulomb_friction", "rotor_inertia"} <= found.keys()
+    assert {
+        "resistance",
+        "inductance",
+        "back_emf_constant",
+        "coulomb_friction",
+        "rotor_inertia",
+    } <= found.keys()
     assert all(low <= real <= high for low, high, real in found.values())
     config = load_config(tmp_path / "identified-0")
     assert len(config.env.randomize) >= 5
@@ -125,7 +148,9 @@ def test_the_demonstration_leaves_two_runs_and_a_film(demonstrated):
     assert height > 360
 
 
-def test_the_demonstration_prints_the_validation_and_all_four_results_and_where_to_look(demonstrated):
+def test_the_demonstration_prints_the_validation_and_all_four_results_and_where_to_look(
+    demonstrated,
+):
     out, text = demonstrated
     assert "FAILED" not in text
     assert text.count("passed") == 25
@@ -149,7 +174,11 @@ def test_a_second_demonstration_reuses_the_trainings(demonstrated):
 
 @pytest.mark.parametrize(
     ("group", "least", "own"),
-    [("vector: mountain_car_continuous", 3, 2), ("single: pendulum", 3, 2), ("engine: pendulum", 4, 0)],
+    [
+        ("vector: mountain_car_continuous", 3, 2),
+        ("single: pendulum", 3, 2),
+        ("engine: pendulum", 4, 0),
+    ],
 )
 def test_a_group_of_the_benchmark_is_measured_against_its_first_member(group, least, own, tmp_path):
     out = tmp_path / "bench.json"

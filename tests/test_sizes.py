@@ -31,7 +31,9 @@ def test_the_free_memory_is_that_of_the_system():
 
 def test_what_fits_is_not_refused(small):
     fields.check_memory(0.99e9, "a thing", "remedy")
-    with pytest.raises(ValueError, match=r"^a thing: about 1.01 GB of memory, of which 1 are free; remedy$"):
+    with pytest.raises(
+        ValueError, match=r"^a thing: about 1.01 GB of memory, of which 1 are free; remedy$"
+    ):
         fields.check_memory(1.01e9, "a thing", "remedy")
 
 
@@ -39,7 +41,10 @@ def test_what_fits_is_not_refused(small):
     ("line", "says"),
     [
         # 20 kHz is the drive's rate, 5 kHz that of the rows
-        ("--duration 1e5", "100,000 s are 2,000,000,000 samples of the drive and 500,000,000 rows: about"),
+        (
+            "--duration 1e5",
+            "100,000 s are 2,000,000,000 samples of the drive and 500,000,000 rows: about",
+        ),
         ("--rate 1e9", "4 s are 80,000 samples of the drive and 4,000,000,000 rows: about"),
     ],
 )
@@ -62,15 +67,22 @@ def test_sizes_are_refused_from_python_too():
         simulate(drive, Excitation("prbs", 6.0, 4.0), sampler=Sampler(1e9))
     with pytest.raises(ValueError, match="200,000,000 samples of the drive and 200,000,000 rows"):
         plan(drive, duration=1e4)
-    fast = dataclasses.replace(drive, controller=dataclasses.replace(drive.controller, sample_rate=1e12))
-    with pytest.raises(ValueError, match=r"sample_rate = 1e\+12: 120,000,000,000 samples of a step: .*; lower it"):
+    fast = dataclasses.replace(
+        drive, controller=dataclasses.replace(drive.controller, sample_rate=1e12)
+    )
+    with pytest.raises(
+        ValueError, match=r"sample_rate = 1e\+12: 120,000,000,000 samples of a step: .*; lower it"
+    ):
         step(fast)
 
 
 @pytest.mark.usefixtures("small")
 def test_episodes_side_by_side_are_refused():
     env = EnvConfig("cartpole")
-    with pytest.raises(ValueError, match=r"episodes = 1,000,000, which run side by side: about 100 GB .*; run fewer"):
+    with pytest.raises(
+        ValueError,
+        match=r"episodes = 1,000,000, which run side by side: about 100 GB .*; run fewer",
+    ):
         run_episodes(RandomPolicy("cartpole"), env.make, 1_000_000)
     with pytest.raises(ValueError, match="evaluation_episodes = 0: must be >= 1"):
         check_episodes(0, "evaluation_episodes")
@@ -83,15 +95,22 @@ def test_an_episode_that_does_not_end_stops_before_memory_does(monkeypatch):
     free = iter([10**12, *[0] * 10])
     monkeypatch.setattr(fields, "free_memory", lambda: next(free))
     env = EnvConfig("pendulum", max_episode_steps=10**9)
-    with pytest.raises(ValueError, match=r"an episode of 50 steps, which does not end: .*; lower max_episode_steps"):
+    with pytest.raises(
+        ValueError, match=r"an episode of 50 steps, which does not end: .*; lower max_episode_steps"
+    ):
         run_episodes(RandomPolicy("pendulum"), env.make, 1)
 
 
 @pytest.mark.parametrize(
     ("agent", "sizes", "says"),
     [
-        # of pendulum: 3 numbers seen and 1 done, 4 bytes each; a replayed step is seen before and after
-        ("ppo", {"rollout_steps": 10**9, "batch_size": 1000}, r"rollout_steps = 1,000,000,000: about 16 GB"),
+        # of pendulum: 3 numbers seen and 1 done, 4 bytes each; a replayed step is seen before and
+        # after
+        (
+            "ppo",
+            {"rollout_steps": 10**9, "batch_size": 1000},
+            r"rollout_steps = 1,000,000,000: about 16 GB",
+        ),
         ("sac", {"buffer_size": 10**9}, r"buffer_size = 1,000,000,000: about 28 GB"),
     ],
 )

@@ -58,7 +58,10 @@ def _contract(domain, task_name, options):
 
 
 for _domain, _task_name in suite.ALL_TASKS:
-    _kinds = {name: {"actuator": name} for name in (NAMED if TASKS[_domain].paper else ("ideal", "default"))}
+    _kinds = {
+        name: {"actuator": name}
+        for name in (NAMED if TASKS[_domain].paper else ("ideal", "default"))
+    }
     _kinds["observed"] = {"observe_actuator": True}
     _kinds["voltage"] = _voltage(_domain)
     _kinds["flat"] = {"environment_kwargs": {"flat_observation": True}}
@@ -73,7 +76,9 @@ def test_every_task_is_offered():
 
 
 def test_options_are_set_over_a_configuration():
-    config = EnvConfig("cartpole", "weak", inner_steps=4, options={"center_radius": 0.5}, max_episode_steps=7)
+    config = EnvConfig(
+        "cartpole", "weak", inner_steps=4, options={"center_radius": 0.5}, max_episode_steps=7
+    )
     same = suite.load(config)
     assert (same.setup.config.actuator, same.setup.inner_steps) == (config.actuator, 4)
     assert same.setup.config.options.center_radius == 0.5
@@ -87,7 +92,9 @@ def test_options_are_set_over_a_configuration():
     limited = suite.load("pendulum", "gym", max_episode_steps=5)
     limited.reset()
     assert [limited.step([0.0]).last() for _ in range(5)] == [False] * 4 + [True]
-    with pytest.raises(ValueError, match=r"unknown key env\.innersteps; did you mean env\.inner_steps"):
+    with pytest.raises(
+        ValueError, match=r"unknown key env\.innersteps; did you mean env\.inner_steps"
+    ):
         suite.load(config, innersteps=2)
 
 
@@ -118,7 +125,11 @@ OPTIONS = {
     "all": {"action": "voltage", "observe_actuator": True, "inner_steps": 25, "actuator": MOTOR},
 }
 CASES = [
-    *((task, OPTIONS[case]) for task, case in itertools.product(TASKS, OPTIONS) if TASKS[task].paper or case != "weak"),
+    *(
+        (task, OPTIONS[case])
+        for task, case in itertools.product(TASKS, OPTIONS)
+        if TASKS[task].paper or case != "weak"
+    ),
     *(("cartpole", {"integrator": integrator}) for integrator in ("euler", "semi-implicit")),
     ("cartpole", {"center_radius": 0.03, "actuator": "ideal"}),
 ]
@@ -169,17 +180,27 @@ def test_a_goal_is_an_end_without_a_future(task):
     env.reset()
     env.env.unwrapped.physics.reset(np.array(GOALS[task]))
     timestep = env.step(env.action_spec().generate_value())
-    assert (timestep.last(), timestep.discount) == ((False, 1.0) if task == "pendulum" else (True, 0.0))
+    assert (timestep.last(), timestep.discount) == (
+        (False, 1.0) if task == "pendulum" else (True, 0.0)
+    )
 
 
 # -- the time limit -----------------------------------------------------------------------------------------
 
 
 @every_rebuilt
-@pytest.mark.parametrize("inner_steps", [None, 19, 49, 73])  # quotients that rounding lifts over the limit
+@pytest.mark.parametrize(
+    "inner_steps", [None, 19, 49, 73]
+)  # quotients that rounding lifts over the limit
 def test_an_episode_has_exactly_the_steps_of_gymnasiums(task, inner_steps):
     env = suite.load(task, actuator="ideal", inner_steps=inner_steps)
-    env.env.unwrapped.step = lambda _: (np.zeros(len(TASKS[task].observation_names)), 0.0, False, False, {})
+    env.env.unwrapped.step = lambda _: (
+        np.zeros(len(TASKS[task].observation_names)),
+        0.0,
+        False,
+        False,
+        {},
+    )
     action = env.action_spec().generate_value()
     for _ in range(2):
         timestep, count = env.reset(), 0
@@ -215,12 +236,16 @@ def _whole(physics):
 
 def _continued(env, actions):
     steps = [(env.step(action), _whole(env.physics)) for action in actions]
-    return np.array([[*_vector(one), one.reward, one.discount, *whole] for one, whole in steps], float)
+    return np.array(
+        [[*_vector(one), one.reward, one.discount, *whole] for one, whole in steps], float
+    )
 
 
 @every_task
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-@pytest.mark.parametrize("options", [{}, {"actuator": MOTOR, "observe_actuator": True, "inner_steps": 20}])
+@pytest.mark.parametrize(
+    "options", [{}, {"actuator": MOTOR, "observe_actuator": True, "inner_steps": 20}]
+)
 def test_a_copy_of_the_environment_continues_bit_for_bit(task, duplicate, options):
     env = suite.load(task, task_kwargs={"random": 0}, **options)
     env.reset()
@@ -257,7 +282,9 @@ def test_a_snapshot_has_the_time_limits_count_and_goes_into_an_environment_that_
     env.reset()
     _continued(env, [0, 1])
     other.restore(env.snapshot())
-    np.testing.assert_array_equal(_continued(other, [0, 1, 1, 0, 1]), _continued(env, [0, 1, 1, 0, 1]))
+    np.testing.assert_array_equal(
+        _continued(other, [0, 1, 1, 0, 1]), _continued(env, [0, 1, 1, 0, 1])
+    )
     assert other.step(0).first()
     with pytest.raises(ValueError, match=r"snapshot\['physics'\] is of shape \(3,\)"):
         env.restore(env.snapshot() | {"physics": np.zeros(3)})
@@ -317,7 +344,9 @@ def test_pixels_show_the_present_state_and_change_nothing(task):
     fresh = suite.load(task, actuator="ideal")
     with fresh.physics.reset_context() as physics:
         physics.data.qpos[:] = env.physics.position()
-    np.testing.assert_array_equal(fresh.physics.render(height=48, width=64, camera_id="fixed"), images[-1])
+    np.testing.assert_array_equal(
+        fresh.physics.render(height=48, width=64, camera_id="fixed"), images[-1]
+    )
 
 
 # -- environments of others ---------------------------------------------------------------------------------
@@ -328,7 +357,9 @@ def test_any_environment_of_gymnasiums_keeps_the_contract(made):
     """Vectors, numbers and tuples of them; with motors, and without."""
     ours, theirs = (gymnasium.make(made, disable_env_checker=True) for _ in range(2))
     if made == "Hopper-v5":
-        config = EnvConfig(made, {".*": "lag"}, randomize={".*": {"time_constant": "uniform(0.01, 0.02)"}})
+        config = EnvConfig(
+            made, {".*": "lag"}, randomize={".*": {"time_constant": "uniform(0.01, 0.02)"}}
+        )
         env, theirs = suite.load(config, task_kwargs={"random": 4}), config.make()
         assert env.physics.named.data.qpos["rootz"] == env.data.qpos[1]
         assert env.control_timestep() == env.dt == 0.008
@@ -338,7 +369,10 @@ def test_any_environment_of_gymnasiums_keeps_the_contract(made):
     for action in _actions(theirs.action_space, 60, 0):
         seen.append(env.step(action))
         expected.append(theirs.step(action))
-        assert (seen[-1].reward, seen[-1].last()) == (expected[-1][1], expected[-1][2] or expected[-1][3])
+        assert (seen[-1].reward, seen[-1].last()) == (
+            expected[-1][1],
+            expected[-1][2] or expected[-1][3],
+        )
         if seen[-1].last():
             seen.append(env.step(action))
             expected.append(theirs.reset())
@@ -358,10 +392,18 @@ def test_any_environment_of_gymnasiums_keeps_the_contract(made):
     [
         (("pendulm",), {}, "unknown task 'pendulm': did you mean 'pendulum'?"),
         (("pendulum", "swingup"), {}, "task_name = 'swingup': every domain has one task, 'gym'"),
-        (("pendulum",), {"task_kwargs": {"seed": 1}}, "task_kwargs = {'seed': 1}: may only hold 'random'"),
+        (
+            ("pendulum",),
+            {"task_kwargs": {"seed": 1}},
+            "task_kwargs = {'seed': 1}: may only hold 'random'",
+        ),
         (("pendulum", "gym", "papr"), {}, "unknown actuator 'papr': did you mean 'paper'"),
         (("pendulum",), {"center_radius": 0.1}, "unknown option 'center_radius' of pendulum"),
-        (("cartpole", "gym", "ideal"), {"observe_actuator": True}, "the ideal actuator has no current"),
+        (
+            ("cartpole", "gym", "ideal"),
+            {"observe_actuator": True},
+            "the ideal actuator has no current",
+        ),
     ],
 )
 def test_a_bad_argument_is_refused(arguments, options, message):
@@ -370,10 +412,15 @@ def test_a_bad_argument_is_refused(arguments, options, message):
 
 
 NONE = [0.5, -1, 3, None, "1", np.nan, np.array([0, 1])]
-BAD_ACTIONS = {"cartpole": [*NONE, 1.0, np.array([0.7])], "pendulum": [*NONE, 1.0, np.array([np.nan])]}
+BAD_ACTIONS = {
+    "cartpole": [*NONE, 1.0, np.array([0.7])],
+    "pendulum": [*NONE, 1.0, np.array([np.nan])],
+}
 
 
-@pytest.mark.parametrize(("task", "action"), [(task, one) for task, wrong in BAD_ACTIONS.items() for one in wrong])
+@pytest.mark.parametrize(
+    ("task", "action"), [(task, one) for task, wrong in BAD_ACTIONS.items() for one in wrong]
+)
 def test_a_bad_action_is_refused_and_changes_nothing(task, action):
     env = suite.load(task)
     env.reset()
@@ -393,7 +440,10 @@ def test_a_discrete_action_may_be_any_integer(kind):
 
 def test_a_generator_may_be_shared():
     generator, twin = np.random.default_rng(4), np.random.default_rng(4)
-    one, two = suite.load("pendulum", task_kwargs={"random": generator}), suite.load("pendulum", task_kwargs=None)
+    one, two = (
+        suite.load("pendulum", task_kwargs={"random": generator}),
+        suite.load("pendulum", task_kwargs=None),
+    )
     expected = gymnasium.make(TASKS["pendulum"].env_id)
     expected.reset(seed=4)
     one.reset()

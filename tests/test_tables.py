@@ -14,7 +14,9 @@ from codrl_mj.evaluation import MEASURES, RandomPolicy, evaluate
 def results():
     """Evaluations of random policies, by task and actuator."""
     return {
-        (task, actuator): evaluate(RandomPolicy(task), EnvConfig(task, actuator, max_episode_steps=30), episodes=3)
+        (task, actuator): evaluate(
+            RandomPolicy(task), EnvConfig(task, actuator, max_episode_steps=30), episodes=3
+        )
         for task, actuator in (
             ("cartpole", "ideal"),
             ("cartpole", "weaker"),
@@ -35,17 +37,19 @@ def test_a_row_has_the_most_telling_measures(results):
     result = results["cartpole", "weaker"]
     lines = printed({"mine": result}, details=False)
     (row,) = (line for line in lines if "mine" in line)
-    assert " ".join(row.split()) == (
-        f"mine {100 * result.success.mean:.0f} % "
-        f"{result.returns.mean:.1f} [{result.returns.low:.1f}, {result.returns.high:.1f}] "
-        f"{result.tracking_rms:.3g} N·m {result.saturated_percent:.1f} % {result.peak_voltage:.1f} V "
-        f"{result.energy_drawn.mean:.3g} J"
+    assert (
+        " ".join(row.split()) == f"mine {100 * result.success.mean:.0f} % {result.returns.mean:.1f}"
+        f" [{result.returns.low:.1f}, {result.returns.high:.1f}] {result.tracking_rms:.3g} N·m"
+        f" {result.saturated_percent:.1f} % {result.peak_voltage:.1f} V"
+        f" {result.energy_drawn.mean:.3g} J"
     )
     assert "3 episodes a row" in lines[0]
 
 
 def test_what_an_ideal_actuator_does_not_have_is_a_dash(results):
-    lines = printed({"perfect": results["cartpole", "ideal"], "mine": results["cartpole", "weaker"]})
+    lines = printed(
+        {"perfect": results["cartpole", "ideal"], "mine": results["cartpole", "weaker"]}
+    )
     (row,) = (line for line in lines if line.split()[:1] == ["perfect"])
     assert row.split()[-3:] == ["–", "–", "–"]
     alone = "\n".join(printed({"perfect": results["cartpole", "ideal"]}))
@@ -56,7 +60,10 @@ def test_what_an_ideal_actuator_does_not_have_is_a_dash(results):
 
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_tables_fit_and_break_no_number(results, count):
-    names = [f"a policy with a long name, the {index}th of them, on [some] actuator" for index in range(count)]
+    names = [
+        f"a policy with a long name, the {index}th of them, on [some] actuator"
+        for index in range(count)
+    ]
     lines = printed(dict(zip(names, results.values(), strict=False)))
     assert max(map(len, lines)) <= 110
     text = "\n".join(lines)
@@ -69,7 +76,13 @@ def test_every_measure_is_in_one_of_the_tables(results):
     result = results["pendulum", "weak"]
     text = " ".join(" ".join(printed({"mine": result})).split())
     for name, field in MEASURES.items():
-        shown_above = name in ("returns", "failure", "tracking_rms", "saturated_percent", "peak_voltage")
+        shown_above = name in (
+            "returns",
+            "failure",
+            "tracking_rms",
+            "saturated_percent",
+            "peak_voltage",
+        )
         has_row = f"{field.metadata['label']} [" in text
         assert has_row != (shown_above or getattr(result, name) is None), name
     assert f"copper loss [J] {result.copper_loss.mean:.3g} [{result.copper_loss.low:.3g}," in text

@@ -26,21 +26,42 @@ def idea():
 
 def ours(motor):
     """The package's actuator with the example's numbers."""
-    gains = {"kp": motor.kp, "ki": motor.ki, "kd": motor.kd, "kff": motor.kff, "max_voltage": motor.max_voltage}
-    numbers = motor.resistance, motor.inductance, motor.torque_constant, motor.back_emf_constant, motor.arm
+    gains = {
+        "kp": motor.kp,
+        "ki": motor.ki,
+        "kd": motor.kd,
+        "kff": motor.kff,
+        "max_voltage": motor.max_voltage,
+    }
+    numbers = (
+        motor.resistance,
+        motor.inductance,
+        motor.torque_constant,
+        motor.back_emf_constant,
+        motor.arm,
+    )
     return Actuator(Motor(*numbers), CurrentLoop(**gains), None)
 
 
 def test_its_motors_are_the_papers_and_a_slow_one(idea):
     assert ours(idea.PAPER) == named_actuator("paper", "cartpole")
     weak = named_actuator("weak", "cartpole").controller
-    assert (idea.SLOW.kp, idea.SLOW.ki, idea.SLOW.kd, idea.SLOW.kff) == (weak.kp, weak.ki, weak.kd, weak.kff)
+    assert (idea.SLOW.kp, idea.SLOW.ki, idea.SLOW.kd, idea.SLOW.kff) == (
+        weak.kp,
+        weak.ki,
+        weak.kd,
+        weak.kff,
+    )
 
 
 @pytest.mark.parametrize("physics", ["analytic", "mujoco"])
 @pytest.mark.parametrize(
     "changed",
-    [{}, {"inductance": 1.0, "kp": 1.0, "kff": 0.0}, {"kd": 0.02, "max_voltage": 1.0, "torque_constant": 0.5}],
+    [
+        {},
+        {"inductance": 1.0, "kp": 1.0, "kff": 0.0},
+        {"kd": 0.02, "max_voltage": 1.0, "torque_constant": 0.5},
+    ],
 )
 def test_every_step_is_the_packages(idea, physics, changed):
     motor = idea.PAPER._replace(**changed)
@@ -59,7 +80,10 @@ def test_every_step_is_the_packages(idea, physics, changed):
             _, reward, terminated, _, info = env.step(right)
             np.testing.assert_allclose(env.unwrapped.state, state[:, 0], rtol=0, atol=1e-12)
             expected = desired[0], force[0], inside[0, 0], voltage[0]
-            found = [float(info[name]) for name in ("desired_force", "actual_force", "current", "voltage")]
+            found = [
+                float(info[name])
+                for name in ("desired_force", "actual_force", "current", "voltage")
+            ]
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
             standing = bool(idea.standing(state)[0])
             assert terminated != standing
@@ -94,7 +118,9 @@ def test_its_gradient_is_that_of_the_log_probability(idea):
     surprise = right - idea.probability(policy, seen)
     gradient = np.append(np.tensordot(seen, surprise, 2), surprise.sum())
     steps = 1e-6 * np.eye(5)
-    numerical = [(log_probability(policy + one) - log_probability(policy - one)) / 2e-6 for one in steps]
+    numerical = [
+        (log_probability(policy + one) - log_probability(policy - one)) / 2e-6 for one in steps
+    ]
     np.testing.assert_allclose(gradient, numerical, rtol=1e-6)
 
 
@@ -115,6 +141,8 @@ def test_what_learned_on_ideal_forces_falls_and_what_learned_through_the_motor_s
 
 
 def test_it_imports_numpy_alone(idea):
-    imported = [line for line in PATH.read_text().splitlines() if line.startswith(("import ", "from "))]
+    imported = [
+        line for line in PATH.read_text().splitlines() if line.startswith(("import ", "from "))
+    ]
     assert imported == ["from typing import NamedTuple", "import numpy as np"]
     assert "the_whole_idea" not in sys.modules

@@ -19,7 +19,9 @@ IN_PARTS = re.findall(r"^codrl-mj (.*)$", PAGE, re.MULTILINE)
 """What needs a board."""
 
 
-@pytest.mark.parametrize("command", [*(line for line in LINES if line.startswith("codrl-mj")), *IN_PARTS])
+@pytest.mark.parametrize(
+    "command", [*(line for line in LINES if line.startswith("codrl-mj")), *IN_PARTS]
+)
 def test_the_commands_are_understood(command, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     for name, text in FILES.items():
@@ -34,7 +36,9 @@ def test_the_commands_are_understood(command, monkeypatch, tmp_path):
 
 
 @pytest.mark.matrix
-@pytest.mark.skipif(bool(missing_tools("host")), reason="NOT RUN: no C compiler: apt-get install gcc")
+@pytest.mark.skipif(
+    bool(missing_tools("host")), reason="NOT RUN: no C compiler: apt-get install gcc"
+)
 def test_it_can_be_followed_to_its_end(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     for name, text in FILES.items():
@@ -43,19 +47,26 @@ def test_it_can_be_followed_to_its_end(monkeypatch, tmp_path, capsys):
     for line in LINES:
         if not line.startswith("codrl-mj"):
             done = subprocess.run(line, shell=True, check=True, capture_output=True, text=True)
-            assert float(done.stdout.split()[-1]) < 1e-6  # the largest difference of the golden commands
+            assert (
+                float(done.stdout.split()[-1]) < 1e-6
+            )  # the largest difference of the golden commands
             continue
         words = shlex.split(line)[1:]
         if "cortex-m4f" in words and missing_tools("cortex-m4f"):
             continue
         if words[0] == "train":
             words += ["--total-steps", "8192"]
-        words = ["1" if before == "--episodes" else word for before, word in zip(["", *words], words, strict=False)]
+        words = [
+            "1" if before == "--episodes" else word
+            for before, word in zip(["", *words], words, strict=False)
+        ]
         compares = words[:2] == ["identify", "compare"]
         capsys.readouterr()
         assert main([*words, *["--json"] * compares]) == 0, line
         if compares:
-            errors.append({one["name"]: one["error"] for one in json.loads(capsys.readouterr().out)})
+            errors.append(
+                {one["name"]: one["error"] for one in json.loads(capsys.readouterr().out)}
+            )
     with_datasheet, identified = errors
     assert with_datasheet["arm_velocity"] > 2.0 * identified["arm_velocity"]
     assert main(["board", "check", "mine", "rig.csv"]) == 0

@@ -57,7 +57,9 @@ def bench(tmp_path_factory):
 def test_the_fit_finds_the_motor_of_the_bench(bench, monkeypatch):
     monkeypatch.chdir(bench)
     real = yaml.safe_load(FILES["real.yaml"])["motor"]
-    found = {one["name"]: one for one in json.loads(Path("motor/result.json").read_text())["estimates"]}
+    found = {
+        one["name"]: one for one in json.loads(Path("motor/result.json").read_text())["estimates"]
+    }
     for name in ("resistance", "torque_constant", "back_emf_constant"):
         assert found[name]["low"] <= real[name] <= found[name]["high"]
 
@@ -67,4 +69,8 @@ def test_the_rest_of_it_runs(bench, monkeypatch):
     monkeypatch.chdir(bench)
     for command in COMMANDS[TRAINING:]:
         run(command, **SHORT)
-    assert [command.split()[0] for command in COMMANDS[TRAINING:]] == ["train", "evaluate", "evaluate"]
+    assert [command.split()[0] for command in COMMANDS[TRAINING:]] == [
+        "train",
+        "evaluate",
+        "evaluate",
+    ]

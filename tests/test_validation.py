@@ -17,7 +17,13 @@ import codrl_mj
 from codrl_mj.actuators import IDEAL, Actuator, Lag, TorqueSpeed
 from codrl_mj.cli import main
 from codrl_mj.pages import certificate as page
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant, SimulationDivergedError, needed_callbacks
+from codrl_mj.physics import (
+    AnalyticPhysics,
+    MujocoPhysics,
+    Plant,
+    SimulationDivergedError,
+    needed_callbacks,
+)
 from codrl_mj.physics.variation import bare_model
 from codrl_mj.tasks import TASKS
 from codrl_mj.validation import (
@@ -63,7 +69,14 @@ def certificate():
 def one_check(**fields):
     return Check(
         **(
-            {"name": "name", "oracle": "oracle", "tolerance": 1.0, "samples": 1, "worst": 0.0, "group": "dynamics"}
+            {
+                "name": "name",
+                "oracle": "oracle",
+                "tolerance": 1.0,
+                "samples": 1,
+                "worst": 0.0,
+                "group": "dynamics",
+            }
             | fields
         )
     )
@@ -73,7 +86,11 @@ def one_check(**fields):
 
 
 def test_the_quick_certificate_passes(certificate):
-    failed = [(check.group, check.task, check.name, check.worst) for check in certificate.checks if not check.passed]
+    failed = [
+        (check.group, check.task, check.name, check.worst)
+        for check in certificate.checks
+        if not check.passed
+    ]
     assert failed == []
     assert certificate.passed
     assert certificate.quick
@@ -94,7 +111,11 @@ def of_others():
 
 @pytest.mark.matrix
 def test_the_quick_certificate_of_the_other_tasks_passes(of_others):
-    assert [(check.group, check.task, check.name, check.worst) for check in of_others.checks if not check.passed] == []
+    assert [
+        (check.group, check.task, check.name, check.worst)
+        for check in of_others.checks
+        if not check.passed
+    ] == []
     check_coverage(of_others, OTHERS)
 
 
@@ -105,7 +126,11 @@ for module in (*GROUPS, "own_model"):
 def checks_of(certificate, row):
     """The certificate's checks that are of a row."""
     name = re.compile(re.sub(r"\\{[^}]*\\}", ".+", re.escape(row.name)))
-    return [check for check in certificate.checks if check.group == row.group and name.fullmatch(check.name)]
+    return [
+        check
+        for check in certificate.checks
+        if check.group == row.group and name.fullmatch(check.name)
+    ]
 
 
 @pytest.mark.parametrize("row", TABLE, ids=[f"{row.group}, {row.name}" for row in TABLE])
@@ -125,7 +150,9 @@ def test_every_check_is_of_the_table(certificate):
 def test_every_group_is_in_it_and_every_check_says_what_it_compared(certificate):
     assert {check.group for check in certificate.checks} == set(GROUPS)
     for task in TELLING:
-        assert set(GROUPS) - {"motor"} <= {check.group for check in certificate.checks if check.task == task}
+        assert set(GROUPS) - {"motor"} <= {
+            check.group for check in certificate.checks if check.task == task
+        }
     keys = [(check.group, check.task, check.name) for check in certificate.checks]
     assert len(set(keys)) == len(keys)
     for check in certificate.checks:
@@ -137,7 +164,9 @@ def test_every_group_is_in_it_and_every_check_says_what_it_compared(certificate)
 
 def check_coverage(certificate, tasks):
     def names(group, task):
-        return {check.name for check in certificate.checks if (check.group, check.task) == (group, task)}
+        return {
+            check.name for check in certificate.checks if (check.group, check.task) == (group, task)
+        }
 
     for task in tasks:
         assert names("convergence", task) == ideal(task) | with_motor(task) | {RATE}
@@ -146,7 +175,9 @@ def check_coverage(certificate, tasks):
 
 def test_every_integrator_and_motor_has_its_checks(certificate):
     check_coverage(certificate, TELLING)
-    assert {check.name for check in certificate.checks if (check.group, check.task) == ("motor", "")} == EVERY
+    assert {
+        check.name for check in certificate.checks if (check.group, check.task) == ("motor", "")
+    } == EVERY
 
 
 def test_tolerances_are_those_promised(certificate):
@@ -168,7 +199,9 @@ def test_the_whole_form_has_the_same_checks_with_more_samples(certificate):
         for check in certificate.checks
         if (check.group, check.task) == ("dynamics", "cartpole")
     }
-    whole = {check.name: check.samples for check in validate("cartpole", groups=["dynamics"]).checks}
+    whole = {
+        check.name: check.samples for check in validate("cartpole", groups=["dynamics"]).checks
+    }
     assert whole.keys() == quick.keys()
     assert all(whole[name] > quick[name] for name in whole)
 
@@ -237,7 +270,9 @@ def test_faults_are_undone(caught):
 def functions():
     """Every function of the package that is loaded, by (whose it is, name)."""
     modules = [module for name, module in sys.modules.items() if name.startswith("codrl_mj")]
-    classes = [value for module in modules for value in vars(module).values() if isinstance(value, type)]
+    classes = [
+        value for module in modules for value in vars(module).values() if isinstance(value, type)
+    ]
     return {
         (id(owner), name): value
         for owner in [*modules, *classes]
@@ -262,8 +297,16 @@ def test_a_wrong_function_can_be_called_as_the_right_one():
                 names = list(inspect.signature(right).parameters)
                 inspect.signature(wrong).bind(*names)  # raises TypeError
                 inspect.signature(wrong).bind(**dict.fromkeys(names))
-    assert replacing >= {"a stale command", "the other Euler integrator", "a reset that leaves the motor running"}
-    assert replacing >= {"bounds that are not kept", "a mass off by 0.1 %", "kp and ki swapped, everywhere"}
+    assert replacing >= {
+        "a stale command",
+        "the other Euler integrator",
+        "a reset that leaves the motor running",
+    }
+    assert replacing >= {
+        "bounds that are not kept",
+        "a mass off by 0.1 %",
+        "kp and ki swapped, everywhere",
+    }
 
 
 def test_a_fault_is_undone_after_an_error():
@@ -311,7 +354,8 @@ def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
 
     monkeypatch.setattr(gymnasium.envs.classic_control.CartPoleEnv, "step", shifted)
     assert not any(
-        check.passed for check in validate("cartpole", quick=True, groups=["dynamics", "trajectories"]).checks
+        check.passed
+        for check in validate("cartpole", quick=True, groups=["dynamics", "trajectories"]).checks
     )
 
 
@@ -342,7 +386,10 @@ def test_the_worst_is_the_largest_and_a_nan_stays():
 
 
 def test_the_worst_of_an_array_is_worded_by_its_index_and_no_difference_is_nowhere():
-    assert worst_of((np.array([[0.1, 0.2], [0.9, 0.4]]), "at {}".format), (0.5, "b")) == (0.9, "at 2")
+    assert worst_of((np.array([[0.1, 0.2], [0.9, 0.4]]), "at {}".format), (0.5, "b")) == (
+        0.9,
+        "at 2",
+    )
     assert math.isnan(worst_of((np.array([0.1, math.nan, math.inf]), "at {}".format))[0])
     assert worst_of((np.zeros(3), "at {}".format)) == (0.0, "everywhere: there is no difference")
     assert worst_of((0.0, "at the end")) == (0.0, "at the end")
@@ -375,7 +422,9 @@ def test_a_run_that_diverges_is_a_failed_check_that_says_so(monkeypatch):
         return step(self, desired_force)
 
     monkeypatch.setattr(MujocoPhysics, "step", diverging)
-    for check in trajectories.whole_runs(TASKS["cartpole"], "ideal", "euler", range(1), 20, motor=""):
+    for check in trajectories.whole_runs(
+        TASKS["cartpole"], "ideal", "euler", range(1), 20, motor=""
+    ):
         assert check.worst == math.inf
         assert check.where == "step 5 of seed 0: it diverged"
 
@@ -469,8 +518,19 @@ def test_a_model_of_ones_own_passes_what_applies_and_is_told_what_does_not():
     assert result.passed
     names = {check.name for check in result.checks}
     assert {"stable: left", "stable: right", "steps: left", "steps: right"} <= names
-    assert {"batched, 1 thread", "batched, 2 threads", "copied", "restored", "forward passes"} <= names
-    assert {skip.group for skip in result.skipped} >= {"dynamics", "trajectories", "convergence", "energy"}
+    assert {
+        "batched, 1 thread",
+        "batched, 2 threads",
+        "copied",
+        "restored",
+        "forward passes",
+    } <= names
+    assert {skip.group for skip in result.skipped} >= {
+        "dynamics",
+        "trajectories",
+        "convergence",
+        "energy",
+    }
     assert any("foreign" in skip.name and "not motors" in skip.reason for skip in result.skipped)
     assert all(check.task == "two motors" for check in result.checks)
 
@@ -479,13 +539,24 @@ def test_a_model_of_ones_own_passes_what_applies_and_is_told_what_does_not():
 def test_every_check_of_a_model_can_fail():
     model, failed = rotor(), set()
     with wrong_loop(("+ parameters.ki * integral", "- parameters.ki * integral")):
-        failed |= {check.name for check in validate_model(model, quick=True).checks if not check.passed}
+        failed |= {
+            check.name for check in validate_model(model, quick=True).checks if not check.passed
+        }
     for mutation in MUTATIONS:
-        if mutation.name in ("a motor that runs in every forward pass", "a current that simulations share"):
+        if mutation.name in (
+            "a motor that runs in every forward pass",
+            "a current that simulations share",
+        ):
             with mutation.apply():
-                failed |= {check.name for check in validate_model(model, quick=True).checks if not check.passed}
+                failed |= {
+                    check.name
+                    for check in validate_model(model, quick=True).checks
+                    if not check.passed
+                }
     unstable = rotor(changed(FULL, kp=1000.0))
-    failed |= {check.name for check in validate_model(unstable, quick=True).checks if not check.passed}
+    failed |= {
+        check.name for check in validate_model(unstable, quick=True).checks if not check.passed
+    }
     assert failed == {check.name for check in validate_model(model, quick=True).checks}
 
 
@@ -495,8 +566,14 @@ def test_actuators_of_other_families_are_checked_beside_motors():
     add_motor(spec, "hinge", TorqueSpeed(), name="line")
     result = validate_model(spec.compile(), quick=True)
     assert result.passed
-    names = [check.name for check in result.checks if check.group == "motor" and "response" not in check.name]
-    assert names[:6] == [f"{check}: {name}" for check in ("stable", "steps") for name in ("motor", "late", "line")]
+    names = [
+        check.name
+        for check in result.checks
+        if check.group == "motor" and "response" not in check.name
+    ]
+    assert names[:6] == [
+        f"{check}: {name}" for check in ("stable", "steps") for name in ("motor", "late", "line")
+    ]
     assert {skip.name for skip in result.skipped if "no current loop" in skip.reason} == {
         "responses of late",
         "responses of line",
@@ -513,10 +590,16 @@ SERVO = """
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_motors_behind_the_plugin_are_put_through_the_same_checks(bare_engine, integrator):
-    model = behind_plugin(arm(integrator), {"one": ACTUATORS["noisy_current_loop"], "two": ACTUATORS["somebody's"]})
+    model = behind_plugin(
+        arm(integrator), {"one": ACTUATORS["noisy_current_loop"], "two": ACTUATORS["somebody's"]}
+    )
     result = validate_model(model, quick=True)
-    assert [(check.name, check.worst, check.where) for check in result.checks if not check.passed] == []
-    assert {"steps: one", "steps: two", "stable: one", "step response", "restored"} <= {c.name for c in result.checks}
+    assert [
+        (check.name, check.worst, check.where) for check in result.checks if not check.passed
+    ] == []
+    assert {"steps: one", "steps: two", "stable: one", "step response", "restored"} <= {
+        c.name for c in result.checks
+    }
     assert needed_callbacks(model) == ()
 
 
@@ -531,12 +614,16 @@ def test_a_motorised_servo_and_an_ideal_actuator_are_checked_for_what_they_are(b
 def test_a_wrong_motor_behind_the_plugin_fails(bare_engine):
     model = behind_plugin(arm(), {"one": LOOP})
     with wrong_loop(("+ parameters.ki * integral", "- parameters.ki * integral")):
-        failed = {check.name for check in validate_model(model, quick=True).checks if not check.passed}
+        failed = {
+            check.name for check in validate_model(model, quick=True).checks if not check.passed
+        }
     assert failed >= {"steps: one", "step response"}
 
 
 def test_an_actuator_that_its_family_would_refuse_is_not_stable():
-    result = validate_model(rotor(Lag(delay=0.081)), quick=True)  # eight steps of 0.01 s are remembered
+    result = validate_model(
+        rotor(Lag(delay=0.081)), quick=True
+    )  # eight steps of 0.01 s are remembered
     (check,) = (check for check in result.checks if not check.passed)
     assert (check.name, check.worst, check.unit) == ("stable: motor", math.inf, "instability")
 
@@ -578,12 +665,18 @@ def test_no_model_is_kept_from_a_mutation_nor_into_it():
     masses = [bare_model("pendulum").body_mass.sum()]
     with wrong_model(("body_mass", None, 2.0)):
         masses.append(bare_model("pendulum").body_mass.sum())
-    assert [*masses, bare_model("pendulum").body_mass.sum()] == [masses[0], 2.0 * masses[0], masses[0]]
+    assert [*masses, bare_model("pendulum").body_mass.sum()] == [
+        masses[0],
+        2.0 * masses[0],
+        masses[0],
+    ]
 
 
 def test_a_model_without_a_motor_is_refused():
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
-    with pytest.raises(ValueError, match=r"no motor of codrl_mj among its 0 actuators.*codrl_mj.motorise"):
+    with pytest.raises(
+        ValueError, match=r"no motor of codrl_mj among its 0 actuators.*codrl_mj.motorise"
+    ):
         validate_model(model)
 
 
@@ -599,10 +692,14 @@ def test_a_model_without_a_motor_is_refused():
         (["cartpole", "--out", "bare.xml/certificate"], "bare.xml is not a folder"),
     ],
 )
-def test_bad_input_costs_one_line_and_leaves_nothing(capsys, monkeypatch, tmp_path, arguments, expected):
+def test_bad_input_costs_one_line_and_leaves_nothing(
+    capsys, monkeypatch, tmp_path, arguments, expected
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bare.xml").write_text("<mujoco><worldbody/></mujoco>")
-    (tmp_path / "broken.xml").write_text("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
+    (tmp_path / "broken.xml").write_text(
+        "<mujoco><worldbody><body><joint/></body></worldbody></mujoco>"
+    )
     assert main(["validate", *arguments]) == 2
     error = capsys.readouterr().err
     assert expected in error
@@ -615,7 +712,9 @@ def test_bad_input_costs_one_line_and_leaves_nothing(capsys, monkeypatch, tmp_pa
 
 
 BAD = one_check(name="b <i>", group="motor", worst=math.nan, where="x < y & z", unit="A", task="")
-SAMPLE = Certificate("sample", (one_check(task="pendulum"), BAD), (Skipped("s", "why", "motor"),), True, 1.0)
+SAMPLE = Certificate(
+    "sample", (one_check(task="pendulum"), BAD), (Skipped("s", "why", "motor"),), True, 1.0
+)
 
 
 @pytest.mark.matrix
@@ -654,7 +753,9 @@ def test_plots_can_be_looked_at(certificate):
 
 
 def test_the_json_holds_the_verdict_and_every_number(tmp_path):
-    json_file, html_file = page.write(SAMPLE, tmp_path / "new" / "folder", [Caught("m", "", (BAD,), 2)])
+    json_file, html_file = page.write(
+        SAMPLE, tmp_path / "new" / "folder", [Caught("m", "", (BAD,), 2)]
+    )
     content = json.loads(json_file.read_text())
     assert content["verdict"] == "FAILED"
     assert [check["passed"] for check in content["checks"]] == [True, False]
@@ -663,7 +764,10 @@ def test_the_json_holds_the_verdict_and_every_number(tmp_path):
     assert content["skipped"][0]["reason"] == "why"
     assert content["mutations"][0]["failed"] == ["motor: b <i>"]
     assert content["failed by no mutation"] == ["dynamics: pendulum: name"]
-    assert sorted(path.name for path in html_file.parent.iterdir()) == ["certificate.html", "certificate.json"]
+    assert sorted(path.name for path in html_file.parent.iterdir()) == [
+        "certificate.html",
+        "certificate.json",
+    ]
 
 
 def test_a_certificate_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
@@ -681,7 +785,10 @@ def test_a_certificate_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
 def test_the_command_prints_writes_and_exits_with_0(capsys, tmp_path):
     (tmp_path / "robot.xml").write_text(TWO_MOTORS)
     out = tmp_path / "out"
-    assert main(["validate", "--model", str(tmp_path / "robot.xml"), "--quick", "--out", str(out)]) == 0
+    assert (
+        main(["validate", "--model", str(tmp_path / "robot.xml"), "--quick", "--out", str(out)])
+        == 0
+    )
     text = capsys.readouterr().out
     assert "steps: left" in text
     assert "not checked: dynamics" in text
@@ -699,7 +806,9 @@ def test_the_command_takes_a_motorised_model(capsys, bare_engine, tmp_path):
 
 
 @pytest.mark.parametrize("worst", [1.0, math.nan])
-def test_the_command_exits_with_1_when_a_check_fails_and_still_writes(capsys, monkeypatch, tmp_path, worst):
+def test_the_command_exits_with_1_when_a_check_fails_and_still_writes(
+    capsys, monkeypatch, tmp_path, worst
+):
     bad = one_check(name="bad", worst=worst, tolerance=1e-12, where="theta", task="cartpole")
     wrong = Certificate("cartpole", (one_check(name="good", task="cartpole"), bad), (), False, 1.0)
     monkeypatch.setattr("codrl_mj.validation.validate", lambda *_, **__: wrong)
@@ -713,8 +822,12 @@ def test_the_command_exits_with_1_when_a_check_fails_and_still_writes(capsys, mo
 @pytest.mark.parametrize(("missed", "status"), [(False, 0), (True, 1)])
 def test_a_fault_that_is_missed_fails_the_command(capsys, monkeypatch, missed, status):
     good, failed = one_check(task="cartpole"), one_check(task="cartpole", worst=7.0)
-    monkeypatch.setattr("codrl_mj.validation.validate", lambda *_, **__: Certificate("c", (good,), (), False, 1.0))
-    outcomes = [Caught("fault", "cartpole", (failed,), 1)] + [Caught("other", "cartpole", (), 1)] * missed
+    monkeypatch.setattr(
+        "codrl_mj.validation.validate", lambda *_, **__: Certificate("c", (good,), (), False, 1.0)
+    )
+    outcomes = [Caught("fault", "cartpole", (failed,), 1)] + [
+        Caught("other", "cartpole", (), 1)
+    ] * missed
     monkeypatch.setattr("codrl_mj.validation.try_mutations", lambda *_, **__: outcomes)
     assert main(["validate", "cartpole", "--mutations"]) == status
     assert ("MISSED" in capsys.readouterr().out) is missed
@@ -725,7 +838,12 @@ def test_a_fault_that_is_missed_fails_the_command(capsys, monkeypatch, missed, s
 
 
 def test_importing_the_certificate_needs_none_of_the_oracles_libraries():
-    code = "import sys, codrl_mj.cli.terminal; print([n for n in ('control', 'scipy', 'jinja2') if n in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    code = (
+        "import sys, codrl_mj.cli.terminal; print([n for n in ('control', 'scipy', 'jinja2') if n"
+        " in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
     assert "control" not in done.stdout
     assert "jinja2" not in done.stdout or "scipy" in done.stdout

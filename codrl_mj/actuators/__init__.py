@@ -1,6 +1,13 @@
 """Actuators as mathematics: what one is, the families of them, stability, names. No MuJoCo."""
 
-from codrl_mj.actuators.current_loop import Actuator, CurrentLoop, Motor, Supply, VoltageDriven, electrical_step
+from codrl_mj.actuators.current_loop import (
+    Actuator,
+    CurrentLoop,
+    Motor,
+    Supply,
+    VoltageDriven,
+    electrical_step,
+)
 from codrl_mj.actuators.drive import Drive, VoltageDrive
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal

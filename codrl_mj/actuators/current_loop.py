@@ -1,10 +1,10 @@
 """The paper's actuator, family `current_loop`: a DC motor whose winding is driven by a PID current loop.
 
-Source of the equations and of the defaults: *Control-Optimized Deep Reinforcement Learning* (arXiv 2507.00268),
-Methodology; "the paper" below.
+Source of the equations and of the defaults: *Control-Optimized Deep Reinforcement Learning* (arXiv
+2507.00268), Methodology; "the paper" below.
 
-`advance` is plain Python on purpose: numba compiles it for MuJoCo's control callback and actuator plugin, and it also
-runs as it stands, in the analytic physics and in the stability analysis.
+`advance` is plain Python on purpose: numba compiles it for MuJoCo's control callback and actuator
+plugin, and it also runs as it stands, in the analytic physics and in the stability analysis.
 """
 
 import dataclasses
@@ -23,10 +23,12 @@ from codrl_mj.fields import Checked, flag, integer, part, real
 class Motor(Checked):
     """A brushed DC motor: a winding (R, L) whose current makes torque and whose speed makes voltage.
 
-    L di/dt = u - kE*omega - R*i and torque = kT*i (the paper, eqs. for the current update and the torque).
+    L di/dt = u - kE*omega - R*i and torque = kT*i (the paper, eqs. for the current update and the
+    torque).
 
     Raises:
-        ValueError: a field is not a finite number within its bound; the message names field, value and bound.
+        ValueError: a field is not a finite number within its bound; the message names field, value
+            and bound.
     """
 
     resistance: float = real(1.0, above=0.0, unit="ohm")
@@ -38,8 +40,9 @@ class Motor(Checked):
     back_emf_constant: float = real(1.0, least=0.0, unit="V*s/rad")
     """Back-EMF constant kE [V*s/rad], >= 0; equal to kT in SI units for an ideal motor. The paper: 1."""
     arm_radius: float = real(1.0, above=0.0, unit="m")
-    """Arm r [m] between shaft and load, > 0: torque = r*F and omega = v/r. On a hinge it is the inverse of the
-    gear ratio (no unit). The paper: 0.15 for CartPole, else 1."""
+    """Arm r [m] between shaft and load, > 0: torque = r*F and omega = v/r. On a hinge it is the
+    inverse of the gear ratio (no unit). The paper: 0.15 for CartPole, else 1.
+    """
 
     @property
     def electrical_time_constant(self) -> float:
@@ -54,7 +57,8 @@ class CurrentLoop(Checked):
     u = sat(kp*e + ki*I + kd*D + kff*i_ref + kE*omega, +-max_voltage), with e = i_ref - i.
 
     Raises:
-        ValueError: a field is not a finite number within its bound; the message names field, value and bound.
+        ValueError: a field is not a finite number within its bound; the message names field, value
+            and bound.
     """
 
     kp: float = real(1.0, least=0.0, unit="V/A")
@@ -74,8 +78,9 @@ class CurrentLoop(Checked):
     integral_leak: float = real(0.0, least=0.0, unit="1/s")
     """Leak rate of the integral [1/s], >= 0: the paper appendix's low-pass form of the integral. 0: a plain sum."""
     derivative_time_constant: float = real(0.0, least=0.0, unit="s")
-    """Time constant [s] of the low-pass on the derivative, >= 0: the appendix's high-pass form of the derivative.
-    0: the plain difference of two samples."""
+    """Time constant [s] of the low-pass on the derivative, >= 0: the appendix's high-pass form of
+    the derivative. 0: the plain difference of two samples.
+    """
     current_bias: float = real(0.0, unit="A")
     """Offset of the current sensor [A]: the controller measures the current plus this."""
     current_noise: float = real(0.0, least=0.0, unit="A")
@@ -91,8 +96,9 @@ class Supply(Checked):
     """
 
     voltage: float = real(math.inf, above=0.0, unit="V", infinite=True)
-    """Open-circuit voltage [V], > 0; the terminal voltage is limited by the controller's `max_voltage` as well. `inf`:
-    the controller's `max_voltage`."""
+    """Open-circuit voltage [V], > 0; the terminal voltage is limited by the controller's
+    `max_voltage` as well. `inf`: the controller's `max_voltage`.
+    """
     resistance: float = real(0.0, least=0.0, unit="ohm")
     """Resistance [ohm], >= 0: the voltage that is available sags by resistance*|current|."""
 
@@ -121,19 +127,23 @@ class Signals(NamedTuple):
     """1 where that voltage was at its limit."""
 
 
-def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+def advance(
+    parameters: Any, timestep: float, state: State, inputs: Inputs
+) -> tuple[State, float, Signals]:
     """Advance the loop by one mechanical step, with desired torque and speed held over it.
 
-    The paper's Algorithm 1 (function DCMotorENVStep), with its CartPole feed-forward and its appendix's
-    filters, repeated `substeps` times with timestep/substeps. With both filters off, every operation is the paper's.
+    The paper's Algorithm 1 (function DCMotorENVStep), with its CartPole feed-forward and its
+    appendix's filters, repeated `substeps` times with timestep/substeps. With both filters off,
+    every operation is the paper's.
 
     The integral leaks as dI/dt = e - leak*I and the derivative is that of the error seen through
-    1/(1 + Td*s); both by backward Euler, so they are stable at any step and become the paper's sum and
-    difference at leak = 0 and Td = 0.
+    1/(1 + Td*s); both by backward Euler, so they are stable at any step and become the paper's sum
+    and difference at leak = 0 and Td = 0.
 
-    The controller reads i + current_bias + current_noise*n, with a new standard normal n for each electrical step, a
-    function of key, time and electrical step: whoever computes the step again gets it again. The voltage that is
-    available is the least of max_voltage and the supply's, which sags with the current at the electrical step's start.
+    The controller reads i + current_bias + current_noise*n, with a new standard normal n for each
+    electrical step, a function of key, time and electrical step: whoever computes the step again
+    gets it again. The voltage that is available is the least of max_voltage and the supply's, which
+    sags with the current at the electrical step's start.
 
     Args:
         parameters: named as the fields of `Actuator` and its parts.
@@ -145,17 +155,31 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
     substeps = int(parameters.substeps)
     dt = timestep / substeps
     voltage, available = 0.0, min(parameters.max_voltage, parameters.supply_voltage)
-    open_circuit = parameters.max_voltage if math.isinf(parameters.supply_voltage) else parameters.supply_voltage
+    open_circuit = (
+        parameters.max_voltage
+        if math.isinf(parameters.supply_voltage)
+        else parameters.supply_voltage
+    )
     for substep in range(substeps):
         sensor_error = parameters.current_bias
         if parameters.current_noise > 0.0:
             step = int(inputs.time / timestep + 0.5)
-            sensor_error += parameters.current_noise * noise.standard_normal(inputs.noise_key, step, substep)
+            sensor_error += parameters.current_noise * noise.standard_normal(
+                inputs.noise_key, step, substep
+            )
         if parameters.supply_resistance > 0.0:
             sag = parameters.supply_resistance * abs(current)
             available = min(parameters.max_voltage, max(open_circuit - sag, 0.0))
         current, integral, error, voltage = electrical_step(
-            parameters, dt, current, integral, error, inputs.desired_torque, inputs.speed, sensor_error, available
+            parameters,
+            dt,
+            current,
+            integral,
+            error,
+            inputs.desired_torque,
+            inputs.speed,
+            sensor_error,
+            available,
         )
     reference = inputs.desired_torque / parameters.torque_constant
     saturated = 1.0 if abs(voltage) >= available else 0.0
@@ -197,13 +221,20 @@ def electrical_step(
     integral = (integral + error * dt) / (1.0 + parameters.integral_leak * dt)
     derivative = (error - previous_error) / (dt + parameters.derivative_time_constant)
     previous_error = error - parameters.derivative_time_constant * derivative
-    voltage = parameters.kp * error + parameters.ki * integral + parameters.kd * derivative + feed_forward
+    voltage = (
+        parameters.kp * error + parameters.ki * integral + parameters.kd * derivative + feed_forward
+    )
     voltage = min(max(voltage, -limit), limit)
-    current = current + (voltage - back_emf - parameters.resistance * current) / parameters.inductance * dt
+    current = (
+        current
+        + (voltage - back_emf - parameters.resistance * current) / parameters.inductance * dt
+    )
     return current, integral, previous_error, voltage
 
 
-def observe(parameters: Any, timestep: float, signals: Signals, inputs: Inputs) -> tuple[float, float]:
+def observe(
+    parameters: Any, timestep: float, signals: Signals, inputs: Inputs
+) -> tuple[float, float]:
     """The current [A] that the sensor measures at present, at the first electrical step to come, and the reference."""
     error = parameters.current_bias
     if parameters.current_noise > 0.0:
@@ -224,7 +255,11 @@ class Actuator(ActuatorModel):
     electrical_step: ClassVar = staticmethod(electrical_step)
     State: ClassVar[type] = State
     Signals: ClassVar[type] = Signals
-    SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {"current": "A", "reference_current": "A", "voltage": "V"}
+    SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {
+        "current": "A",
+        "reference_current": "A",
+        "voltage": "V",
+    }
     OBSERVED: ClassVar[tuple[str, ...]] = ("current", "reference_current")
     RANDOM: ClassVar[tuple[str, ...]] = ("controller.current_noise",)
     advance: ClassVar = staticmethod(advance)
@@ -246,7 +281,11 @@ class Actuator(ActuatorModel):
     def back_emf_damping(self) -> float:
         """As `ActuatorModel.back_emf_damping`: kT*kE/R, seen from the load."""
         motor = self.motor
-        return motor.torque_constant * motor.back_emf_constant / (motor.resistance * motor.arm_radius**2)
+        return (
+            motor.torque_constant
+            * motor.back_emf_constant
+            / (motor.resistance * motor.arm_radius**2)
+        )
 
     @property
     def winding(self) -> tuple[float, float]:
@@ -256,12 +295,17 @@ class Actuator(ActuatorModel):
     @property
     def voltage_limit(self) -> float:
         """The largest voltage [V] without a current."""
-        return min(self.controller.max_voltage, math.inf if self.supply is None else self.supply.voltage)
+        return min(
+            self.controller.max_voltage, math.inf if self.supply is None else self.supply.voltage
+        )
 
     @property
     def assumed(self) -> str:
         """As `ActuatorModel.assumed`: the controller's default limit, where the supply has more."""
-        most, voltage = self.controller.max_voltage, math.inf if self.supply is None else self.supply.voltage
+        most, voltage = (
+            self.controller.max_voltage,
+            math.inf if self.supply is None else self.supply.voltage,
+        )
         if not (most == CurrentLoop.max_voltage and most < voltage < math.inf):
             return ""
         limit = f"controller.max_voltage = {most:g} V, which limits the supply of {voltage:g} V"
@@ -270,8 +314,12 @@ class Actuator(ActuatorModel):
     def commands(self) -> Mapping[str, Command]:
         """A reference `current` [A], or a `voltage` [V] past the controller: end to end."""
         torque = self.motor.torque_constant
-        fixed = dict.fromkeys(("motor.torque_constant", "motor.arm_radius"), "it would change what an action means")
-        passed = [f"controller.{f.name}" for f in dataclasses.fields(CurrentLoop) if f.name != "substeps"]
+        fixed = dict.fromkeys(
+            ("motor.torque_constant", "motor.arm_radius"), "it would change what an action means"
+        )
+        passed = [
+            f"controller.{f.name}" for f in dataclasses.fields(CurrentLoop) if f.name != "substeps"
+        ]
         driven_fixed = fixed | dict.fromkeys(passed, "the command goes past the controller")
         through = dataclasses.replace(
             CurrentLoop(kp=0.0, kff=1.0, bemf_compensation=False),
@@ -287,16 +335,18 @@ class Actuator(ActuatorModel):
         """Refuse a loop that is unstable at this step, or a supply under which a saturated motor's current is.
 
         Raises:
-            ValueError: the spectral radius is 1 or more; the message has the number and a remedy that was checked.
+            ValueError: the spectral radius is 1 or more; the message has the number and a remedy
+                that was checked.
         """
         if self.supply is not None and self.supply.resistance:
             substeps = self.controller.substeps
             bound = 2.0 * self.motor.inductance * substeps / timestep - self.motor.resistance
             if not self.supply.resistance < bound:
                 raise UnstableError(
-                    f"actuator: supply.resistance = {self.supply.resistance:g}: must be < 2*L/dt - R = {bound:g} ohm "
-                    f"at an electrical step of {timestep / substeps:g} s, or a saturated motor's current oscillates "
-                    "from step to step. Raise controller.substeps, or pass allow_unstable=True"
+                    f"actuator: supply.resistance = {self.supply.resistance:g}: must be < 2*L/dt -"
+                    f" R = {bound:g} ohm at an electrical step of {timestep / substeps:g} s, or a"
+                    " saturated motor's current oscillates from step to step. Raise"
+                    " controller.substeps, or pass allow_unstable=True"
                 )
         stability.check_stable(self, timestep)
 
@@ -306,21 +356,35 @@ class Actuator(ActuatorModel):
         columns = stability.columns(cls, numbers)
         radii = stability.stability_radii(cls, numbers, timestep)
         # under a saturated voltage the current is fed back through the supply
-        pole = (columns.resistance + columns.supply_resistance) * timestep / (columns.inductance * columns.substeps)
-        return np.where(columns.supply_resistance > 0.0, np.maximum(radii, np.abs(1.0 - pole)), radii)
+        pole = (
+            (columns.resistance + columns.supply_resistance)
+            * timestep
+            / (columns.inductance * columns.substeps)
+        )
+        return np.where(
+            columns.supply_resistance > 0.0, np.maximum(radii, np.abs(1.0 - pole)), radii
+        )
 
     def as_mapping(self) -> dict[str, Any]:
         """The nested mapping that `actuator_from_mapping` reads, without a family: it is the one that goes unsaid."""
         return dataclasses.asdict(self) if type(self) is Actuator else super().as_mapping()
 
 
-def _advance_driven(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+def _advance_driven(
+    parameters: Any, timestep: float, state: State, inputs: Inputs
+) -> tuple[State, float, Signals]:
     """`advance`, where the current asks for itself: an agent that commands the voltage desires whatever follows."""
     state, torque, signals = advance(parameters, timestep, state, inputs)
-    return state, torque, Signals(signals.current, signals.current, signals.voltage, signals.saturated)
+    return (
+        state,
+        torque,
+        Signals(signals.current, signals.current, signals.voltage, signals.saturated),
+    )
 
 
-def _observe_driven(parameters: Any, timestep: float, signals: Signals, inputs: Inputs) -> tuple[float, float]:
+def _observe_driven(
+    parameters: Any, timestep: float, signals: Signals, inputs: Inputs
+) -> tuple[float, float]:
     """The measured current, which is its own reference too."""
     measured, _ = observe(parameters, timestep, signals, inputs)
     return measured, measured
@@ -330,8 +394,8 @@ def _observe_driven(parameters: Any, timestep: float, signals: Signals, inputs: 
 class VoltageDriven(Actuator):
     """A motor under commanded voltage.
 
-    With no feedback, a feed-forward gain of 1 V/A and no back-EMF compensation, the terminal voltage in volts is the
-    reference current in amperes.
+    With no feedback, a feed-forward gain of 1 V/A and no back-EMF compensation, the terminal
+    voltage in volts is the reference current in amperes.
     """
 
     family: ClassVar[str] = ""

@@ -1,9 +1,10 @@
 """An off-the-shelf motor behind an off-the-shelf drive, family `drive`: gear, rotor, friction, a sampled PI loop.
 
-Where the paper's `current_loop` takes one or a few Euler steps of a slow winding, a bench motor's winding has a time
-constant of 0.1 to 5 ms under a loop that samples at 10 to 40 kHz. The winding is exact here, the loop has a sample rate
-of its own, its integrator does not wind up, and what is delivered over a mechanical step is the *mean* torque of it:
-the current at the end of a step says little of what moved the load.
+Where the paper's `current_loop` takes one or a few Euler steps of a slow winding, a bench motor's
+winding has a time constant of 0.1 to 5 ms under a loop that samples at 10 to 40 kHz. The winding is
+exact here, the loop has a sample rate of its own, its integrator does not wind up, and what is
+delivered over a mechanical step is the *mean* torque of it: the current at the end of a step says
+little of what moved the load.
 """
 
 import dataclasses
@@ -80,11 +81,15 @@ def limited(parameters: Any, timestep: float, heat: Heat, resistance: float, ask
     return min(max(asked, -most), most)
 
 
-def begin(parameters: Any, timestep: float, state: Any, inputs: Inputs) -> tuple[Winding, Heat, Shaft]:
+def begin(
+    parameters: Any, timestep: float, state: Any, inputs: Inputs
+) -> tuple[Winding, Heat, Shaft]:
     """Winding, temperatures and shaft at the beginning of a step, from a state that has the entries of `State`."""
     inertia, others = shaft.inertia_of(parameters, inputs.inertia), 0.0
     if state.due > 0.0 and abs(inputs.time - state.due) < 0.5 * timestep and inertia < math.inf:
-        others = shaft.others_after(timestep, inputs.speed - state.speed, state.acceleration, state.others)
+        others = shaft.others_after(
+            timestep, inputs.speed - state.speed, state.acceleration, state.others
+        )
     moving = Shaft(inertia, others, inputs.speed)
     winding = Winding(state.current, state.integral, state.pending)
     return winding, Heat(state.winding_rise, state.housing_rise), moving
@@ -108,7 +113,9 @@ def end(
         heat = shaft.heated(parameters, timestep, heat, resistance * means.current * means.current)
     own = means.torque / moving.inertia
     kept = winding.current, winding.integral, winding.pending, heat.winding, heat.housing
-    return (*kept, own, moving.speed, moving.others, time + timestep), shaft.temperature_of(parameters, heat)
+    return (*kept, own, moving.speed, moving.others, time + timestep), shaft.temperature_of(
+        parameters, heat
+    )
 
 
 def _advance(
@@ -120,8 +127,12 @@ def _advance(
     resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))
     reference = limited(parameters, timestep, heat, resistance, asked) if closed else asked
     samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
-    winding, _, means = shaft.turn(parameters, resistance, timestep, samples, winding, moving, closed, reference)
-    after, temperature = end(parameters, timestep, inputs.time, heat, resistance, winding, moving, means)
+    winding, _, means = shaft.turn(
+        parameters, resistance, timestep, samples, winding, moving, closed, reference
+    )
+    after, temperature = end(
+        parameters, timestep, inputs.time, heat, resistance, winding, moving, means
+    )
     shown = reference if closed else means.current
     less, warm = reference != asked, abs(reference) < parameters.max_current
     signals = Signals(
@@ -139,12 +150,19 @@ def _advance(
     return State(*after), means.torque, signals
 
 
-def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+def advance(
+    parameters: Any, timestep: float, state: State, inputs: Inputs
+) -> tuple[State, float, Signals]:
     """Advance winding, loop and shaft by one mechanical step [s]; speed and inertia of the inputs are the rotor's."""
     return _advance(parameters, timestep, state, inputs, True)
 
 
-def observe(parameters: Any, timestep: float, signals: Signals, inputs: Inputs) -> tuple[float, float]:  # noqa: ARG001
+def observe(
+    parameters: Any,  # noqa: ARG001
+    timestep: float,  # noqa: ARG001
+    signals: Signals,
+    inputs: Inputs,  # noqa: ARG001
+) -> tuple[float, float]:
     """The mean current [A] of the last step, which is what a drive reports, and its reference."""
     return signals.current, signals.reference_current
 
@@ -199,7 +217,9 @@ class Drive(ActuatorModel):
         """Rotor inertia and friction, seen from the load."""
         arm, motor = self.arm_radius, self.motor
         return JointAdditions(
-            motor.rotor_inertia / (arm * arm), motor.viscous_friction / (arm * arm), motor.coulomb_friction / arm
+            motor.rotor_inertia / (arm * arm),
+            motor.viscous_friction / (arm * arm),
+            motor.coulomb_friction / arm,
         )
 
     @property
@@ -230,13 +250,20 @@ class Drive(ActuatorModel):
         motor = self.motor
         alike = 0.5 <= motor.back_emf_constant / motor.torque_constant <= 2.0
         missing = {
-            f"supply.voltage = {self.voltage_limit:g} V": self.supply is None or math.isinf(self.supply.voltage),
+            f"supply.voltage = {self.voltage_limit:g} V": (
+                self.supply is None or math.isinf(self.supply.voltage)
+            ),
             "controller.max_current = inf": math.isinf(self.controller.max_current),
             "motor.rotor_inertia = 0": motor.rotor_inertia == 0.0,
         }
-        for name in ("torque_constant", "back_emf_constant"):  # of another motor: the two are equal but for losses
+        for name in (
+            "torque_constant",
+            "back_emf_constant",
+        ):  # of another motor: the two are equal but for losses
             value = getattr(motor, name)
-            missing[f"motor.{name} = {value:g}, a default"] = not alike and value == getattr(GearMotor, name)
+            missing[f"motor.{name} = {value:g}, a default"] = not alike and value == getattr(
+                GearMotor, name
+            )
         told = ", ".join(text for text, is_missing in missing.items() if is_missing)
         return f"assumed, for none is given: {told}" if told else ""
 
@@ -244,18 +271,26 @@ class Drive(ActuatorModel):
     def from_numbers(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
         """As `ActuatorModel.from_numbers`: the arm is that between rotor and load, the gear among the numbers."""
         family: Any = cls
-        return super().from_numbers(numbers, arm_radius * parameters_type(family)(*numbers).gear_ratio)
+        return super().from_numbers(
+            numbers, arm_radius * parameters_type(family)(*numbers).gear_ratio
+        )
 
     def commands(self) -> Mapping[str, Command]:
         """A reference `current` [A] within `max_current`, or the terminal `voltage` [V]."""
         limit, torque = self.controller.max_current, self.motor.torque_constant
-        fixed = dict.fromkeys(("motor.torque_constant", *ARM), "it would change what an action means")
+        fixed = dict.fromkeys(
+            ("motor.torque_constant", *ARM), "it would change what an action means"
+        )
         driven = VoltageDrive(self.motor, self.controller, self.supply)
         past = ["motor.max_temperature", *(f"controller.{name}" for name in _PAST_THE_LOOP)]
         return {
             "current": Command("A", self, torque, limit if math.isfinite(limit) else None, fixed),
             "voltage": Command(
-                "V", driven, torque, self.voltage_limit, fixed | dict.fromkeys(past, "the command goes past the loop")
+                "V",
+                driven,
+                torque,
+                self.voltage_limit,
+                fixed | dict.fromkeys(past, "the command goes past the loop"),
             ),
         }
 
@@ -269,15 +304,17 @@ class Drive(ActuatorModel):
         if abs(samples - round(samples)) > 1e-6 * samples or samples < 0.5:
             nearest = max(round(samples), 1) / timestep
             raise ValueError(
-                f"SampledLoop.sample_rate = {controller.sample_rate:g}: a mechanical step of {timestep:g} s holds "
-                f"{samples:g} samples, must be a whole number of them; the nearest rate is {nearest:.8g} Hz"
+                f"SampledLoop.sample_rate = {controller.sample_rate:g}: a mechanical step of"
+                f" {timestep:g} s holds {samples:g} samples, must be a whole number of them; the"
+                f" nearest rate is {nearest:.8g} Hz"
             )
         radius = float(_radii(type(self), np.array([self.numbers]))[0])
         if not radius < 1.0:
             raise UnstableError(
-                f"actuator: the current loop is unstable: spectral radius {radius:.4g} over a sample, must be < 1. "
-                f"Lower controller.kp = {controller.kp:g} and controller.ki = {controller.ki:g}, or leave both 0 to "
-                "have them designed; lower supply.resistance; or pass allow_unstable=True to study it as it is"
+                f"actuator: the current loop is unstable: spectral radius {radius:.4g} over a"
+                f" sample, must be < 1. Lower controller.kp = {controller.kp:g} and controller.ki ="
+                f" {controller.ki:g}, or leave both 0 to have them designed; lower"
+                " supply.resistance; or pass allow_unstable=True to study it as it is"
             )
 
     def check_shaft(self, timestep: float, inertia: float, held: bool = False) -> None:
@@ -295,23 +332,31 @@ class Drive(ActuatorModel):
         share = timestep / samples * braking / inertia
         remedy = "raise controller.sample_rate"
         if held:
-            remedy = "shorten the step" if told == 0.0 else "leave motor.load_inertia 0, so that the speed is followed"
+            remedy = (
+                "shorten the step"
+                if told == 0.0
+                else "leave motor.load_inertia 0, so that the speed is followed"
+            )
         text = (
-            f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes {share:.3g} of the rotor's "
-            f"speed in {timestep / samples:g} s over which that is held"
+            f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes {share:.3g}"
+            f" of the rotor's speed in {timestep / samples:g} s over which that is held"
         )
         if share >= 2.0:
             raise UnstableError(
-                f"{text}, must be < 2; {remedy}, give the rotor its inertia (it moves {inertia:.3g} kg*m^2 in all), "
-                "shorten the step, or pass allow_unstable=True to study it as it is"
+                f"{text}, must be < 2; {remedy}, give the rotor its inertia (it moves {inertia:.3g}"
+                " kg*m^2 in all), shorten the step, or pass allow_unstable=True to study it as"
+                " it is"
             )
         if share > 0.5:
-            warnings.warn(f"{text}: above 0.5 it is wrong, above 1 it rings; {remedy}", stacklevel=2)
+            warnings.warn(
+                f"{text}: above 0.5 it is wrong, above 1 it rings; {remedy}", stacklevel=2
+            )
         elif share * samples > 3.0:
             warnings.warn(
-                f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes {share * samples:.3g} of "
-                f"the rotor's speed in a step of {timestep:g} s. That is followed on a free shaft; at a stop, under "
-                "friction or beside other joints the torque comes as many steps late; shorten the step",
+                f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes"
+                f" {share * samples:.3g} of the rotor's speed in a step of {timestep:g} s. That is"
+                " followed on a free shaft; at a stop, under friction or beside other joints the"
+                " torque comes as many steps late; shorten the step",
                 stacklevel=2,
             )
 
@@ -330,7 +375,9 @@ class Drive(ActuatorModel):
         possible &= np.isinf(columns.max_temperature) | (
             columns.thermal_resistance_winding + columns.thermal_resistance_housing > 0.0
         )
-        possible &= 1.0 + columns.resistance_coefficient * (columns.ambient_temperature - 25.0) > 0.0
+        possible &= (
+            1.0 + columns.resistance_coefficient * (columns.ambient_temperature - 25.0) > 0.0
+        )
         return np.where(possible, _radii(cls, numbers), np.inf)
 
 
@@ -340,7 +387,9 @@ _PAST_THE_LOOP = ("bandwidth", "kp", "ki", "anti_windup", "bemf_compensation", "
 """What of a loop does not count where the agent commands the voltage."""
 
 
-def _advance_driven(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+def _advance_driven(
+    parameters: Any, timestep: float, state: State, inputs: Inputs
+) -> tuple[State, float, Signals]:
     """`advance` past the loop; the current asks for itself, as an agent that commands voltages desires what follows."""
     return _advance(parameters, timestep, state, inputs, False)
 
@@ -363,7 +412,9 @@ def _radii(cls: Any, numbers: np.ndarray) -> np.ndarray:
     decay = np.exp(-x)
     share = np.where(columns.bandwidth > 0.0, columns.bandwidth * sample_time, DEFAULT_BANDWIDTH)
     design = np.vectorize(sampled.designed_gains, otypes=[float, float])
-    gains = design(resistance, columns.inductance, sample_time, 2.0 * math.pi * share * columns.sample_rate)
+    gains = design(
+        resistance, columns.inductance, sample_time, 2.0 * math.pi * share * columns.sample_rate
+    )
     designed = (columns.kp == 0.0) & (columns.ki == 0.0)
     kp = np.where(designed, gains[0], columns.kp)
     ki = np.where(designed, gains[1], columns.ki * sample_time)
@@ -374,7 +425,11 @@ def _radii(cls: Any, numbers: np.ndarray) -> np.ndarray:
     integrates = ki > 0.0  # else the integral is no part of the loop
     voltage = -(kp + ki), np.where(integrates, one, 0.0), nothing  # of (current, integral, pending)
     rows = [
-        [decay + np.where(late, 0.0, effect * voltage[0]), np.where(late, 0.0, effect * voltage[1]), late * effect],
+        [
+            decay + np.where(late, 0.0, effect * voltage[0]),
+            np.where(late, 0.0, effect * voltage[1]),
+            late * effect,
+        ],
         [-ki, np.where(integrates, one, 0.0), nothing],
         [late * voltage[0], late * voltage[1], nothing],
     ]

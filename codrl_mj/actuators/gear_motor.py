@@ -32,22 +32,28 @@ class GearMotor(Checked):
     gear_ratio: float = real(1.0, above=0.0, unit="")
     """Turns n of the rotor for a turn of the output shaft, > 0."""
     gear_efficiency: float = real(1.0, above=0.0, most=1.0)
-    """Share of the torque that the gear passes on when it drives, in (0, 1]; driven, it brakes with 1/efficiency - 1 of
-    the torque: friction that depends on the load, part of what is delivered (`codrl_mj.actuators.shaft.friction`)."""
+    """Share of the torque that the gear passes on when it drives, in (0, 1]; driven, it brakes with
+    1/efficiency - 1 of the torque: friction that depends on the load, part of what is delivered
+    (`codrl_mj.actuators.shaft.friction`).
+    """
     coulomb_friction: float = real(0.0, least=0.0, unit="N*m")
     """Coulomb friction [N*m] at the rotor, >= 0: the joint's `frictionloss`."""
     viscous_friction: float = real(0.0, least=0.0, unit="N*m*s/rad")
     """Viscous friction [N*m*s/rad] at the rotor, >= 0: the joint's `damping`."""
     stribeck_friction: float = real(0.0, least=0.0, unit="N*m")
-    """What friction has at standstill [N*m] at the rotor over the Coulomb friction, >= 0; with the speed w it falls as
-    exp(-|w/`stribeck_speed`|^`stribeck_exponent`). Part of what is delivered (`codrl_mj.actuators.shaft.friction`)."""
+    """What friction has at standstill [N*m] at the rotor over the Coulomb friction, >= 0; with the
+    speed w it falls as exp(-|w/`stribeck_speed`|^`stribeck_exponent`). Part of what is delivered
+    (`codrl_mj.actuators.shaft.friction`).
+    """
     stribeck_speed: float = real(1.0, above=0.0, unit="rad/s")
     """Speed [rad/s] of the rotor at which 1/e of it is left, > 0."""
     stribeck_exponent: float = real(2.0, above=0.0, most=10.0, unit="")
     """How abruptly it falls, > 0 and <= 10: 2 is the usual, fits to servos give 1.3 and more."""
     load_inertia: float = real(0.0, least=0.0, unit="kg*m^2", infinite=True)
-    """Inertia [kg*m^2] of what the output shaft moves, >= 0, by which its speed changes within a step; 0: what it is in
-    the model at each moment; `inf`: the speed is held over a step. Nothing is added to the model by it."""
+    """Inertia [kg*m^2] of what the output shaft moves, >= 0, by which its speed changes within a
+    step; 0: what it is in the model at each moment; `inf`: the speed is held over a step. Nothing
+    is added to the model by it.
+    """
     thermal_resistance_winding: float = real(0.0, least=0.0, unit="K/W")
     """Thermal resistance [K/W] from the winding to the housing, >= 0; 0: the winding is as warm as the housing."""
     thermal_time_constant_winding: float = real(10.0, above=0.0, unit="s")
@@ -70,19 +76,24 @@ class GearMotor(Checked):
         super().__post_init__()
         if not self.max_temperature > self.ambient_temperature:
             raise ValueError(
-                f"GearMotor.max_temperature = {self.max_temperature:g}: must be above ambient_temperature = "
-                f"{self.ambient_temperature:g} degC, or no current at all would be asked for"
+                f"GearMotor.max_temperature = {self.max_temperature:g}: must be above"
+                f" ambient_temperature = {self.ambient_temperature:g} degC, or no current at all"
+                " would be asked for"
             )
-        if self.max_temperature < math.inf and not self.thermal_resistance_winding + self.thermal_resistance_housing:
+        if (
+            self.max_temperature < math.inf
+            and not self.thermal_resistance_winding + self.thermal_resistance_housing
+        ):
             raise ValueError(
-                f"GearMotor.max_temperature = {self.max_temperature:g}: needs thermal_resistance_winding or "
-                "thermal_resistance_housing, without which nothing warms"
+                f"GearMotor.max_temperature = {self.max_temperature:g}: needs"
+                " thermal_resistance_winding or thermal_resistance_housing, without which nothing"
+                " warms"
             )
         if not 1.0 + self.resistance_coefficient * (self.ambient_temperature - 25.0) > 0.0:
             raise ValueError(
-                f"GearMotor.ambient_temperature = {self.ambient_temperature:g}: with resistance_coefficient = "
-                f"{self.resistance_coefficient:g} the winding would have no resistance; must be above "
-                f"{25.0 - 1.0 / self.resistance_coefficient:g} degC"
+                f"GearMotor.ambient_temperature = {self.ambient_temperature:g}: with"
+                f" resistance_coefficient = {self.resistance_coefficient:g} the winding would have"
+                f" no resistance; must be above {25.0 - 1.0 / self.resistance_coefficient:g} degC"
             )
 
     @classmethod
@@ -94,10 +105,12 @@ class GearMotor(Checked):
             0.0251
 
         Args:
-            printed: as for `codrl_mj.catalogue.from_datasheet`, which also says how each number came about.
+            printed: as for `codrl_mj.catalogue.from_datasheet`, which also says how each number
+                came about.
 
         Raises:
-            ValueError: the datasheet does not suffice, or contradicts itself; the message has values and remedy.
+            ValueError: the datasheet does not suffice, or contradicts itself; the message has
+                values and remedy.
         """
         from codrl_mj.catalogue import from_datasheet
 
@@ -106,18 +119,24 @@ class GearMotor(Checked):
     @classmethod
     def of(cls, numbers: Any) -> "GearMotor":
         """A motor of `codrl_mj.catalogue.MotorNumbers`; what they do not know is left at 0, an efficiency at 1."""
-        known = {field.name: getattr(numbers, field.name, None) for field in dataclasses.fields(cls)}
+        known = {
+            field.name: getattr(numbers, field.name, None) for field in dataclasses.fields(cls)
+        }
         known |= {name: 0.0 for name in _UNKNOWN if known[name] is None}
         whole = getattr(numbers, "thermal_resistance", None)
         if known["thermal_resistance_winding"] is None and whole is not None:
-            known["thermal_resistance_winding"] = whole - (known["thermal_resistance_housing"] or 0.0)
+            known["thermal_resistance_winding"] = whole - (
+                known["thermal_resistance_housing"] or 0.0
+            )
         if known["thermal_resistance_winding"] is None:
             known["max_temperature"] = None
         return cls(**{name: value for name, value in known.items() if value is not None})
 
     def stribeck(self, speed: Any) -> Any:
         """Stribeck friction [N*m] at the rotor at its speed [rad/s], any shape."""
-        return self.stribeck_friction * np.exp(-(np.abs(speed / self.stribeck_speed) ** self.stribeck_exponent))
+        return self.stribeck_friction * np.exp(
+            -(np.abs(speed / self.stribeck_speed) ** self.stribeck_exponent)
+        )
 
     @property
     def electrical_time_constant(self) -> float:

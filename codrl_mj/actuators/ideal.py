@@ -15,7 +15,12 @@ class Signals(NamedTuple):
     saturated: float
 
 
-def advance(parameters: Any, timestep: float, state: Nothing, inputs: Inputs) -> tuple[Nothing, float, Signals]:  # noqa: ARG001
+def advance(
+    parameters: Any,  # noqa: ARG001
+    timestep: float,  # noqa: ARG001
+    state: Nothing,  # noqa: ARG001
+    inputs: Inputs,
+) -> tuple[Nothing, float, Signals]:
     """Deliver the desired torque."""
     return Nothing(), inputs.desired_torque, Signals(0.0, 0.0, 0.0, 0.0)
 

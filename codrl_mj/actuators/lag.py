@@ -28,13 +28,26 @@ class State(NamedTuple):
     c8: float
 
 
-def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Nothing]:
+def advance(
+    parameters: Any, timestep: float, state: State, inputs: Inputs
+) -> tuple[State, float, Nothing]:
     """Tau' = (gain*u(t - delay) - tau)/T, exactly, with u held over a step: tau -> g*u + (tau - g*u)*exp(-dt/T).
 
-    The torque is that at the end of the step, as the current loop's is. A delay that is no whole number of steps mixes
-    the two neighbouring commands in proportion, which is what held commands come to on average over a step.
+    The torque is that at the end of the step, as the current loop's is. A delay that is no whole
+    number of steps mixes the two neighbouring commands in proportion, which is what held commands
+    come to on average over a step.
     """
-    commands = (inputs.desired_torque, state.c1, state.c2, state.c3, state.c4, state.c5, state.c6, state.c7, state.c8)
+    commands = (
+        inputs.desired_torque,
+        state.c1,
+        state.c2,
+        state.c3,
+        state.c4,
+        state.c5,
+        state.c6,
+        state.c7,
+        state.c8,
+    )
     steps = parameters.delay / timestep
     whole = min(int(steps + 1e-9), 8)
     fraction = min(max(steps - whole, 0.0), 1.0) if steps - whole > 1e-9 else 0.0
@@ -42,9 +55,21 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
     if fraction > 0.0:
         arrived = arrived + fraction * (commands[min(whole + 1, 8)] - arrived)
     arrived = parameters.gain * arrived
-    decay = math.exp(-timestep / parameters.time_constant) if parameters.time_constant > 0.0 else 0.0
+    decay = (
+        math.exp(-timestep / parameters.time_constant) if parameters.time_constant > 0.0 else 0.0
+    )
     torque = arrived + (state.torque - arrived) * decay
-    after = State(torque, inputs.desired_torque, state.c1, state.c2, state.c3, state.c4, state.c5, state.c6, state.c7)
+    after = State(
+        torque,
+        inputs.desired_torque,
+        state.c1,
+        state.c2,
+        state.c3,
+        state.c4,
+        state.c5,
+        state.c6,
+        state.c7,
+    )
     return after, torque, Nothing()
 
 
@@ -78,14 +103,16 @@ class Lag(ActuatorModel):
         # Mountain Car decides once a second, and the studies let it lag by up to four of its steps.
         if self.time_constant > 4.0:
             warnings.warn(
-                f"Lag.time_constant = {self.time_constant:g}: 63 % of a step is delivered after {self.time_constant:g} "
-                f"s; it is in seconds: for {self.time_constant:g} ms write {self.time_constant / 1e3:g}",
+                f"Lag.time_constant = {self.time_constant:g}: 63 % of a step is delivered after"
+                f" {self.time_constant:g} s; it is in seconds: for {self.time_constant:g} ms write"
+                f" {self.time_constant / 1e3:g}",
                 stacklevel=2,
             )
         if self.delay > HISTORY * timestep * (1 + 1e-9):
             raise ValueError(
-                f"Lag.delay = {self.delay:g}: must be <= {HISTORY * timestep:g} s, {HISTORY} steps of {timestep:g} s. "
-                "Longer delays are the environment's: disturbances={'command_delay': ...}"
+                f"Lag.delay = {self.delay:g}: must be <= {HISTORY * timestep:g} s, {HISTORY} steps"
+                f" of {timestep:g} s. Longer delays are the environment's:"
+                " disturbances={'command_delay': ...}"
             )
 
     @classmethod

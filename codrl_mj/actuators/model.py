@@ -1,8 +1,8 @@
 """What an actuator is to the rest of the package: a frozen dataclass of numbers, and one pure function.
 
-A *family* of actuators is a subclass of `ActuatorModel`, in one file. What it says here is all that is known of it
-elsewhere: the doors into MuJoCo, the analytic physics, configuration files, the command line, randomisation, `info`,
-films and evaluations read it. docs/actuators.md builds one.
+A *family* of actuators is a subclass of `ActuatorModel`, in one file. What it says here is all that
+is known of it elsewhere: the doors into MuJoCo, the analytic physics, configuration files, the
+command line, randomisation, `info`, films and evaluations read it. docs/actuators.md builds one.
 """
 
 import dataclasses
@@ -42,8 +42,9 @@ class Inputs(NamedTuple):
     noise_key: float
     """Key of the episode's random numbers, a whole number: see `codrl_mj.actuators.noise`."""
     inertia: float = math.inf
-    """Inertia at the shaft [kg*m^2], or mass [kg], of all that the model has it move, by the state at the beginning of
-    the step; `inf` for families that do not ask for it, and where nobody knows."""
+    """Inertia at the shaft [kg*m^2], or mass [kg], of all that the model has it move, by the state
+    at the beginning of the step; `inf` for families that do not ask for it, and where nobody knows.
+    """
 
 
 class UnstableError(ValueError):
@@ -94,8 +95,9 @@ BUILT_IN: list[Any] = []
 class ActuatorModel(fields.Checked):
     """Base of every family of actuators: a frozen dataclass whose fields are made with `codrl_mj.fields`.
 
-    A family has a name, says its states and signals as `NamedTuple`s of floats, and defines `advance`. The other
-    methods have defaults that suit an actuator without a gear, without electrics, and stable at any step.
+    A family has a name, says its states and signals as `NamedTuple`s of floats, and defines
+    `advance`. The other methods have defaults that suit an actuator without a gear, without
+    electrics, and stable at any step.
 
     Raises:
         ValueError: a field is out of bounds.
@@ -106,9 +108,11 @@ class ActuatorModel(fields.Checked):
     State: ClassVar[type] = Nothing
     """What it remembers: a `NamedTuple` of floats, all 0 at the start of an episode."""
     Signals: ClassVar[type] = Nothing
-    """What can be seen of it after a step: a `NamedTuple` of floats. A signal called `saturated` is 1 where the
-    actuator is at its limit; `voltage_saturated`, `current_saturated` and `temperature_saturated` may say at which.
-    Signals called `current` [A] and `voltage` [V] make the electrical measures of an evaluation."""
+    """What can be seen of it after a step: a `NamedTuple` of floats. A signal called `saturated` is
+    1 where the actuator is at its limit; `voltage_saturated`, `current_saturated` and
+    `temperature_saturated` may say at which. Signals called `current` [A] and `voltage` [V] make
+    the electrical measures of an evaluation.
+    """
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {}
     """Units of the signals, for tables and figures."""
     OBSERVED: ClassVar[tuple[str, ...]] = ()
@@ -125,7 +129,9 @@ class ActuatorModel(fields.Checked):
     def __init_subclass__(cls, **named: Any) -> None:
         """Know a family of ours by its name, once; anybody else's is found as `module:Class`."""
         super().__init_subclass__(**named)
-        if cls.__module__.startswith("codrl_mj.actuators.") and reference(cls) not in map(reference, BUILT_IN):
+        if cls.__module__.startswith("codrl_mj.actuators.") and reference(cls) not in map(
+            reference, BUILT_IN
+        ):
             BUILT_IN.append(cls)
             if name := vars(cls).get("family"):
                 FAMILIES[name] = cls
@@ -140,12 +146,14 @@ class ActuatorModel(fields.Checked):
             if given is not field.default and not isinstance(given, kinds.get(field.name, object)):
                 kind = fields.parts(family)[field.name].__name__
                 raise ValueError(
-                    f"{family.__name__}.{field.name} = {given!r}: must be a {kind}; to build one from nested mappings "
-                    f"use {family.__name__}.from_mapping"
+                    f"{family.__name__}.{field.name} = {given!r}: must be a {kind}; to build one"
+                    f" from nested mappings use {family.__name__}.from_mapping"
                 )
 
     @staticmethod
-    def advance(parameters: Any, timestep: float, state: Any, inputs: Inputs) -> tuple[Any, float, Any]:
+    def advance(
+        parameters: Any, timestep: float, state: Any, inputs: Inputs
+    ) -> tuple[Any, float, Any]:
         """Advance by one mechanical step. A pure function, in plain Python that numba compiles as it stands.
 
         Args:
@@ -160,7 +168,9 @@ class ActuatorModel(fields.Checked):
         raise NotImplementedError
 
     @staticmethod
-    def observe(parameters: Any, timestep: float, signals: Any, inputs: Inputs) -> tuple[float, ...]:
+    def observe(
+        parameters: Any, timestep: float, signals: Any, inputs: Inputs
+    ) -> tuple[float, ...]:
         """What a sensor says of the signals at the time of `inputs`, entries as in `OBSERVED`; compiled as `advance`.
 
         Args:
@@ -210,7 +220,8 @@ class ActuatorModel(fields.Checked):
         """What an agent can command besides the force, by name.
 
         Raises:
-            ValueError: when a command is read that the fields do not allow; the message names the field.
+            ValueError: when a command is read that the fields do not allow; the message names the
+                field.
         """
         return {}
 
@@ -227,8 +238,8 @@ class ActuatorModel(fields.Checked):
 
         Args:
             timestep: mechanical step [s].
-            inertia: at the shaft [kg*m^2], or mass [kg], the rotor's own included, in the model's initial position; its
-                share of it where several drive the same joint.
+            inertia: at the shaft [kg*m^2], or mass [kg], the rotor's own included, in the model's
+                initial position; its share of it where several drive the same joint.
             held: whether it will not be told the inertia, or not be alone in changing the speed.
 
         Raises:
@@ -278,7 +289,9 @@ class ActuatorModel(fields.Checked):
     @property
     def numbers(self) -> tuple[float, ...]:
         """The parameters, in the order of `parameters_type`: what a model's `user` data hold."""
-        return tuple(float(value_at(self, path)) for path in parameter_paths(family_of(self)).values())
+        return tuple(
+            float(value_at(self, path)) for path in parameter_paths(family_of(self)).values()
+        )
 
     @classmethod
     def from_numbers(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
@@ -291,7 +304,9 @@ class ActuatorModel(fields.Checked):
         Raises:
             ValueError: a number is out of its field's bounds.
         """
-        values = dict(zip(parameter_paths(family_of(cls)).values(), map(float, numbers), strict=True))
+        values = dict(
+            zip(parameter_paths(family_of(cls)).values(), map(float, numbers), strict=True)
+        )
         values |= {path: arm_radius for path in field_paths(family_of(cls)) if is_arm(path)}
         return from_values(cls, values)
 
@@ -299,7 +314,8 @@ class ActuatorModel(fields.Checked):
         """A copy with other values of some fields.
 
         Args:
-            values: by dotted path, such as `motor.inductance`; in a part that is None, over what stands for it.
+            values: by dotted path, such as `motor.inductance`; in a part that is None, over what
+                stands for it.
 
         Raises:
             ValueError: a value is out of bounds.
@@ -328,7 +344,8 @@ class ActuatorModel(fields.Checked):
             mapping: for example `{"motor": {"inductance": 0.2}, "controller": {"kp": 2.0}}`.
 
         Raises:
-            ValueError: an unknown field (the nearest known one is suggested) or a value out of bounds.
+            ValueError: an unknown field (the nearest known one is suggested) or a value out of
+                bounds.
         """
         return fields.build(cls, mapping, "actuator field")
 
@@ -339,7 +356,11 @@ class ActuatorModel(fields.Checked):
 
 def advance_form(cls: Family) -> tuple[Form, str]:
     """What `advance` is to return, and what says so."""
-    return (cls.State._fields, "torque", cls.Signals._fields), f"{cls.__name__}.State and {cls.__name__}.Signals"
+    return (
+        cls.State._fields,
+        "torque",
+        cls.Signals._fields,
+    ), f"{cls.__name__}.State and {cls.__name__}.Signals"
 
 
 @functools.cache
@@ -347,29 +368,43 @@ def check_family(cls: Family) -> None:
     """Refuse a family whose functions do not return what it declares: each is called once on plain numbers."""
     for name in ("State", "Signals"):
         if not hasattr(kind := getattr(cls, name), "_fields"):
-            raise ValueError(f"{cls.__name__}.{name} = {kind!r}: must be a typing.NamedTuple of floats")
+            raise ValueError(
+                f"{cls.__name__}.{name} = {kind!r}: must be a typing.NamedTuple of floats"
+            )
     if any(isinstance(value, dataclasses.Field) for value in vars(cls).values()):
-        raise ValueError(f"{cls.__name__}: must be decorated with @dataclasses.dataclass(frozen=True)")
+        raise ValueError(
+            f"{cls.__name__}: must be decorated with @dataclasses.dataclass(frozen=True)"
+        )
     if reserved := {"desired_force", "actual_force", "speed"} & {*cls.Signals._fields}:
-        raise ValueError(f"{cls.__name__}.Signals: {', '.join(reserved)}: every family has that: choose another name")
+        raise ValueError(
+            f"{cls.__name__}.Signals: {', '.join(reserved)}: every family has that: choose another"
+            " name"
+        )
     fields.check_names(cls.SIGNAL_UNITS, cls.Signals._fields, "signal", "SIGNAL_UNITS.")
     fields.check_names(cls.RANDOM, field_paths(cls), "field", "RANDOM: ")
-    if missing := [one.name for one in dataclasses.fields(cls) if one.default is dataclasses.MISSING]:
+    if missing := [
+        one.name for one in dataclasses.fields(cls) if one.default is dataclasses.MISSING
+    ]:
         raise ValueError(f"{cls.__name__}.{missing[0]}: must have a default")
     actuator = cls()
     for path in field_paths(cls):
         if not isinstance(value := value_at(actuator, path), int | float):
-            raise ValueError(f"{cls.__name__}.{path} = {value!r}: must be a number; see `codrl_mj.fields`")
+            raise ValueError(
+                f"{cls.__name__}.{path} = {value!r}: must be a number; see `codrl_mj.fields`"
+            )
     parameters, step = parameters_type(cls)(*actuator.numbers), np.float64(1e-3)
     inputs = Inputs(*map(np.float64, (0.1, 0.2, 0.3, 0.0, 0.0, 1.0)))
-    state, signals = (kind(*map(np.float64, [0.0] * len(kind._fields))) for kind in (cls.State, cls.Signals))
+    state, signals = (
+        kind(*map(np.float64, [0.0] * len(kind._fields))) for kind in (cls.State, cls.Signals)
+    )
     if cls.advance is ActuatorModel.advance:
         raise ValueError(f"{cls.__name__}: has no `advance`")
     result = call(f"{cls.__name__}.advance", cls.advance, parameters, step, state, inputs)
     after, torque, _ = check_form(cls.advance, result, *advance_form(cls))
     if not np.isfinite([*after, torque]).all():
         raise ValueError(
-            f"{place(cls.advance)}: returns the state {(*map(float, after),)} and the torque {torque}: must be finite"
+            f"{place(cls.advance)}: returns the state {(*map(float, after),)} and the torque"
+            f" {torque}: must be finite"
         )
     if cls.OBSERVED:
         seen = call(f"{cls.__name__}.observe", cls.observe, parameters, step, signals, inputs)

@@ -30,12 +30,14 @@ NAMED: dict[str, tuple[str, Callable[[Actuator], ActuatorModel]]] = {
     "open_loop": (
         "no feedback, u = R*i_ref + kE*omega, and a slow winding: L = 0.5 H",
         lambda paper: Actuator(
-            dataclasses.replace(paper.motor, inductance=0.5), CurrentLoop(kp=0.0, kff=paper.motor.resistance)
+            dataclasses.replace(paper.motor, inductance=0.5),
+            CurrentLoop(kp=0.0, kff=paper.motor.resistance),
         ),
     ),
 }
-"""Name -> (what it is, function from the task's paper actuator to the actuator): variations of the task's own motor, so
-that a name means the same kind of actuator on every task."""
+"""Name -> (what it is, function from the task's paper actuator to the actuator): variations of the
+task's own motor, so that a name means the same kind of actuator on every task.
+"""
 
 
 def find_family(name: str) -> Family:
@@ -58,8 +60,8 @@ def actuator_from_mapping(mapping: Mapping[str, Any]) -> Any:
     fields = dict(mapping)
     if isinstance(motor := fields.get("motor"), str | Path):
         raise ValueError(
-            f"motor = {str(motor)!r}: must be a mapping of a motor's fields; for a motor of the catalogue or of a file "
-            f"write name = {str(motor)!r} beside the family"
+            f"motor = {str(motor)!r}: must be a mapping of a motor's fields; for a motor of the"
+            f" catalogue or of a file write name = {str(motor)!r} beside the family"
         )
     return find_family(fields.pop("family", Actuator.family)).from_mapping(fields)
 
@@ -72,8 +74,9 @@ def mapping_of(actuator: ActuatorModel) -> dict[str, Any] | None:
 def name_of(actuator: ActuatorModel, paper: Actuator | None = None) -> str:
     """What to call an actuator wherever it is shown.
 
-    What it was asked for by (`label_of`), or the motor of the catalogue that has its numbers but for gear, loop and
-    supply; of a current loop the variation of `paper` that it is, `custom` if none; else its family.
+    What it was asked for by (`label_of`), or the motor of the catalogue that has its numbers but
+    for gear, loop and supply; of a current loop the variation of `paper` that it is, `custom` if
+    none; else its family.
     """
     kind, known = type(actuator), {}
     if kind is Actuator:
@@ -85,7 +88,9 @@ def name_of(actuator: ActuatorModel, paper: Actuator | None = None) -> str:
     return label_of(actuator) or next(same, family)
 
 
-def names_together(actuators: Iterable[ActuatorModel], papers: Iterable[Actuator] | None = None) -> str:
+def names_together(
+    actuators: Iterable[ActuatorModel], papers: Iterable[Actuator] | None = None
+) -> str:
     """What to call several, each name once."""
     pairs = itertools.zip_longest(actuators, papers or ())
     return ", ".join(dict.fromkeys(name_of(one, paper) for one, paper in pairs))
@@ -125,7 +130,11 @@ def _catalogue() -> dict[str, Any]:
 def _own_numbers(actuator: Any) -> Any:
     """Of a motor all that it is but for the gear that it has here; of other actuators they themselves."""
     motor = getattr(actuator, "motor", None)
-    return dataclasses.replace(motor, gear_ratio=1.0, arm_radius=1.0) if isinstance(motor, GearMotor) else actuator
+    return (
+        dataclasses.replace(motor, gear_ratio=1.0, arm_radius=1.0)
+        if isinstance(motor, GearMotor)
+        else actuator
+    )
 
 
 def named_mapping(actuator: ActuatorModel) -> Any:
@@ -147,10 +156,11 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     """Turn whatever a user may write for an actuator into an `ActuatorModel`.
 
     Args:
-        given: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file, `module:NAME` of an
-            actuator or a family, a YAML or JSON file of such a mapping, an actuator, a family's class, a mapping of its
-            fields (with a `name`, over that actuator's; with a `label`, what to call it), or None (ideal). Files may be
-            given as a `pathlib.Path`.
+        given: a name of `NAMED`, `FAMILIES` or the catalogue of motors, a motor's TOML file,
+            `module:NAME` of an actuator or a family, a YAML or JSON file of such a mapping, an
+            actuator, a family's class, a mapping of its fields (with a `name`, over that
+            actuator's; with a `label`, what to call it), or None (ideal). Files may be given as a
+            `pathlib.Path`.
         paper: the actuator that the names vary; None where there is none.
         whose: whose it is, for messages.
 
@@ -176,15 +186,16 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
         given = str(given)
     if not isinstance(given, str):
         raise ValueError(
-            f"actuator = {given!r}: must be a name ({', '.join(NAMED)}), an actuator or a mapping of its fields"
+            f"actuator = {given!r}: must be a name ({', '.join(NAMED)}), an actuator or a mapping"
+            " of its fields"
         )
     if given == "ideal":
         return IDEAL
     if given in NAMED:
         if paper is None:
             raise ValueError(
-                f"actuator = {given!r}: a variation of the paper's actuator, of which {whose} has none; known are "
-                f"{', '.join(FAMILIES)}"
+                f"actuator = {given!r}: a variation of the paper's actuator, of which {whose} has"
+                f" none; known are {', '.join(FAMILIES)}"
             )
         return NAMED[given][1](paper)
     if given not in FAMILIES and Path(given).suffix in _FILES:
@@ -193,7 +204,12 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
 
     if given in motor_names() or Path(given).suffix == ".toml":
         return labelled(Drive.of(motor_entry(given).numbers), Path(given).stem)
-    found = look_up(given, NAMED | FAMILIES, "actuator", others={"the motors of `codrl-mj motor list`": motor_names()})
+    found = look_up(
+        given,
+        NAMED | FAMILIES,
+        "actuator",
+        others={"the motors of `codrl-mj motor list`": motor_names()},
+    )
     if is_family(found):
         return resolve(found, paper, whose)
     if isinstance(found, ActuatorModel):
@@ -219,7 +235,10 @@ def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
         section = fields.pop("identified", None)
         section = section if isinstance(section, Mapping) else {}
         if section.get("problem"):
-            raise ValueError(f"identified from {', '.join(map(str, section.get('logs', ())))}: {section['problem']}")
+            raise ValueError(
+                f"identified from {', '.join(map(str, section.get('logs', ())))}:"
+                f" {section['problem']}"
+            )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return fields, section
@@ -231,7 +250,10 @@ def _from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
     try:
         other = Path(str(fields.get("name")))
         if other.suffix in _FILES and Path(str(_read(other)[0].get("name"))).suffix in _FILES:
-            raise ValueError(f"name = {fields['name']!r}: must be an actuator's name, or a file that names no other")
+            raise ValueError(
+                f"name = {fields['name']!r}: must be an actuator's name, or a file that names no"
+                " other"
+            )
         with trusting_files():
             made = resolve(fields, paper, whose)
     except (ValueError, TypeError) as error:
@@ -267,13 +289,13 @@ def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
 
     Args:
         base: the other one.
-        changes: nested, for example `{"controller": {"kp": 2.0}}`. A `family` turns a drive into a servo, or back: the
-            motor, the controller and the supply stay the same. A servo that is made so and is given no
-            `loop.velocity_gain` gets `Servo.default_velocity_gain`.
+        changes: nested, for example `{"controller": {"kp": 2.0}}`. A `family` turns a drive into a
+            servo, or back: the motor, the controller and the supply stay the same. A servo that is
+            made so and is given no `loop.velocity_gain` gets `Servo.default_velocity_gain`.
 
     Raises:
-        ValueError: a field is unknown or out of bounds, or set over the ideal actuator, which has none; or the family
-            is not related to the actuator's.
+        ValueError: a field is unknown or out of bounds, or set over the ideal actuator, which has
+            none; or the family is not related to the actuator's.
     """
     given = {name: value for name, value in changes.items() if value != {}}
     kind: Any = type(base)
@@ -283,28 +305,42 @@ def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
         return base
     if isinstance(base, Ideal):
         raise ValueError(
-            "the ideal actuator has no motor and no controller to set fields of: name another actuator, such as paper"
+            "the ideal actuator has no motor and no controller to set fields of: name another"
+            " actuator, such as paper"
         )
     if family != family_name(kind):
         kind = _related_family(family, kind)
     _check_fields(given, kind)
-    merged: dict[str, Any] = {key: value for key, value in base.as_mapping().items() if key in _field_names(kind)}
+    merged: dict[str, Any] = {
+        key: value for key, value in base.as_mapping().items() if key in _field_names(kind)
+    }
     for name, value in given.items():
         inner = merged.get(name)
         merged[name] = {**(inner or {}), **value} if isinstance(value, Mapping) else value
     made = kind.from_mapping(merged)
-    if issubclass(kind, Servo) and not isinstance(base, Servo) and isinstance(given.get("loop", {}), Mapping):
+    if (
+        issubclass(kind, Servo)
+        and not isinstance(base, Servo)
+        and isinstance(given.get("loop", {}), Mapping)
+    ):
         made = made.with_default_gain(given.get("loop", {}))
     label = label_of(base).removesuffix(_CHANGED)
     if kind is not type(base) and label:  # a motor's name alone stands for its drive
-        label = label.removesuffix(f" {family_name(type(base))}") + ("" if kind is Drive else f" {family}")
-    return labelled(made, label + _CHANGED * (_own_numbers(made) != _own_numbers(base))) if label else made
+        label = label.removesuffix(f" {family_name(type(base))}") + (
+            "" if kind is Drive else f" {family}"
+        )
+    return (
+        labelled(made, label + _CHANGED * (_own_numbers(made) != _own_numbers(base)))
+        if label
+        else made
+    )
 
 
 def _related_family(family: str, kind: Any) -> Any:
     """Return the family of a name, to be set over an actuator of a `kind`: one of the two is a subclass of the other.
 
-    A servo is a drive with outer loops, so a drive's motor, controller and supply become a servo's, and back.
+    A servo is a drive with outer loops, so a drive's motor, controller and supply become a servo's,
+    and back.
 
     Raises:
         ValueError: there is no such family, or it is not related to the kind.
@@ -312,9 +348,10 @@ def _related_family(family: str, kind: Any) -> Any:
     other = find_family(family)
     if not (issubclass(other, kind) or issubclass(kind, other)):
         raise ValueError(
-            f"family = {family!r}: cannot be set over an actuator of the family {family_name(kind)!r}, whose fields "
-            f"are others. Name an actuator of a related family, or give all fields of the {family!r} without a name. "
-            "Motors of `codrl-mj motor list` and of datasheets are drives, which can become servos"
+            f"family = {family!r}: cannot be set over an actuator of the family"
+            f" {family_name(kind)!r}, whose fields are others. Name an actuator of a related"
+            f" family, or give all fields of the {family!r} without a name. Motors of `codrl-mj"
+            " motor list` and of datasheets are drives, which can become servos"
         )
     return other
 
@@ -327,9 +364,16 @@ def _field_names(kind: Any) -> set[str]:
 def _check_fields(given: Mapping[str, Any], kind: Any) -> None:
     """Refuse fields that the family does not have, but a related family has, with the name of that family."""
     for name in given:
-        owners = [other for other, one in FAMILIES.items() if issubclass(one, kind) and name in _field_names(one)]
+        owners = [
+            other
+            for other, one in FAMILIES.items()
+            if issubclass(one, kind) and name in _field_names(one)
+        ]
         if owners and name not in _field_names(kind):
-            raise ValueError(f"unknown actuator field {name} of a {family_name(kind)}: add family = {owners[0]!r}")
+            raise ValueError(
+                f"unknown actuator field {name} of a {family_name(kind)}: add family ="
+                f" {owners[0]!r}"
+            )
 
 
 def check_same_family(actuators: Sequence[ActuatorModel]) -> Family:
@@ -341,7 +385,10 @@ def check_same_family(actuators: Sequence[ActuatorModel]) -> Family:
     kinds = {type(actuator) for actuator in actuators}
     if len(kinds) > 1:
         names = ", ".join(sorted(kind.__name__ for kind in kinds))
-        raise ValueError(f"actuators of several families ({names}): the actuators of one environment must be of one")
+        raise ValueError(
+            f"actuators of several families ({names}): the actuators of one environment must be"
+            " of one"
+        )
     family: Family = kinds.pop()
     check_family(family)
     return family

@@ -1,15 +1,19 @@
 """Random numbers that are a function of their place: the same key and counter give the same number, whoever asks.
 
-A sensor that is read inside MuJoCo's callback is read again by every `mj_forward`, in any thread and by copies of the
-data. Numbers drawn from a generator would differ each time; these do not. Plain Python on purpose: the same source runs
-in Python and, compiled by numba, in the callback, because every intermediate keeps its low 64 bits either way.
+A sensor that is read inside MuJoCo's callback is read again by every `mj_forward`, in any thread
+and by copies of the data. Numbers drawn from a generator would differ each time; these do not.
+Plain Python on purpose: the same source runs in Python and, compiled by numba, in the callback,
+because every intermediate keeps its low 64 bits either way.
 """
 
 import math
 
 _MASK = 0xFFFFFFFF
 _EVEN, _ODD = 0xD2511F53, 0xCD9E8D57  # Philox4x32's multipliers
-_STEP_0, _STEP_1 = 0x9E3779B9, 0xBB67AE85  # and what its key grows by: the golden ratio and sqrt(3) - 1
+_STEP_0, _STEP_1 = (
+    0x9E3779B9,
+    0xBB67AE85,
+)  # and what its key grows by: the golden ratio and sqrt(3) - 1
 
 SENSOR_STREAM, LOAD_STREAM = 0, 1
 """The last counter word: streams of one key that share no number."""

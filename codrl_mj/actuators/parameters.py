@@ -18,7 +18,9 @@ def family_of(actuator: Any) -> Any:
 def value_at(owner: Any, path: str) -> Any:
     """What stands at a dotted path, a word as its number; in a part that is None, what stands for it."""
     for name in path.split("."):
-        metadata: Mapping[str, Any] = next((f.metadata for f in dataclasses.fields(owner) if f.name == name), {})
+        metadata: Mapping[str, Any] = next(
+            (f.metadata for f in dataclasses.fields(owner) if f.name == name), {}
+        )
         value = getattr(owner, name)
         if "options" in metadata:
             return metadata["options"].index(value)
@@ -89,7 +91,10 @@ def is_arm(path: str) -> bool:
 @functools.cache
 def field_paths(cls: type) -> tuple[str, ...]:
     """Dotted paths of all fields of a family, those of its parts too."""
-    inner = ([f"{name}.{path}" for path in field_paths(part)] if part else [name] for name, part in _outline(cls))
+    inner = (
+        [f"{name}.{path}" for path in field_paths(part)] if part else [name]
+        for name, part in _outline(cls)
+    )
     return tuple(itertools.chain.from_iterable(inner))
 
 
@@ -97,7 +102,8 @@ def field_paths(cls: type) -> tuple[str, ...]:
 def parameter_paths(cls: type) -> Mapping[str, str]:
     """Name -> dotted path of the fields that are parameters of `advance`: all but the arm, which is the gear's.
 
-    A parameter is called as its field is, and in a part that may be None by the part's name and the field's.
+    A parameter is called as its field is, and in a part that may be None by the part's name and the
+    field's.
 
     Raises:
         ValueError: two of them have the same name.
@@ -105,11 +111,14 @@ def parameter_paths(cls: type) -> Mapping[str, str]:
     optional = {field.name for field in dataclasses.fields(cls) if "absent" in field.metadata}
     paths = [path for path in field_paths(cls) if not is_arm(path)]
     named = {
-        path.replace(".", "_") if path.split(".")[0] in optional else path.rpartition(".")[2]: path for path in paths
+        path.replace(".", "_") if path.split(".")[0] in optional else path.rpartition(".")[2]: path
+        for path in paths
     }
     if len(named) < len(paths):
         twice = [path for path in paths if path not in named.values()]
-        raise ValueError(f"{cls.__name__}: another parameter has the same name as {', '.join(twice)}: rename one")
+        raise ValueError(
+            f"{cls.__name__}: another parameter has the same name as {', '.join(twice)}: rename one"
+        )
     return named
 
 

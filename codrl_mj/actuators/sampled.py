@@ -1,20 +1,23 @@
 """A sampled current loop over a winding that is solved exactly, many samples at a time: the mathematics of `Drive`.
 
-Within a sample of length T the voltage u and the back-EMF b are held, and the winding's current is exact:
-i+ = v + (i - v)*e with v = (u - b)/R and e = exp(-R*T/L).
+Within a sample of length T the voltage u and the back-EMF b are held, and the winding's current is
+exact: i+ = v + (i - v)*e with v = (u - b)/R and e = exp(-R*T/L).
 
-With the discrete pole-zero cancellation of `designed_gains` and back-calculation with the tracking time kp/ki, a whole
-step of n samples has a closed form, saturated or not. Take the integral as a current, c = (integral - b')/R with b' the
-back-EMF that is not compensated; then, with P = 1 - exp(-wc*T) and G = P/(1 - e), the voltage asked for is b + R*q,
+With the discrete pole-zero cancellation of `designed_gains` and back-calculation with the tracking
+time kp/ki, a whole step of n samples has a closed form, saturated or not. Take the integral as a
+current, c = (integral - b')/R with b' the back-EMF that is not compensated; then, with P = 1 -
+exp(-wc*T) and G = P/(1 - e), the voltage asked for is b + R*q,
 
     q = G*(i_ref - i) + c,
 
-and i - c decays as e^k whether the voltage saturates or not. Unsaturated, q - i_ref decays as (1 - P)^k, so it reaches
-a limit once at most; saturated, i and c approach v as e^k, so it leaves the limit once at most.
+and i - c decays as e^k whether the voltage saturates or not. Unsaturated, q - i_ref decays as (1 -
+P)^k, so it reaches a limit once at most; saturated, i and c approach v as e^k, so it leaves the
+limit once at most.
 
-What the winding draws in a sample is u times the sample's mean current, i + (1 - m)*(v - i) with m = (1 - e)*L/(R*T).
-Unsaturated, with E = i_ref - i and l = i - c, v - i = G*E - l, E+ = (1 - P)*E + (1 - e)*l and l+ = e*l. What is
-quadratic in E and l is then what p*E^2 + q*E*l + r*l^2 loses in a sample, for some p, q and r: its sum is in both ends.
+What the winding draws in a sample is u times the sample's mean current, i + (1 - m)*(v - i) with m
+= (1 - e)*L/(R*T). Unsaturated, with E = i_ref - i and l = i - c, v - i = G*E - l, E+ = (1 - P)*E +
+(1 - e)*l and l+ = e*l. What is quadratic in E and l is then what p*E^2 + q*E*l + r*l^2 loses in a
+sample, for some p, q and r: its sum is in both ends.
 """
 
 import math
@@ -28,14 +31,19 @@ _USUAL_STEP = -math.expm1(-_USUAL)
 """Its P, which a tenth of a step would go into."""
 
 
-def designed_gains(resistance: float, inductance: float, sample_time: float, bandwidth: float) -> tuple[float, float]:
+def designed_gains(
+    resistance: float, inductance: float, sample_time: float, bandwidth: float
+) -> tuple[float, float]:
     """Proportional gain [V/A] and integral gain per sample [V/A] of the loop whose zero cancels the winding's pole.
 
     kp = R*P*e/(1 - e) and ki*T = R*P: the loop from reference to current is P/(z - 1 + P).
     """
     x = resistance * sample_time / inductance
     step = -math.expm1(-bandwidth * sample_time)
-    return resistance * step * math.exp(-x) / -math.expm1(-x), resistance * step  # exp(x) would overflow
+    return (
+        resistance * step * math.exp(-x) / -math.expm1(-x),
+        resistance * step,
+    )  # exp(x) would overflow
 
 
 def jump(
@@ -51,8 +59,8 @@ def jump(
 ) -> tuple[float, float, float, float, int]:
     """A designed loop over n samples in closed form; all in amperes, with x = R*T/L, y = wc*T and `lost` = 1 - e.
 
-    v lies from `low` to `high`. Found are i, c, the sum of i over the samples' starts [A], that of v times the mean
-    current of each sample [A^2], and how many samples were saturated.
+    v lies from `low` to `high`. Found are i, c, the sum of i over the samples' starts [A], that of
+    v times the mean current of each sample [A^2], and how many samples were saturated.
     """
     step = _USUAL_STEP if y == _USUAL else -math.expm1(-y)  # P
     gain, apart = step / lost, lost - step
@@ -81,7 +89,9 @@ def jump(
             lag_after = lag * faster
             errors = (before - error + lag - lag_after) / step
             total += held * reference - errors
-            drawn += reference * (held * reference - 2.0 * errors + (1.0 + rising) * (before - error) / lost)
+            drawn += reference * (
+                held * reference - 2.0 * errors + (1.0 + rising) * (before - error) / lost
+            )
             drawn += p * (before * before - error * error) + q * (before * lag - error * lag_after)
             drawn += r * (lag * lag - lag_after * lag_after)
             current = reference - error
@@ -126,13 +136,18 @@ def run_samples(
 ) -> tuple[float, float, float, float, float, int]:
     """Any PI loop, sample by sample: i [A], the integral [V], the pending voltage, and then what `jump` finds.
 
-    Its `parameters` are a `Drive`'s, but for the gains: `ki` is the integral gain per sample [V/A]. `compensated` is
-    the part of the back-EMF [V] that is added to the voltage, `decay` e, and `lasting` m. A delayed loop applies the
-    voltage of the sample before, `pending`. Back-calculation has the tracking time kp/ki.
+    Its `parameters` are a `Drive`'s, but for the gains: `ki` is the integral gain per sample [V/A].
+    `compensated` is the part of the back-EMF [V] that is added to the voltage, `decay` e, and
+    `lasting` m. A delayed loop applies the voltage of the sample before, `pending`.
+    Back-calculation has the tracking time kp/ki.
     """
     total, drawn, saturated, gain = 0.0, 0.0, 0, kp + ki
     tracking = ki / gain if gain > 0.0 else 0.0
-    voltage, sag, deadband = parameters.supply_voltage, parameters.supply_resistance, parameters.deadband
+    voltage, sag, deadband = (
+        parameters.supply_voltage,
+        parameters.supply_resistance,
+        parameters.deadband,
+    )
     for _ in range(samples):
         limit = max(voltage - sag * abs(current), 0.0) if sag > 0.0 else voltage
         error = reference - current

@@ -14,21 +14,25 @@ class SampledLoop(Checked):
     """The PI current loop of a drive, at a sample rate of its own.
 
     Raises:
-        ValueError: a field is out of bounds, or the bandwidth is beyond what the sample rate allows.
+        ValueError: a field is out of bounds, or the bandwidth is beyond what the sample rate
+            allows.
     """
 
     sample_rate: float = real(20e3, above=0.0, unit="Hz")
     """Samples a second [Hz], > 0; a mechanical step must hold a whole number of them."""
     bandwidth: float = real(0.0, least=0.0, unit="Hz")
-    """Bandwidth [Hz] that the gains are designed for by pole-zero cancellation, >= 0. 0: 0.0555 of the sample rate,
-    60 degrees of phase margin with `delayed`."""
+    """Bandwidth [Hz] that the gains are designed for by pole-zero cancellation, >= 0. 0: 0.0555 of
+    the sample rate, 60 degrees of phase margin with `delayed`.
+    """
     kp: float = real(0.0, least=0.0, unit="V/A")
     """Proportional gain [V/A], >= 0. It and `ki` replace the designed gains where one of them is not 0."""
     ki: float = real(0.0, least=0.0, unit="V/(A*s)")
     """Integral gain [V/(A*s)], >= 0."""
     anti_windup: str = choice("back_calculation", "back_calculation", "clamping", "none")
-    """What the integrator does while the voltage saturates: it follows what was possible (`back_calculation`, with the
-    tracking time kp/ki), it stands still (`clamping`), or it goes on (`none`)."""
+    """What the integrator does while the voltage saturates: it follows what was possible
+    (`back_calculation`, with the tracking time kp/ki), it stands still (`clamping`), or it goes on
+    (`none`).
+    """
     delayed: bool = flag(False)
     """Whether the voltage that a sample computes is applied in the next one, as most digital drives do."""
     bemf_compensation: bool = flag(True)
@@ -44,7 +48,7 @@ class SampledLoop(Checked):
         most = self.sample_rate / (2 * math.pi)
         if self.bandwidth > most:
             raise ValueError(
-                f"SampledLoop.bandwidth = {self.bandwidth:g}: must be <= {most:g} Hz at sample_rate = "
-                f"{self.sample_rate:g} Hz, where a delay of one sample leaves 4 degrees of phase margin; lower it, or "
-                "raise the sample rate"
+                f"SampledLoop.bandwidth = {self.bandwidth:g}: must be <= {most:g} Hz at sample_rate"
+                f" = {self.sample_rate:g} Hz, where a delay of one sample leaves 4 degrees of phase"
+                " margin; lower it, or raise the sample rate"
             )

@@ -1,7 +1,8 @@
 """A drive with a velocity loop, and if need be a position loop, around its current loop: family `servo`.
 
-The cascade of industrial drives: a position loop P asks a velocity loop PI for a speed, that asks the current loop for
-a current. P and PD in one, u = kp*(q* - q) - kd*w, are `velocity_gain` kd, `position_gain` kp/kd and no integral.
+The cascade of industrial drives: a position loop P asks a velocity loop PI for a speed, that asks
+the current loop for a current. P and PD in one, u = kp*(q* - q) - kd*w, are `velocity_gain` kd,
+`position_gain` kp/kd and no integral.
 """
 
 import dataclasses
@@ -30,18 +31,21 @@ class ServoLoop(Checked):
     controls: str = choice("position", "position", "velocity")
     """What it is asked for."""
     servo_rate: float = real(1e3, above=0.0, unit="Hz")
-    """Samples a second of these loops [Hz], > 0; the drive's `sample_rate` must be a multiple of it, and it or the
-    mechanical step's rate one of the other."""
+    """Samples a second of these loops [Hz], > 0; the drive's `sample_rate` must be a multiple of
+    it, and it or the mechanical step's rate one of the other.
+    """
     position_gain: float = real(20.0, above=0.0, unit="1/s")
     """Speed [rad/s] for an error of 1 rad, > 0."""
     velocity_gain: float = real(0.1, above=0.0, unit="N*m*s/rad")
     """Torque [N*m] for an error of 1 rad/s, > 0: for a bandwidth f, 2*pi*f times the inertia, the rotor's included."""
     velocity_integral_gain: float = real(0.0, least=0.0, unit="1/s")
-    """What an error of 1 rad/s adds to the torque in a second, as a share of `velocity_gain` [1/s], >= 0. It stands
-    still while the current is at its limit."""
+    """What an error of 1 rad/s adds to the torque in a second, as a share of `velocity_gain` [1/s],
+    >= 0. It stands still while the current is at its limit.
+    """
     velocity_feed_forward: float = real(0.0, least=0.0, unit="")
-    """Share of the asked position's own speed that is added to the speed asked for, >= 0: for positions that are asked
-    for anew at every mechanical step."""
+    """Share of the asked position's own speed that is added to the speed asked for, >= 0: for
+    positions that are asked for anew at every mechanical step.
+    """
     inertia_feed_forward: float = real(0.0, least=0.0, unit="kg*m^2")
     """Torque [N*m] for 1 rad/s^2 of the speed that is asked for from outside, >= 0, likewise."""
     max_velocity: float = real(math.inf, above=0.0, unit="rad/s", infinite=True)
@@ -57,8 +61,8 @@ class ServoLoop(Checked):
         unused = "inertia_feed_forward" if self.controls == "position" else "velocity_feed_forward"
         if getattr(self, unused) != 0.0:
             raise ValueError(
-                f"ServoLoop.{unused} = {getattr(self, unused):g}: must be 0 where controls = {self.controls!r}, "
-                "which has no use for it"
+                f"ServoLoop.{unused} = {getattr(self, unused):g}: must be 0 where controls ="
+                f" {self.controls!r}, which has no use for it"
             )
 
 
@@ -109,16 +113,25 @@ class Signals(NamedTuple):
 
 
 def demand(
-    parameters: Any, period: float, target: float, rate: float, position: float, speed: float, integral: float
+    parameters: Any,
+    period: float,
+    target: float,
+    rate: float,
+    position: float,
+    speed: float,
+    integral: float,
 ) -> tuple[float, float]:
     """One sample of the outer loops, at the rotor: the torque [N*m] asked for, and the integral that would follow.
 
-    The target [rad] or [rad/s] has a rate of change of its own, and the period [s] is that to the next sample.
+    The target [rad] or [rad/s] has a rate of change of its own, and the period [s] is that to the
+    next sample.
     """
     ratio = parameters.gear_ratio
     gain, fastest = parameters.velocity_gain / (ratio * ratio), parameters.max_velocity * ratio
     if parameters.controls == 0.0:
-        wanted = parameters.position_gain * (target - position) + parameters.velocity_feed_forward * rate
+        wanted = (
+            parameters.position_gain * (target - position) + parameters.velocity_feed_forward * rate
+        )
         ahead = 0.0
     else:
         wanted, ahead = target, parameters.inertia_feed_forward / (ratio * ratio) * rate
@@ -127,7 +140,9 @@ def demand(
     return gain * error + integral + ahead, after
 
 
-def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+def advance(
+    parameters: Any, timestep: float, state: State, inputs: Inputs
+) -> tuple[State, float, Signals]:
     """Advance all loops by one mechanical step; between its samples the outer loops see the speed as it is predicted.
 
     In place of a desired torque the inputs have a position [rad] or a speed [rad/s] of the rotor.
@@ -148,7 +163,9 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
     for _ in range(count):
         # A servo that is faster than the mechanical step is sampled `count` times within it.
         if waiting <= 0.0 or count > 1:
-            asked, grown = demand(parameters, period * every, target, rate, position, speed, integral)
+            asked, grown = demand(
+                parameters, period * every, target, rate, position, speed, integral
+            )
             waiting = float(every)
         else:
             grown = integral
@@ -161,15 +178,21 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
         elif given != asked / constant:
             at_amperes = 1.0
         now = Shaft(moving.inertia, moving.others, speed)
-        winding, next_speed, means = shaft.turn(parameters, resistance, period, samples, winding, now, True, given)
+        winding, next_speed, means = shaft.turn(
+            parameters, resistance, period, samples, winding, now, True, given
+        )
         position, speed = position + 0.5 * period * (speed + next_speed), next_speed
         at_volts += means.saturated
         amperes, volts = amperes + means.current / count, volts + means.voltage / count
         torque += means.torque / count
         power, loss = power + means.power / count, loss + means.heat / count
     mean = Means(amperes, volts, torque, at_volts, power, loss)
-    after, temperature = drive.end(parameters, timestep, inputs.time, heat, resistance, winding, moving, mean)
-    error = (target - (inputs.position if parameters.controls == 0.0 else inputs.speed)) / parameters.gear_ratio
+    after, temperature = drive.end(
+        parameters, timestep, inputs.time, heat, resistance, winding, moving, mean
+    )
+    error = (
+        target - (inputs.position if parameters.controls == 0.0 else inputs.speed)
+    ) / parameters.gear_ratio
     at_volts = 1.0 if at_volts > 0.0 else 0.0
     limits = max(at_volts, at_amperes, too_warm), at_volts, at_amperes, too_warm
     signals = Signals(amperes, given, volts, temperature, error, *limits, power, loss)
@@ -199,11 +222,13 @@ class Servo(Drive):
     def default_velocity_gain(self) -> float:
         """Gain [N*m*s/rad] of an untuned velocity loop: ten times the slope kT*kE/R of the motor, at its output.
 
-        An error of a tenth of the free speed then asks for the stall torque. It is rounded to three digits, so that a
-        message has the same number; 0 for a motor without back-EMF.
+        An error of a tenth of the free speed then asks for the stall torque. It is rounded to three
+        digits, so that a message has the same number; 0 for a motor without back-EMF.
         """
         motor = self.motor
-        slope = motor.torque_constant * motor.back_emf_constant / motor.resistance * motor.gear_ratio**2
+        slope = (
+            motor.torque_constant * motor.back_emf_constant / motor.resistance * motor.gear_ratio**2
+        )
         return float(f"{10.0 * slope:.3g}")
 
     def with_default_gain(self, loop: Mapping[str, Any]) -> "Servo":
@@ -216,8 +241,8 @@ class Servo(Drive):
             return self
         if not self.default_velocity_gain:
             raise ValueError(
-                "loop.velocity_gain is missing: must be given where a motor has no back-EMF; for a bandwidth f it is "
-                "2*pi*f times the inertia at the output, the rotor's included"
+                "loop.velocity_gain is missing: must be given where a motor has no back-EMF; for a"
+                " bandwidth f it is 2*pi*f times the inertia at the output, the rotor's included"
             )
         return self.replaced({"loop.velocity_gain": self.default_velocity_gain})
 
@@ -237,10 +262,16 @@ class Servo(Drive):
         if loop.controls == "position":
             limit, unit = loop.max_position * motor.arm_radius, "rad"
         else:
-            free = self.voltage_limit / motor.back_emf_constant if motor.back_emf_constant else math.inf
+            free = (
+                self.voltage_limit / motor.back_emf_constant
+                if motor.back_emf_constant
+                else math.inf
+            )
             limit, unit = min(free * arm, loop.max_velocity * motor.arm_radius), "rad/s"
             if math.isinf(limit):
-                raise ValueError("loop.max_velocity = inf: must be finite where a motor has no back-EMF")
+                raise ValueError(
+                    "loop.max_velocity = inf: must be finite where a motor has no back-EMF"
+                )
         return {loop.controls: Command(unit, self, 1.0 / arm, limit, fixed)}
 
     def check(self, timestep: float) -> None:
@@ -252,9 +283,10 @@ class Servo(Drive):
         super().check(timestep)
         if not _fits(self.loop.servo_rate, self.controller.sample_rate, timestep):
             raise ValueError(
-                f"ServoLoop.servo_rate = {self.loop.servo_rate:g}: must be a multiple of the mechanical step's rate, "
-                f"{1.0 / timestep:g} Hz, or that a multiple of it, and the drive's sample_rate = "
-                f"{self.controller.sample_rate:g} Hz a multiple of both; the step's own rate always fits"
+                f"ServoLoop.servo_rate = {self.loop.servo_rate:g}: must be a multiple of the"
+                f" mechanical step's rate, {1.0 / timestep:g} Hz, or that a multiple of it, and the"
+                f" drive's sample_rate = {self.controller.sample_rate:g} Hz a multiple of both; the"
+                " step's own rate always fits"
             )
 
     @classmethod
@@ -262,7 +294,10 @@ class Servo(Drive):
         """As `Drive.instability`; infinite too where rates do not fit. What it moves is not known here."""
         columns = stability.columns(cls, numbers)
         fitting = np.array(
-            [_fits(*each, timestep) for each in zip(columns.servo_rate, columns.sample_rate, strict=True)]
+            [
+                _fits(*each, timestep)
+                for each in zip(columns.servo_rate, columns.sample_rate, strict=True)
+            ]
         )
         return np.where(fitting, super().instability(numbers, timestep), np.inf)
 
@@ -272,9 +307,10 @@ class Servo(Drive):
         loop, count = self.loop, round(timestep * self.loop.servo_rate)
         if loop.controls == "position" and count > 1 and timestep * loop.position_gain > 1.0:
             warnings.warn(
-                f"loop.position_gain = {loop.position_gain:g}: the servo would be at its target within a step of "
-                f"{timestep:g} s, and the engine moves the joint by one speed in that: it comes later than it should. "
-                f"Shorten the step to {1.0 / loop.position_gain:.3g} s",
+                f"loop.position_gain = {loop.position_gain:g}: the servo would be at its target"
+                f" within a step of {timestep:g} s, and the engine moves the joint by one speed in"
+                " that: it comes later than it should. Shorten the step to"
+                f" {1.0 / loop.position_gain:.3g} s",
                 stacklevel=2,
             )
 
@@ -286,9 +322,10 @@ class Servo(Drive):
         """As `ActuatorModel.loop_remedy`."""
         loop, at_joint = self.loop, inertia * self.motor.gear_ratio**2
         return (
-            f"It moves {at_joint:.3g} kg*m^2: for a bandwidth f loop.velocity_gain = {loop.velocity_gain:g} is 2*pi*f "
-            f"times that, f well below servo_rate = {loop.servo_rate:g} Hz, and position_gain = "
-            f"{loop.position_gain:g} well below 2*pi*f."
+            f"It moves {at_joint:.3g} kg*m^2: for a bandwidth f loop.velocity_gain ="
+            f" {loop.velocity_gain:g} is 2*pi*f times that, f well below servo_rate ="
+            f" {loop.servo_rate:g} Hz, and position_gain = {loop.position_gain:g} well below"
+            " 2*pi*f."
         )
 
 

@@ -1,7 +1,8 @@
 """A drive's winding, gear and shaft over some time: the mathematics that `drive` and `servo` share.
 
-Within a mechanical step the shaft's speed changes by the motor's own torque, which is known, and by whatever else acts
-on the load, which is taken as it was in the step before: `others`. Where nobody knows the inertia the speed is held.
+Within a mechanical step the shaft's speed changes by the motor's own torque, which is known, and by
+whatever else acts on the load, which is taken as it was in the step before: `others`. Where nobody
+knows the inertia the speed is held.
 """
 
 import math
@@ -69,7 +70,9 @@ def temperature_of(parameters: Any, heat: Heat) -> float:
 
 def resistance_at(parameters: Any, temperature: float) -> float:
     """Resistance [ohm] of the winding at a temperature [degC]."""
-    return parameters.resistance * (1.0 + parameters.resistance_coefficient * (temperature - RATED_TEMPERATURE))
+    return parameters.resistance * (
+        1.0 + parameters.resistance_coefficient * (temperature - RATED_TEMPERATURE)
+    )
 
 
 def warmer(resistance: float, constant: float, duration: float, rise: float, watts: float) -> float:
@@ -101,26 +104,38 @@ def heated(parameters: Any, duration: float, heat: Heat, watts: float) -> Heat:
 def thermal_limit(parameters: Any, duration: float, heat: Heat, resistance: float) -> float:
     """The current [A] that takes the winding to `max_temperature` within some time [s], and no further.
 
-    While the motor is cold that is more than it can bear for long; at the limit it falls to the continuous current.
+    While the motor is cold that is more than it can bear for long; at the limit it falls to the
+    continuous current.
     """
-    cooled, by_a_watt = heated(parameters, duration, heat, 0.0), heated(parameters, duration, Heat(0.0, 0.0), 1.0)
-    room = parameters.max_temperature - parameters.ambient_temperature - cooled.winding - cooled.housing
+    cooled, by_a_watt = (
+        heated(parameters, duration, heat, 0.0),
+        heated(parameters, duration, Heat(0.0, 0.0), 1.0),
+    )
+    room = (
+        parameters.max_temperature
+        - parameters.ambient_temperature
+        - cooled.winding
+        - cooled.housing
+    )
     return math.sqrt(max(room, 0.0) / (resistance * (by_a_watt.winding + by_a_watt.housing)))
 
 
 def inertia_of(parameters: Any, inertia: float) -> float:
     """Inertia [kg*m^2] that the rotor moves, by `load_inertia` or the model's; `inf` where the speed is held."""
     if parameters.load_inertia > 0.0:
-        inertia = parameters.rotor_inertia + parameters.load_inertia / (parameters.gear_ratio * parameters.gear_ratio)
+        inertia = parameters.rotor_inertia + parameters.load_inertia / (
+            parameters.gear_ratio * parameters.gear_ratio
+        )
     return inertia if inertia > 0.0 else math.inf
 
 
 def others_after(timestep: float, change: float, own: float, others: float) -> float:
     """Acceleration [rad/s^2] of the rotor by all but its motor, from what the last step showed.
 
-    Half of it is what was taken then: two joints that move each other, each with a stiff motor, would answer to what
-    the other did a step ago, back and forth. From the rotor's change of speed in the step [rad/s] and, [rad/s^2], its
-    acceleration by the motor's torque and what was taken for that by all else.
+    Half of it is what was taken then: two joints that move each other, each with a stiff motor,
+    would answer to what the other did a step ago, back and forth. From the rotor's change of speed
+    in the step [rad/s] and, [rad/s^2], its acceleration by the motor's torque and what was taken
+    for that by all else.
     """
     return 0.5 * (change / timestep - own) + 0.5 * others
 
@@ -128,10 +143,11 @@ def others_after(timestep: float, change: float, own: float, others: float) -> f
 def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> float:
     """Torque [N*m] that Stribeck friction and the gear take from the motor's, by an implicit step.
 
-    It is against the speed that the shaft would have without it, and at most what stops the shaft: so it never turns
-    the rotor back, and where the inertia is known it holds what pushes less than it: the rotor sticks. Where the speed
-    is held it stops no more than the rotor alone, and nothing sticks. Source: the friction of Duclusaud, Passault,
-    Padois, Ly, *Extended Friction Models for the Physics Simulation of Servo Actuators* (2024), sec. III.
+    It is against the speed that the shaft would have without it, and at most what stops the shaft:
+    so it never turns the rotor back, and where the inertia is known it holds what pushes less than
+    it: the rotor sticks. Where the speed is held it stops no more than the rotor alone, and nothing
+    sticks. Source: the friction of Duclusaud, Passault, Padois, Ly, *Extended Friction Models for
+    the Physics Simulation of Servo Actuators* (2024), sec. III.
     """
     if shaft.inertia < math.inf:
         free = shaft.speed + duration * (torque / shaft.inertia + shaft.others)
@@ -153,19 +169,25 @@ def is_warming(parameters: Any) -> bool:
 
 
 def run_over(
-    parameters: Any, resistance: float, samples: int, winding: Winding, closed: bool, asked: float, speed: float
+    parameters: Any,
+    resistance: float,
+    samples: int,
+    winding: Winding,
+    closed: bool,
+    asked: float,
+    speed: float,
 ) -> tuple[Winding, float, float, int, float, float]:
     """Winding and loop over some samples at a held speed: at once where that has a closed form.
 
-    The sums that it needs telescope: with S the sum of the current over the samples' starts, the mean of (u - b)/R is
-    (S + (i_n - i_0)/(1 - e))/n, and that of the current, the mean of every sample included,
-    (S + (1 - m)/(1 - e)*(i_n - i_0))/n with m = (1 - e)/x and x = R*T/L. What is drawn and neither moves the rotor nor
-    is left in the winding's field, L*i^2/2, is heat. Where the loop is `closed` a current [A] is asked for, else a
-    voltage [V].
+    The sums that it needs telescope: with S the sum of the current over the samples' starts, the
+    mean of (u - b)/R is (S + (i_n - i_0)/(1 - e))/n, and that of the current, the mean of every
+    sample included, (S + (1 - m)/(1 - e)*(i_n - i_0))/n with m = (1 - e)/x and x = R*T/L. What is
+    drawn and neither moves the rotor nor is left in the winding's field, L*i^2/2, is heat. Where
+    the loop is `closed` a current [A] is asked for, else a voltage [V].
 
     Returns:
-        The winding afterwards, the mean current [A], the mean voltage [V], how many samples were saturated, and the
-        mean of the power [W] at the terminals and of the heat [W].
+        The winding afterwards, the mean current [A], the mean voltage [V], how many samples were
+        saturated, and the mean of the power [W] at the terminals and of the heat [W].
     """
     sample_time, voltage = 1.0 / parameters.sample_rate, parameters.supply_voltage
     stiff = parameters.delayed == 0.0 and parameters.supply_resistance == 0.0
@@ -176,8 +198,14 @@ def run_over(
     back_emf = parameters.back_emf_constant * speed
     compensated = back_emf if parameters.bemf_compensation != 0.0 else 0.0
     designed = parameters.kp == 0.0 and parameters.ki == 0.0
-    y = 2.0 * math.pi * (parameters.bandwidth * sample_time if parameters.bandwidth > 0.0 else DEFAULT_BANDWIDTH)
-    as_designed = closed and designed and parameters.anti_windup == 0.0 and parameters.deadband == 0.0
+    y = (
+        2.0
+        * math.pi
+        * (parameters.bandwidth * sample_time if parameters.bandwidth > 0.0 else DEFAULT_BANDWIDTH)
+    )
+    as_designed = (
+        closed and designed and parameters.anti_windup == 0.0 and parameters.deadband == 0.0
+    )
     if as_designed and stiff:
         offset = back_emf - compensated
         current, integral, total, drawn, saturated = sampled.jump(
@@ -197,7 +225,9 @@ def run_over(
         if not closed:
             kp, ki, compensated, asked = 0.0, 0.0, asked, 0.0
         elif designed:
-            kp, ki = sampled.designed_gains(resistance, parameters.inductance, sample_time, y * parameters.sample_rate)
+            kp, ki = sampled.designed_gains(
+                resistance, parameters.inductance, sample_time, y * parameters.sample_rate
+            )
         current, integral, pending, total, drawn, saturated = sampled.run_samples(
             parameters,
             winding.current,
@@ -234,11 +264,14 @@ def turn(
 ) -> tuple[Winding, float, Means]:
     """Winding, loop and shaft over some time under a held command.
 
-    Where a saturated voltage meets a light load, the speed cannot be held: c = h*kT*kE/(R*J) is the share of it that
-    the back-EMF takes off in a time h; above 1 it rings, above 2 it grows. So the time is cut into 2*c pieces, and the
-    speed goes on from piece to piece. Found are winding and speed [rad/s] afterwards, and what there was in between.
+    Where a saturated voltage meets a light load, the speed cannot be held: c = h*kT*kE/(R*J) is the
+    share of it that the back-EMF takes off in a time h; above 1 it rings, above 2 it grows. So the
+    time is cut into 2*c pieces, and the speed goes on from piece to piece. Found are winding and
+    speed [rad/s] afterwards, and what there was in between.
     """
-    viscous = parameters.viscous_friction  # of the joint, which `others` has at the speed of the beginning
+    viscous = (
+        parameters.viscous_friction
+    )  # of the joint, which `others` has at the speed of the beginning
     braking = parameters.torque_constant * parameters.back_emf_constant / resistance + viscous
     pieces = min(max(math.ceil(2.0 * duration * braking / shaft.inertia), 1), samples)
     lossy = parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0
@@ -254,7 +287,11 @@ def turn(
         if lossy:
             now = Shaft(shaft.inertia, shaft.others, speed)
             delivered -= friction(parameters, share * duration, delivered, now)
-        amperes, volts, torque = amperes + share * mean, volts + share * voltage, torque + share * delivered
+        amperes, volts, torque = (
+            amperes + share * mean,
+            volts + share * voltage,
+            torque + share * delivered,
+        )
         power, heat = power + share * drawn, heat + share * lost
         changed = delivered - viscous * (speed - shaft.speed)
         speed += share * duration * (changed / shaft.inertia + shaft.others)

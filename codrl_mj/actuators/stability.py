@@ -29,12 +29,18 @@ class _Unlimited:
         return False
 
 
-def _closed_loops(family: Any, numbers: np.ndarray, timestep: float) -> tuple[np.ndarray, np.ndarray]:
+def _closed_loops(
+    family: Any, numbers: np.ndarray, timestep: float
+) -> tuple[np.ndarray, np.ndarray]:
     """What an electrical step makes of (current, integral, error), (to, from, actuator), and how many are in a step."""
     parameters = columns(family, numbers)
     dt = timestep / parameters.substeps
-    current, integral, error = np.eye(3)[:, :, np.newaxis]  # all states of all actuators at once: (state, actuator)
-    after = family.electrical_step(parameters, dt, current, integral, error, 0.0, 0.0, 0.0, _Unlimited())[:3]
+    current, integral, error = np.eye(3)[
+        :, :, np.newaxis
+    ]  # all states of all actuators at once: (state, actuator)
+    after = family.electrical_step(
+        parameters, dt, current, integral, error, 0.0, 0.0, 0.0, _Unlimited()
+    )[:3]
     matrices = np.stack([np.broadcast_to(entry, (3, len(numbers))) for entry in after])
     # what no gain reads is no part of the loop: 0 instead of the eigenvalue of a state of its own
     read = np.stack([np.ones(len(numbers), dtype=bool), parameters.ki > 0, parameters.kd > 0])
@@ -79,7 +85,9 @@ def stability_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.nda
         linear = (a * e - b * d) + (a * i - c * g) + (e * i - f * h)
         zero = -(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
         margin = MARGIN * (1.0 + abs(two) + abs(linear) + abs(zero)) ** 2
-        least = np.minimum(np.minimum(1.0 + two + linear + zero, 1.0 - two + linear - zero), 1.0 - abs(zero))
+        least = np.minimum(
+            np.minimum(1.0 + two + linear + zero, 1.0 - two + linear - zero), 1.0 - abs(zero)
+        )
         last = np.minimum(least, 1.0 - zero * zero - abs(linear - zero * two))
         least = np.where(least > margin, last, least)
         radii = np.where(least > margin, 0.0, np.where(least < -margin, np.inf, np.nan))
@@ -107,30 +115,36 @@ def check_stable(actuator: Any, timestep: float) -> None:
         timestep: mechanical step [s].
 
     Raises:
-        ValueError: the spectral radius is 1 or more; the message has the number and a remedy that was checked.
+        ValueError: the spectral radius is 1 or more; the message has the number and a remedy that
+            was checked.
     """
     radius = spectral_radius(actuator, timestep)
     if radius < 1.0:
         return
     gains = actuator.controller
-    remedy = f"Lower the gains (kp = {gains.kp:g}, ki = {gains.ki:g}, kd = {gains.kd:g}): more substeps do not help"
+    remedy = (
+        f"Lower the gains (kp = {gains.kp:g}, ki = {gains.ki:g}, kd = {gains.kd:g}): more substeps"
+        " do not help"
+    )
     for substeps in (gains.substeps * 2**doubling for doubling in range(1, 11)):
-        finer = dataclasses.replace(actuator, controller=dataclasses.replace(gains, substeps=substeps))
+        finer = dataclasses.replace(
+            actuator, controller=dataclasses.replace(gains, substeps=substeps)
+        )
         if spectral_radius(finer, timestep) < 1.0:
             remedy = f"Set controller.substeps = {substeps}, lower the gains, or shorten the step"
             break
     raise UnstableError(
-        f"actuator: the current loop is unstable at a step of {timestep:g} s: spectral radius {radius:.4g}, must be "
-        f"< 1. {remedy}, or pass allow_unstable=True to study it as it is"
+        f"actuator: the current loop is unstable at a step of {timestep:g} s: spectral radius"
+        f" {radius:.4g}, must be < 1. {remedy}, or pass allow_unstable=True to study it as it is"
     )
 
 
 class Joints(NamedTuple):
     """Joints and shafts at rest, linearized without gravity, springs, contacts and limits.
 
-    `inertia` (v, v) and `damping` (v,) are of the degrees of freedom, `moments` (n, v) the speeds of shafts for theirs.
-    The `integrator` is `euler`, which moves positions by the old speeds, `semi-implicit` or `rk4`; unless by RK4,
-    `explicit_damping` damps the old speeds.
+    `inertia` (v, v) and `damping` (v,) are of the degrees of freedom, `moments` (n, v) the speeds
+    of shafts for theirs. The `integrator` is `euler`, which moves positions by the old speeds,
+    `semi-implicit` or `rk4`; unless by RK4, `explicit_damping` damps the old speeds.
     """
 
     inertia: np.ndarray
@@ -146,13 +160,17 @@ class Joints(NamedTuple):
         after, drag = np.eye(freedoms + 2 * shafts), np.diag(self.damping)
         if self.integrator == "rk4":
             rate = np.zeros_like(after)
-            rate[speeds] = np.linalg.solve(self.inertia, np.hstack([-drag, 0.0 * self.moments.T, self.moments.T]))
+            rate[speeds] = np.linalg.solve(
+                self.inertia, np.hstack([-drag, 0.0 * self.moments.T, self.moments.T])
+            )
             rate[positions, speeds] = self.moments
             for order in (4, 3, 2, 1):  # Of a linear system RK4 is the Taylor series of order 4.
                 after = np.eye(len(rate)) + timestep / order * rate @ after
         else:
             implicit, explicit = (0.0, timestep) if self.explicit_damping else (timestep, 0.0)
-            pushes = np.hstack([self.inertia - explicit * drag, 0.0 * self.moments.T, timestep * self.moments.T])
+            pushes = np.hstack(
+                [self.inertia - explicit * drag, 0.0 * self.moments.T, timestep * self.moments.T]
+            )
             after[speeds] = np.linalg.solve(self.inertia + implicit * drag, pushes)
             moving = np.eye(len(after))[speeds] if self.integrator == "euler" else after[speeds]
             after[positions] += timestep * self.moments @ moving
@@ -166,7 +184,11 @@ FREE = {"stribeck_friction": 0.0, "gear_efficiency": 1.0, "deadband": 0.0}
 
 
 def linearize(
-    actuator: Any, advance: Callable[..., Any], timestep: float, inertia: float, change: float = CHANGE
+    actuator: Any,
+    advance: Callable[..., Any],
+    timestep: float,
+    inertia: float,
+    change: float = CHANGE,
 ) -> np.ndarray:
     """Linearize an actuator's `advance` at rest, for each mechanical step until its samples repeat.
 
@@ -178,12 +200,15 @@ def linearize(
         change: what is added to each state in turn.
 
     Returns:
-        Shape (steps, s + 1, s + 2): the new states and the torque, for the states, the position and the speed.
+        Shape (steps, s + 1, s + 2): the new states and the torque, for the states, the position and
+            the speed.
     """
     family: Any = type(actuator)
     period = actuator.steps_per_sample(timestep)
     parameters, count = parameters_type(family)(*actuator.numbers), len(family.State._fields)
-    parameters = parameters._replace(**{name: FREE[name] for name in FREE.keys() & {*parameters._fields}})
+    parameters = parameters._replace(
+        **{name: FREE[name] for name in FREE.keys() & {*parameters._fields}}
+    )
     maps, state = [], np.zeros(count)
 
     def advanced(point: np.ndarray, time: float) -> np.ndarray:
@@ -217,16 +242,26 @@ def loop_radius(joints: Joints, loops: Sequence[np.ndarray], timestep: float) ->
     product = now
     for step in range(math.lcm(*map(len, loops))):
         torques, matrix = np.zeros((shafts, len(now))), np.zeros_like(now)
-        for index, (loop, start, end) in enumerate(zip(loops, starts[:-1], starts[1:], strict=True)):
-            seen = np.vstack([now[start:end], now[freedoms + index], joints.moments[index] @ now[:freedoms]])
+        for index, (loop, start, end) in enumerate(
+            zip(loops, starts[:-1], starts[1:], strict=True)
+        ):
+            seen = np.vstack(
+                [now[start:end], now[freedoms + index], joints.moments[index] @ now[:freedoms]]
+            )
             matrix[start:end], torques[index] = np.split(loop[step % len(loop)] @ seen, [-1])
         matrix[: starts[0]] = transition @ np.vstack([now[: starts[0]], torques])
         product = matrix @ product
     if not np.isfinite(product).all():
         return math.inf
-    # A state, other than a speed, that nothing else reads, or that nothing else changes, is no part of a loop.
-    live, coupled = np.ones(len(product), dtype=bool), (product != 0.0) & ~np.eye(len(product), dtype=bool)
+    # A state, other than a speed, that nothing else reads, or that nothing else changes, is no part
+    # of a loop.
+    live, coupled = (
+        np.ones(len(product), dtype=bool),
+        (product != 0.0) & ~np.eye(len(product), dtype=bool),
+    )
     coupled[:freedoms, :freedoms] = True
-    while (left := live & coupled[live].any(axis=0) & coupled[:, live].any(axis=1)).sum() < live.sum():
+    while (
+        left := live & coupled[live].any(axis=0) & coupled[:, live].any(axis=1)
+    ).sum() < live.sum():
         live = left
     return float(np.abs(np.linalg.eigvals(product[np.ix_(live, live)])).max(initial=0.0))

@@ -1,7 +1,7 @@
 """A torque source within a motor's torque-speed line, family `torque_speed`.
 
-What Isaac Lab (`DCMotor`) and mjlab (`DcMotorActuator`) call a DC motor: no winding and no loop, only the line that a
-supply draws through stall torque and no-load speed, and a limit of the torque.
+What Isaac Lab (`DCMotor`) and mjlab (`DcMotorActuator`) call a DC motor: no winding and no loop,
+only the line that a supply draws through stall torque and no-load speed, and a limit of the torque.
 """
 
 import dataclasses
@@ -21,12 +21,18 @@ class Signals(NamedTuple):
     saturated: float
 
 
-def advance(parameters: Any, timestep: float, state: Nothing, inputs: Inputs) -> tuple[Nothing, float, Signals]:  # noqa: ARG001
+def advance(
+    parameters: Any,
+    timestep: float,  # noqa: ARG001
+    state: Nothing,  # noqa: ARG001
+    inputs: Inputs,
+) -> tuple[Nothing, float, Signals]:
     """Clip the desired torque to the torque-speed line, and both to `max_torque`.
 
-    At speed w the voltage that drives forward leaves stall_torque*(1 - w/no_load_speed), the one that drives backward
-    stall_torque*(-1 - w/no_load_speed). Beyond the speeds at which the line reaches +-max_torque it ends there: a
-    controller's current limit holds in every quadrant. Without a `max_torque` the stall torque has its place.
+    At speed w the voltage that drives forward leaves stall_torque*(1 - w/no_load_speed), the one
+    that drives backward stall_torque*(-1 - w/no_load_speed). Beyond the speeds at which the line
+    reaches +-max_torque it ends there: a controller's current limit holds in every quadrant.
+    Without a `max_torque` the stall torque has its place.
     """
     ratio = inputs.speed / parameters.no_load_speed
     limit = parameters.max_torque if parameters.max_torque < math.inf else parameters.stall_torque
@@ -77,8 +83,9 @@ class TorqueSpeed(ActuatorModel):
         share = timestep * self.stall_torque / (self.no_load_speed * inertia)
         if share >= 2.0:
             raise UnstableError(
-                f"stall_torque = {self.stall_torque:g} at no_load_speed = {self.no_load_speed:g}: on the line between "
-                f"them a step of {timestep:g} s takes {share:.3g} of the way to the no-load speed, must be < 2. It "
-                f"moves {inertia:.3g} kg*m^2. Shorten the step to less than {2.0 * timestep / share:.3g} s, or pass "
-                "allow_unstable=True to study it as it is"
+                f"stall_torque = {self.stall_torque:g} at no_load_speed = {self.no_load_speed:g}:"
+                f" on the line between them a step of {timestep:g} s takes {share:.3g} of the way"
+                f" to the no-load speed, must be < 2. It moves {inertia:.3g} kg*m^2. Shorten the"
+                f" step to less than {2.0 * timestep / share:.3g} s, or pass allow_unstable=True to"
+                " study it as it is"
             )

@@ -10,7 +10,8 @@ from codrl_mj.agents.sarsa import SARSAConfig
 from codrl_mj.own_code import look_up
 
 AGENTS: dict[str, type[AgentConfig]] = {
-    config.name: config for config in (PPOConfig, DDPGConfig, DQNConfig, TD3Config, SACConfig, SARSAConfig)
+    config.name: config
+    for config in (PPOConfig, DDPGConfig, DQNConfig, TD3Config, SACConfig, SARSAConfig)
 }
 """Every agent's settings by the agent's name."""
 
@@ -58,15 +59,18 @@ def check_fits(agent: str, env: Any) -> None:
 
     Args:
         agent: the agent's name.
-        env: the environment's configuration, whose module is too heavy for those that only want settings.
+        env: the environment's configuration, whose module is too heavy for those that only want
+            settings.
 
     Raises:
         ValueError: it cannot; the message names the agents that can.
     """
     space = env.action_space
     if not isinstance(space, find_agent(agent).action_spaces):
-        fitting = [name for name, config in AGENTS.items() if isinstance(space, config.action_spaces)]
+        fitting = [
+            name for name, config in AGENTS.items() if isinstance(space, config.action_spaces)
+        ]
         raise ValueError(
-            f"agent = {agent!r}: cannot act in the {type(space).__name__} actions of {env.task}; agents that can: "
-            f"{', '.join(fitting) or 'none'}"
+            f"agent = {agent!r}: cannot act in the {type(space).__name__} actions of {env.task};"
+            f" agents that can: {', '.join(fitting) or 'none'}"
         )

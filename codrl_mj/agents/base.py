@@ -49,7 +49,8 @@ class AgentConfig(Checked):
         """The policy of such an agent with fresh weights: what its saved weights are loaded into.
 
         Returns:
-            A Stable-Baselines3 `BasePolicy` on the CPU, whose `state_dict` has the keys of the agent's own.
+            A Stable-Baselines3 `BasePolicy` on the CPU, whose `state_dict` has the keys of the
+            agent's own.
         """
         raise NotImplementedError
 
@@ -76,7 +77,9 @@ class AgentConfig(Checked):
 
 def check_buffer(name: str, steps: int, env: Any, observations: int) -> None:
     """Refuse a buffer of steps, each with one or two observations, that memory does not hold; `name` is its field's."""
-    numbers = observations * spaces.flatdim(env.observation_space) + spaces.flatdim(env.action_space)
+    numbers = observations * spaces.flatdim(env.observation_space) + spaces.flatdim(
+        env.action_space
+    )
     check_memory(4.0 * numbers * steps, f"{name} = {steps:,}", "lower it")
 
 
@@ -85,8 +88,10 @@ class DeepAgentConfig(AgentConfig):
     """Settings of an agent with networks, on Stable-Baselines3."""
 
     input_scale: tuple[float, ...] | None = factors()
-    """Fixed factors > 0 on the observation's entries before they enter a network, in their order; entries without one
-    stay as they are. Velocities of the mountain cars are below 0.07, too small for a network to notice."""
+    """Fixed factors > 0 on the observation's entries before they enter a network, in their order;
+    entries without one stay as they are. Velocities of the mountain cars are below 0.07, too small
+    for a network to notice.
+    """
 
     def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
         """See `AgentConfig.make_policy`."""

@@ -1,7 +1,7 @@
 """PPO whose arithmetic is written out for small networks.
 
-How an actor's outputs become actions, and the slopes of the actions' probabilities; then the algorithm. Imports torch:
-import it where an agent is made.
+How an actor's outputs become actions, and the slopes of the actions' probabilities; then the
+algorithm. Imports torch: import it where an agent is made.
 """
 
 import math
@@ -28,8 +28,9 @@ class Judged(NamedTuple):
     entropy: torch.Tensor
     """Of the distributions that they are held against, shape (N, 1)."""
     backward: Callable[[torch.Tensor, float], tuple[torch.Tensor, torch.Tensor | None]]
-    """A loss's gradient by `log_prob` (N, 1), and that by every entry of `entropy` -> its gradient by the actor's
-    outputs (N, a), and that by `log_std` where there is one."""
+    """A loss's gradient by `log_prob` (N, 1), and that by every entry of `entropy` -> its gradient
+    by the actor's outputs (N, a), and that by `log_std` where there is one.
+    """
 
 
 class Categorical:
@@ -42,7 +43,9 @@ class Categorical:
         """Gumbel's noise (steps, envs, outputs): the largest of logits plus this has the softmax's probabilities."""
         return torch.empty(steps, envs, outputs).exponential_().log_().neg_()
 
-    def actions(self, hidden: torch.Tensor, outputs: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
+    def actions(
+        self, hidden: torch.Tensor, outputs: torch.Tensor, draw: torch.Tensor
+    ) -> torch.Tensor:
         """Actions (N,) from outputs (N, a)."""
         del hidden
         return (outputs + draw).argmax(1)
@@ -66,15 +69,18 @@ class Categorical:
 class Gaussian:
     """Continuous actions, whose outputs are means.
 
-    The logarithms of the standard deviations are a parameter (a,). With state-dependent noise they are (h, a), and the
-    noise is a linear function of the actor's h last hidden units, the factors of which are drawn every so many steps.
+    The logarithms of the standard deviations are a parameter (a,). With state-dependent noise they
+    are (h, a), and the noise is a linear function of the actor's h last hidden units, the factors
+    of which are drawn every so many steps.
     """
 
     def __init__(self, policy: ActorCriticPolicy, every: int) -> None:
         """Share the policy's parameter."""
         self.log_std, self.every = policy.log_std, every
         self._state_dependent = policy.use_sde
-        self._least = policy.action_dist.epsilon if policy.use_sde else 0.0  # variance, as Stable-Baselines3 has it
+        self._least = (
+            policy.action_dist.epsilon if policy.use_sde else 0.0
+        )  # variance, as Stable-Baselines3 has it
         self._unit = getattr(policy, "largest", torch.ones(policy.log_std.shape[-1]))
 
     def draws(self, steps: int, envs: int, outputs: int) -> torch.Tensor:
@@ -82,7 +88,9 @@ class Gaussian:
         del outputs
         return torch.randn(-(-steps // self.every), envs, *self.log_std.shape) * self.log_std.exp()
 
-    def actions(self, hidden: torch.Tensor, outputs: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
+    def actions(
+        self, hidden: torch.Tensor, outputs: torch.Tensor, draw: torch.Tensor
+    ) -> torch.Tensor:
         """Actions (N, a) from outputs (N, a) and hidden units (N, h)."""
         noise = torch.bmm(hidden[:, None], draw)[:, 0] if self._state_dependent else draw
         return (outputs + noise) * self._unit
@@ -94,10 +102,14 @@ class Gaussian:
         variances = features @ squares.view(features.shape[1], -1) + self._least
         error = actions / self._unit - outputs
         slope = error / variances
-        entropy = 0.5 * (2 * math.pi * math.e * self._unit.square() * variances).log().sum(1, keepdim=True)
+        entropy = 0.5 * (2 * math.pi * math.e * self._unit.square() * variances).log().sum(
+            1, keepdim=True
+        )
         log_prob = 0.5 * (1 - slope * error).sum(1, keepdim=True) - entropy
 
-        def backward(by_log_prob: torch.Tensor, by_entropy: float) -> tuple[torch.Tensor, torch.Tensor]:
+        def backward(
+            by_log_prob: torch.Tensor, by_entropy: float
+        ) -> tuple[torch.Tensor, torch.Tensor]:
             # hidden units count as constants in the noise, as in Stable-Baselines3
             by_variances = 0.5 * (by_log_prob * (slope * error - 1) + by_entropy) / variances
             return slope * by_log_prob, (features.T @ by_variances).view_as(squares) * (2 * squares)
@@ -108,13 +120,15 @@ class Gaussian:
 class FastPPO(PPO):
     """Stable-Baselines3's PPO in a fraction of its time: the same policy, rollouts, losses and minibatches.
 
-    Only the order in which floating-point numbers are added and the way in which noise is drawn differ. A rollout
-    takes the actor's products for each step; values and probabilities of all its actions are found in one go at its
-    end. Gradients are written out and not found by automatic differentiation.
+    Only the order in which floating-point numbers are added and the way in which noise is drawn
+    differ. A rollout takes the actor's products for each step; values and probabilities of all its
+    actions are found in one go at its end. Gradients are written out and not found by automatic
+    differentiation.
 
     Raises:
-        ValueError: observations of several parts, a clipped value loss, or a policy with other parameters than those of
-            its two networks, such as a features extractor that learns: those are Stable-Baselines3's own `PPO`'s.
+        ValueError: observations of several parts, a clipped value loss, or a policy with other
+            parameters than those of its two networks, such as a features extractor that learns:
+            those are Stable-Baselines3's own `PPO`'s.
     """
 
     _last_obs: Any
@@ -123,20 +137,27 @@ class FastPPO(PPO):
     def _setup_model(self) -> None:
         if isinstance(self.observation_space, spaces.Dict):
             raise ValueError(
-                f"observation_space = {self.observation_space}: must be a single space; flatten it, as gymnasium's "
-                "FlattenObservation does"
+                f"observation_space = {self.observation_space}: must be a single space; flatten it,"
+                " as gymnasium's FlattenObservation does"
             )
         if self.clip_range_vf is not None:
-            raise ValueError(f"clip_range_vf = {self.clip_range_vf!r}: must be None; use Stable-Baselines3's PPO")
+            raise ValueError(
+                f"clip_range_vf = {self.clip_range_vf!r}: must be None; use Stable-Baselines3's PPO"
+            )
         super()._setup_model()
         policy = self.policy
         self._networks = TwinNetworks(policy)
         every = self.sde_sample_freq if self.sde_sample_freq > 0 else self.n_steps
         discrete = isinstance(policy.action_space, spaces.Discrete)
-        self._exploration = Categorical() if discrete else Gaussian(policy, every if policy.use_sde else 1)
+        self._exploration = (
+            Categorical() if discrete else Gaussian(policy, every if policy.use_sde else 1)
+        )
         self._networks.parameters.grad = self._networks.gradient
         policy.optimizer = VectorAdam(
-            self._networks.parameters, policy.parameters(), lr=self.lr_schedule(1), **policy.optimizer_kwargs
+            self._networks.parameters,
+            policy.parameters(),
+            lr=self.lr_schedule(1),
+            **policy.optimizer_kwargs,
         )
 
     def _excluded_save_params(self) -> list[str]:
@@ -144,18 +165,28 @@ class FastPPO(PPO):
         return [*super()._excluded_save_params(), "_networks", "_exploration"]
 
     @torch.no_grad()
-    def collect_rollouts(self, env: Any, callback: Any, rollout_buffer: Any, n_rollout_steps: int) -> bool:
+    def collect_rollouts(
+        self, env: Any, callback: Any, rollout_buffer: Any, n_rollout_steps: int
+    ) -> bool:
         """Fill the buffer, as `PPO.collect_rollouts` does."""
         callback.on_rollout_start()
         seen, starts = self._last_obs, self._last_episode_starts
         rollout_buffer.reset()
         draws = self._exploration.draws(n_rollout_steps, env.num_envs, self._networks.outputs)
         box = self.action_space if isinstance(self.action_space, spaces.Box) else None
-        cut: list[tuple[int, int, np.ndarray]] = []  # step, environment and last observation where time ran out
+        cut: list[
+            tuple[int, int, np.ndarray]
+        ] = []  # step, environment and last observation where time ran out
         for step in range(n_rollout_steps):
             acted = self._networks.act(self._features(seen))
-            actions = self._exploration.actions(*acted, draws[step // self._exploration.every]).numpy()
-            clipped = actions if box is None else np.clip(actions.reshape(-1, *box.shape), box.low, box.high)
+            actions = self._exploration.actions(
+                *acted, draws[step // self._exploration.every]
+            ).numpy()
+            clipped = (
+                actions
+                if box is None
+                else np.clip(actions.reshape(-1, *box.shape), box.low, box.high)
+            )
             observations, rewards, dones, infos = env.step(clipped)
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
@@ -163,7 +194,11 @@ class FastPPO(PPO):
                 self._last_obs, self._last_episode_starts = seen, starts
                 return False
             self._update_info_buffer(infos, dones)
-            timed_out = [row for row in np.flatnonzero(dones).tolist() if infos[row].get("TimeLimit.truncated")]
+            timed_out = [
+                row
+                for row in np.flatnonzero(dones).tolist()
+                if infos[row].get("TimeLimit.truncated")
+            ]
             cut += [(step, row, infos[row]["terminal_observation"]) for row in timed_out]
             rollout_buffer.observations[step] = seen.reshape(rollout_buffer.observations.shape[1:])
             rollout_buffer.actions[step] = actions.reshape(env.num_envs, -1)
@@ -179,7 +214,9 @@ class FastPPO(PPO):
         rollout_buffer.values[:] = layers[-1][1, :, 0].view(rollout_buffer.values.shape)
         if cut:  # a time limit is no failure: the value of the last state is added
             steps, rows, last = zip(*cut, strict=True)
-            rollout_buffer.rewards[list(steps), list(rows)] += self.gamma * self._values(np.array(last)).numpy()
+            rollout_buffer.rewards[list(steps), list(rows)] += (
+                self.gamma * self._values(np.array(last)).numpy()
+            )
         rollout_buffer.compute_returns_and_advantage(self._values(observations), dones)
         callback.on_rollout_end()
         return True
@@ -188,13 +225,20 @@ class FastPPO(PPO):
     def train(self) -> None:
         """Learn from the rollout."""
         if not self._networks.holds(self.policy):
-            raise RuntimeError("the policy is another than the model was made with: copy a model by save and load")
+            raise RuntimeError(
+                "the policy is another than the model was made with: copy a model by save and load"
+            )
         optimizer, buffer = self.policy.optimizer, self.rollout_buffer
         self._update_learning_rate(optimizer)
         features = self._features(buffer.swap_and_flatten(buffer.observations))
-        rest = [torch.as_tensor(buffer.swap_and_flatten(getattr(buffer, name))).float() for name in _LEARNT_FROM]
+        rest = [
+            torch.as_tensor(buffer.swap_and_flatten(getattr(buffer, name))).float()
+            for name in _LEARNT_FROM
+        ]
         for _ in range(self.n_epochs):
-            order = torch.as_tensor(np.random.permutation(len(features)))  # as Stable-Baselines3 draws it
+            order = torch.as_tensor(
+                np.random.permutation(len(features))
+            )  # as Stable-Baselines3 draws it
             shuffled = [one[order].split(self.batch_size) for one in (features, *rest)]
             going_on = all(self._improve(*minibatch) for minibatch in zip(*shuffled, strict=True))
             self._n_updates += 1
@@ -202,10 +246,13 @@ class FastPPO(PPO):
                 break
         layers, (actions, _, _, returns) = self._networks.forward(features), rest  # as they are now
         entropy = self._exploration.judge(layers[-2][0], layers[-1][0], actions).entropy
-        self.logger.record("train/value_loss", (layers[-1][1, :, :1] - returns).square().mean().item())
+        self.logger.record(
+            "train/value_loss", (layers[-1][1, :, :1] - returns).square().mean().item()
+        )
         self.logger.record("train/entropy_loss", -entropy.mean().item())
         self.logger.record(
-            "train/explained_variance", explained_variance(buffer.values.ravel(), buffer.returns.ravel())
+            "train/explained_variance",
+            explained_variance(buffer.values.ravel(), buffer.returns.ravel()),
         )
         if isinstance(self._exploration, Gaussian):
             self.logger.record("train/std", self._exploration.log_std.exp().mean().item())
@@ -238,11 +285,15 @@ class FastPPO(PPO):
         by_log_prob = gains * (gains <= advantages * ratio.clamp(1 - reach, 1 + reach)) / -count
         gradient = torch.zeros_like(layers[-1])
         gradient[0], by_log_std = judged.backward(by_log_prob, -self.ent_coef / count)
-        torch.sub(layers[-1][1, :, :1], returns, out=gradient[1, :, :1]).mul_(2 * self.vf_coef / count)
+        torch.sub(layers[-1][1, :, :1], returns, out=gradient[1, :, :1]).mul_(
+            2 * self.vf_coef / count
+        )
         networks.backward(layers, gradient)
         if networks.log_std_gradient is not None:
             networks.log_std_gradient.copy_(by_log_std)
-        networks.gradient.mul_((self.max_grad_norm / (networks.gradient.norm() + 1e-6)).clamp(max=1.0))
+        networks.gradient.mul_(
+            (self.max_grad_norm / (networks.gradient.norm() + 1e-6)).clamp(max=1.0)
+        )
         self.policy.optimizer.step()
         return True
 

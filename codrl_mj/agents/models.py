@@ -26,8 +26,8 @@ class ScaledObservation(FlattenExtractor):
         super().__init__(observation_space)
         if len(factors) > self.features_dim:
             raise ValueError(
-                f"input_scale = {tuple(factors)}: must have at most {self.features_dim} factors, one for each entry of "
-                "the observation"
+                f"input_scale = {tuple(factors)}: must have at most {self.features_dim} factors,"
+                " one for each entry of the observation"
             )
         padded = torch.ones(self.features_dim)
         padded[: len(factors)] = torch.tensor(factors)
@@ -43,7 +43,10 @@ class UnitActionPolicy(ActorCriticPolicy):
 
     def _build(self, lr_schedule: Any) -> None:
         if not isinstance(self.action_space, spaces.Box):
-            raise ValueError(f"unit_actions = True: must be False for discrete actions, which {self.action_space} has")
+            raise ValueError(
+                "unit_actions = True: must be False for discrete actions, which"
+                f" {self.action_space} has"
+            )
         super()._build(lr_schedule)
         largest = np.maximum(np.abs(self.action_space.low), np.abs(self.action_space.high))
         self.register_buffer("largest", torch.as_tensor(largest), persistent=False)
@@ -57,7 +60,12 @@ class TwoStreams(nn.Module):
     """Q(state, action): state and action each through layers of their own, then joined, then through joint layers."""
 
     def __init__(
-        self, state_size: int, action_size: int, state: Sequence[int], action: Sequence[int], joint: Sequence[int]
+        self,
+        state_size: int,
+        action_size: int,
+        state: Sequence[int],
+        action: Sequence[int],
+        joint: Sequence[int],
     ) -> None:
         """Make layers of so many units for state and action, none letting it through, and joint ones; with ReLUs."""
         super().__init__()
@@ -69,7 +77,10 @@ class TwoStreams(nn.Module):
 
     def forward(self, state_and_action: torch.Tensor) -> torch.Tensor:
         """States and actions, concatenated, (N, state_size + action_size) -> values (N, 1)."""
-        state, action = state_and_action[:, : self.state_size], state_and_action[:, self.state_size :]
+        state, action = (
+            state_and_action[:, : self.state_size],
+            state_and_action[:, self.state_size :],
+        )
         return self.joint(torch.cat([self.state_stream(state), self.action_stream(action)], dim=1))
 
 
@@ -101,13 +112,16 @@ class TwoStreamPolicy(TD3Policy):
 class TwoRatePPO(PPO):
     """Stable-Baselines3's PPO with separate passes, and separate learning rates, for actor and critic.
 
-    The update of Spinning Up and of Keras's example: passes over the rollout improve the actor until it has moved too
-    far (1.5 times `target_kl`), and the critic is fitted whether the actor stopped or not. Gradients are not clipped.
-    One Adam optimiser holds both, in two groups: Adam keeps moments and count for each tensor, and leaves out those
-    without a gradient, so this is two optimisers in one state dict.
+    The update of Spinning Up and of Keras's example: passes over the rollout improve the actor
+    until it has moved too far (1.5 times `target_kl`), and the critic is fitted whether the actor
+    stopped or not. Gradients are not clipped. One Adam optimiser holds both, in two groups: Adam
+    keeps moments and count for each tensor, and leaves out those without a gradient, so this is two
+    optimisers in one state dict.
     """
 
-    def __init__(self, *args: Any, critic_learning_rate: float, critic_epochs: int, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, critic_learning_rate: float, critic_epochs: int, **kwargs: Any
+    ) -> None:
         """Take what `PPO` takes, whose `learning_rate` is the actor's and whose `n_epochs` are the actor's at most."""
         self.critic_learning_rate = critic_learning_rate
         self.critic_epochs = critic_epochs
@@ -120,7 +134,9 @@ class TwoRatePPO(PPO):
         of_critic = {id(parameter) for parameter in critic}
         actor = [parameter for parameter in policy.parameters() if id(parameter) not in of_critic]
         groups = [{"params": actor}, {"params": critic}]
-        policy.optimizer = policy.optimizer_class(groups, lr=self.lr_schedule(1), **policy.optimizer_kwargs)
+        policy.optimizer = policy.optimizer_class(
+            groups, lr=self.lr_schedule(1), **policy.optimizer_kwargs
+        )
 
     def train(self) -> None:
         """Learn from the rollout."""
@@ -146,7 +162,9 @@ class TwoRatePPO(PPO):
             log_probability = distribution.log_prob(actions)
             log_ratio = log_probability - rollout.old_log_prob
             ratio = log_ratio.exp()
-            divergence = (ratio - 1 - log_ratio).mean().item()  # of the old policy from the new, an unbiased estimate
+            divergence = (
+                (ratio - 1 - log_ratio).mean().item()
+            )  # of the old policy from the new, an unbiased estimate
             self.logger.record("train/approx_kl", divergence)
             if self.target_kl is not None and divergence > 1.5 * self.target_kl:
                 return False
@@ -156,7 +174,9 @@ class TwoRatePPO(PPO):
             loss = -torch.min(ratio * advantages, clipped * advantages).mean()
             if self.ent_coef:
                 entropy = distribution.entropy()
-                loss = loss - self.ent_coef * (-log_probability if entropy is None else entropy).mean()
+                loss = (
+                    loss - self.ent_coef * (-log_probability if entropy is None else entropy).mean()
+                )
             self._descend(loss)
             self.logger.record("train/policy_gradient_loss", loss.item())
         return True
@@ -165,13 +185,16 @@ class TwoRatePPO(PPO):
         """One pass over the rollout."""
         losses = []
         for rollout in self.rollout_buffer.get(self.batch_size):
-            loss = functional.mse_loss(self.policy.predict_values(rollout.observations).flatten(), rollout.returns)
+            loss = functional.mse_loss(
+                self.policy.predict_values(rollout.observations).flatten(), rollout.returns
+            )
             self._descend(loss)
             losses.append(loss.item())
         self.logger.record("train/value_loss", np.mean(losses))
 
     def _descend(self, loss: torch.Tensor) -> None:
-        self.policy.optimizer.zero_grad()  # to None: the optimiser then leaves the other network alone
+        # to None: the optimiser then leaves the other network alone
+        self.policy.optimizer.zero_grad()
         loss.backward()
         self.policy.optimizer.step()
 
@@ -218,7 +241,8 @@ class EpisodicDQN(DQN):
             self.exploration_schedule = lambda _: max(least, first * decay**self._episode_num)
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> Any:
-        # DQN refreshes epsilon before it counts an episode as ended: the next would start with the last one's
+        # DQN refreshes epsilon before it counts an episode as ended: the next would start with the
+        # last one's
         if self.exploration_decay is not None:
             self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
         return super()._sample_action(*args, **kwargs)

@@ -37,8 +37,8 @@ class OffPolicyConfig(DeepAgentConfig):
         """See `AgentConfig.make_model`."""
         if self.train_every is None and env.num_envs > 1:
             raise ValueError(
-                f"{type(self).__name__}.train_every = None: training at the end of every episode needs num_envs = 1, "
-                f"not {env.num_envs}; set train_every to a number of steps"
+                f"{type(self).__name__}.train_every = None: training at the end of every episode"
+                f" needs num_envs = 1, not {env.num_envs}; set train_every to a number of steps"
             )
         check_buffer(f"{type(self).__name__}.buffer_size", self.buffer_size, env, observations=2)
         from codrl_mj.agents import models
@@ -78,8 +78,9 @@ class OffPolicyConfig(DeepAgentConfig):
 class ActorCriticConfig(OffPolicyConfig):
     """Settings of an agent for continuous actions that learns from a replay buffer.
 
-    It explores by Ornstein-Uhlenbeck noise on the action, x' = x - theta * x * dt + sigma * sqrt(dt) * N(0, 1), which
-    starts at 0 in every episode. `noise_theta = noise_dt = 1` is independent noise of standard deviation sigma.
+    It explores by Ornstein-Uhlenbeck noise on the action, x' = x - theta * x * dt + sigma *
+    sqrt(dt) * N(0, 1), which starts at 0 in every episode. `noise_theta = noise_dt = 1` is
+    independent noise of standard deviation sigma.
     """
 
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box,)
@@ -98,8 +99,8 @@ class ActorCriticConfig(OffPolicyConfig):
         super().__post_init__()
         if self.noise_theta * self.noise_dt >= 2:
             raise ValueError(
-                f"{type(self).__name__}.noise_theta = {self.noise_theta!r}: noise_theta * noise_dt must be < 2, "
-                f"and noise_dt = {self.noise_dt!r}"
+                f"{type(self).__name__}.noise_theta = {self.noise_theta!r}: noise_theta * noise_dt"
+                f" must be < 2, and noise_dt = {self.noise_dt!r}"
             )
 
     def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
@@ -118,8 +119,8 @@ class ActorCriticConfig(OffPolicyConfig):
 class DDPGConfig(ActorCriticConfig):
     """Deep deterministic policy gradient, on Stable-Baselines3, with the paper's critic.
 
-    State and action each pass through layers of their own; then they are joined. Every hidden layer has a ReLU; the
-    actor ends in tanh, times half the action's range.
+    State and action each pass through layers of their own; then they are joined. Every hidden layer
+    has a ReLU; the actor ends in tanh, times half the action's range.
     """
 
     name: ClassVar[str] = "ddpg"
@@ -137,8 +138,15 @@ class DDPGConfig(ActorCriticConfig):
     """Units of the critic's hidden layers after both are joined. The paper: 256-256 (pendulum), 64 (car)."""
 
     def _policy_arguments(self) -> dict[str, Any]:
-        streams = {name: getattr(self, name) for name in ("state_units", "action_units", "joint_units")}
-        return {"net_arch": list(self.actor_units), "n_critics": 1, **streams, **super()._policy_arguments()}
+        streams = {
+            name: getattr(self, name) for name in ("state_units", "action_units", "joint_units")
+        }
+        return {
+            "net_arch": list(self.actor_units),
+            "n_critics": 1,
+            **streams,
+            **super()._policy_arguments(),
+        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,8 +163,9 @@ class TD3Config(ActorCriticConfig):
     policy_delay: int = integer(2, least=1)
     """Critic updates for each update of the actor and the targets, >= 1."""
     target_noise: float = real(0.2, least=0)
-    """Standard deviation of the noise on the target actions, >= 0, in shares of half the action's range; clipped at 2.5
-    times that."""
+    """Standard deviation of the noise on the target actions, >= 0, in shares of half the action's
+    range; clipped at 2.5 times that.
+    """
 
     def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
         return {

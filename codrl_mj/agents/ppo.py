@@ -13,8 +13,9 @@ from codrl_mj.fields import choice, flag, integer, real, units
 class PPOConfig(DeepAgentConfig):
     """Proximal policy optimisation with clipping, on Stable-Baselines3.
 
-    Discount, clip range and network are the paper's; the remaining defaults were chosen so that a run takes a minute on
-    two cores. With `critic_learning_rate`, actor and critic learn apart, as the paper's do.
+    Discount, clip range and network are the paper's; the remaining defaults were chosen so that a
+    run takes a minute on two cores. With `critic_learning_rate`, actor and critic learn apart, as
+    the paper's do.
     """
 
     name: ClassVar[str] = "ppo"
@@ -23,8 +24,10 @@ class PPOConfig(DeepAgentConfig):
     learning_rate: float = real(1e-3, above=0, most=1)
     """Adam's step size, in (0, 1]: the actor's, and the critic's too unless it has its own. The paper: 3e-4."""
     critic_learning_rate: float | None = real(None, above=0, most=1)
-    """Adam's step size for the critic, in (0, 1]: actor and critic then take separate passes over a rollout, and
-    `target_kl` stops the actor's alone. None: one optimiser and one loss for both. The paper: 1e-3."""
+    """Adam's step size for the critic, in (0, 1]: actor and critic then take separate passes over a
+    rollout, and `target_kl` stops the actor's alone. None: one optimiser and one loss for both. The
+    paper: 1e-3.
+    """
     rollout_steps: int = integer(2048, least=2)
     """Environment steps, over all environments, between two updates, >= 2; a multiple of the environments."""
     batch_size: int | None = integer(256, least=2, optional=True)
@@ -42,8 +45,9 @@ class PPOConfig(DeepAgentConfig):
     entropy_coefficient: float = real(0.0, least=0)
     """Weight of the entropy bonus, >= 0."""
     target_kl: float | None = real(0.03, above=0, optional=True)
-    """Passes over a rollout stop when the policy has moved 1.5 times this far [nat], > 0; None: never. The paper:
-    0.01."""
+    """Passes over a rollout stop when the policy has moved 1.5 times this far [nat], > 0; None:
+    never. The paper: 0.01.
+    """
     hidden: tuple[int, ...] = units((64, 64))
     """Units of the hidden layers of actor and critic, each. The paper: 64-64."""
     activation: Literal["tanh", "relu"] = choice("tanh", "tanh", "relu")
@@ -51,22 +55,25 @@ class PPOConfig(DeepAgentConfig):
     log_std_init: float = real(0.0, least=-20, most=10)
     """Continuous actions: natural logarithm of the standard deviation at the start, in [-20, 10]."""
     state_dependent_noise: bool = flag(False)
-    """Continuous actions: explore by noise that is a function of the state, drawn anew every `noise_steps` (Raffin et
-    al., 2021), which moves a system more than independent noise at every step does."""
+    """Continuous actions: explore by noise that is a function of the state, drawn anew every
+    `noise_steps` (Raffin et al., 2021), which moves a system more than independent noise at every
+    step does.
+    """
     noise_steps: int | None = integer(None, least=1)
     """Steps between two draws of that noise, >= 1; None: one draw a rollout."""
 
     unit_actions: bool = flag(False)
-    """Continuous actions: the actor's mean and noise are in units of the largest action, so that one setting learns by
-    torque, current or voltage. Not with `state_dependent_noise`."""
+    """Continuous actions: the actor's mean and noise are in units of the largest action, so that
+    one setting learns by torque, current or voltage. Not with `state_dependent_noise`.
+    """
 
     def __post_init__(self) -> None:
         """Validate."""
         super().__post_init__()
         if self.unit_actions and self.state_dependent_noise:
             raise ValueError(
-                "PPOConfig.unit_actions = True: must be False with state_dependent_noise, which has a scale of its "
-                "own: set one of them"
+                "PPOConfig.unit_actions = True: must be False with state_dependent_noise, which has"
+                " a scale of its own: set one of them"
             )
 
     def make_model(self, env: Any, seed: int) -> Any:
@@ -84,7 +91,8 @@ class PPOConfig(DeepAgentConfig):
         for name, size in (("num_envs", env.num_envs), ("batch_size", batch_size)):
             if self.rollout_steps % size:
                 raise ValueError(
-                    f"PPOConfig.rollout_steps = {self.rollout_steps}: must be a multiple of {name} = {size}"
+                    f"PPOConfig.rollout_steps = {self.rollout_steps}: must be a multiple of {name}"
+                    f" = {size}"
                 )
         check_buffer("PPOConfig.rollout_steps", self.rollout_steps, env, observations=1)
         arguments: dict[str, Any] = {

@@ -13,10 +13,11 @@ from codrl_mj.fields import integer, real, reals, units
 class SARSAConfig(AgentConfig):
     """Episodic semi-gradient SARSA with tile coding, after Sutton and Barto (2018), sections 9.5.4 and 10.1.
 
-    The defaults are the paper's: 8 tilings of 9 x 9 tiles for 3 actions, 1944 weights. Tiles cover as many leading
-    entries of the observation as there are `intervals`, where an angle counts as one; the entries behind, such as those
-    that `observe_actuator` appends, are ignored unless `intervals`, `low` and `high` are given for them as well.
-    Entries outside their bounds lie in the outer tiles.
+    The defaults are the paper's: 8 tilings of 9 x 9 tiles for 3 actions, 1944 weights. Tiles cover
+    as many leading entries of the observation as there are `intervals`, where an angle counts as
+    one; the entries behind, such as those that `observe_actuator` appends, are ignored unless
+    `intervals`, `low` and `high` are given for them as well. Entries outside their bounds lie in
+    the outer tiles.
     """
 
     name: ClassVar[str] = "sarsa"
@@ -43,14 +44,16 @@ class SARSAConfig(AgentConfig):
     high: tuple[float, ...] | None = reals()
     """Their upper bounds."""
     initial_value: float = real(0.0)
-    """Return expected of every action before it was tried; optimistic, it makes the agent try all. The paper: 0, with
-    rewards of -1."""
+    """Return expected of every action before it was tried; optimistic, it makes the agent try all.
+    The paper: 0, with rewards of -1.
+    """
 
     def make_model(self, env: Any, seed: int) -> Any:
         """See `AgentConfig.make_model`.
 
         Raises:
-            ValueError: there is more than one environment, or its observations or actions do not go with the tiles.
+            ValueError: there is more than one environment, or its observations or actions do not go
+                with the tiles.
         """
         from codrl_mj.agents.sarsa_algorithm import SARSA, TileCodingPolicy
 

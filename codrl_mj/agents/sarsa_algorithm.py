@@ -1,6 +1,7 @@
 """Episodic semi-gradient SARSA with tile coding: learning from a step and from an episode, compiled, and the algorithm.
 
-Sutton and Barto, *Reinforcement Learning: An Introduction* (2018), section 10.1; with traces, section 12.7.
+Sutton and Barto, *Reinforcement Learning: An Introduction* (2018), section 10.1; with traces,
+section 12.7.
 """
 
 import sys
@@ -48,7 +49,8 @@ class Traces(NamedTuple):
 class Learner(NamedTuple):
     """An agent in an episode: what it knows, where it is, and how it learns. Its arrays change.
 
-    Its generator is no part of it: with one in a tuple, numba takes 0.1 ms to find out what a call's arguments are.
+    Its generator is no part of it: with one in a tuple, numba takes 0.1 ms to find out what a
+    call's arguments are.
     """
 
     coder: TileCoder
@@ -96,7 +98,8 @@ def learn(
 ) -> int:
     """Learn from a step that led to an observation (k,), and choose the next action, without meaning at the end.
 
-    The target is r + gamma q(s', a'), also where a time limit cuts the episode off; and r where the task ends it.
+    The target is r + gamma q(s', a'), also where a time limit cuts the episode off; and r where the
+    task ends it.
     """
     weights, traces, tiles = learner.weights, learner.traces, learner.tiles
     error = reward - action_value(weights, tiles, action)
@@ -110,7 +113,9 @@ def learn(
         _mark(traces, tiles, action, weights.shape[1], learner.gamma * learner.trace_decay)
         for kept in range(traces.used[0]):
             index = traces.eligible[kept]
-            weights[index // weights.shape[1], index % weights.shape[1]] += change * traces.eligibility[index]
+            weights[index // weights.shape[1], index % weights.shape[1]] += (
+                change * traces.eligibility[index]
+            )
     else:
         for tile in tiles:
             weights[tile, action] += change
@@ -154,8 +159,9 @@ def run_episode(
 ) -> tuple[float, int, bool, bool]:
     """Learn from an episode of an environment's compiled `step`, from its first observation (k,), which gets the last.
 
-    `record`, as long as the time limit, gets the trace's last `row` of each step. Sum of the rewards, steps, whether
-    the task ended the episode, and whether the simulation was fine throughout.
+    `record`, as long as the time limit, gets the trace's last `row` of each step. Sum of the
+    rewards, steps, whether the task ended the episode, and whether the simulation was fine
+    throughout.
     """
     action = begin(learner, generator, observation)
     total, length, terminated = 0.0, 0, False
@@ -175,27 +181,32 @@ def run_episode(
 class TileCodingPolicy(BasePolicy):
     """Acts by action values that are linear in the active tiles: greedily, or epsilon-greedily.
 
-    Of equally good actions a greedy one (`deterministic=True`) is the first. `predict(..., deterministic=False)` draws
-    from the policy's `generator`; training draws from the algorithm's own generator, so that no evaluation
-    changes it.
+    Of equally good actions a greedy one (`deterministic=True`) is the first. `predict(...,
+    deterministic=False)` draws from the policy's `generator`; training draws from the algorithm's
+    own generator, so that no evaluation changes it.
     """
 
-    def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], config: Any) -> None:
+    def __init__(
+        self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], config: Any
+    ) -> None:
         """Make a policy that knows nothing yet."""
         if not isinstance(action_space, spaces.Discrete) or action_space.start != 0:
             raise ValueError(
-                f"action_space = {action_space}: SARSA has a weight for every action: must be Discrete, from 0"
+                f"action_space = {action_space}: SARSA has a weight for every action: must be"
+                " Discrete, from 0"
             )
         if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
             raise ValueError(
-                f"observation_space = {observation_space}: must be a Box with one axis, to be covered by tiles"
+                f"observation_space = {observation_space}: must be a Box with one axis, to be"
+                " covered by tiles"
             )
         tilings, intervals, angles = config.tilings, config.intervals, config.angles
         used = slice(2 * angles, len(intervals) + angles)
         if used.stop > observation_space.shape[0]:
             raise ValueError(
-                f"intervals = {intervals}, angles = {angles}: are of {used.stop} observation entries, but there "
-                f"are {observation_space.shape[0]}; give one interval for an angle or any other entry"
+                f"intervals = {intervals}, angles = {angles}: are of {used.stop} observation"
+                f" entries, but there are {observation_space.shape[0]}; give one interval for an"
+                " angle or any other entry"
             )
         super().__init__(observation_space, action_space)
         low = observation_space.low[used].tolist() if config.low is None else config.low
@@ -214,17 +225,24 @@ class TileCodingPolicy(BasePolicy):
     def _predict(self, observation: Any, deterministic: bool = False) -> torch.Tensor:
         epsilon, generator = self.config.epsilon, self.generator
         return torch.from_numpy(
-            choose_actions(observation.numpy(), self.coder, self.table, deterministic, epsilon, generator)
+            choose_actions(
+                observation.numpy(), self.coder, self.table, deterministic, epsilon, generator
+            )
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {"observation_space": self.observation_space, "action_space": self.action_space, "config": self.config}
+        return {
+            "observation_space": self.observation_space,
+            "action_space": self.action_space,
+            "config": self.config,
+        }
 
 
 class CompiledEpisodes:
     """Runs the episodes of an `ActuatedVecEnv` of one environment on a simulation of its own, bit for bit the same.
 
-    At the end of each the environment is where its own steps would have brought it: at the start of the next one.
+    At the end of each the environment is where its own steps would have brought it: at the start of
+    the next one.
     """
 
     def __init__(self, env: ActuatedVecEnv) -> None:
@@ -253,8 +271,9 @@ class CompiledEpisodes:
     def run(self, learner: Learner, generator: np.random.Generator) -> tuple[Any, ...] | None:
         """Learn from an episode; None, with nothing done, if the environment stands in the middle of one.
 
-        What `SARSA._count` takes: steps, first observation (1, k) of the next episode, sum of the rewards (1,), that
-        the episode ended (1,), infos of its last step, and the actuator's signals, each of shape (steps,).
+        What `SARSA._count` takes: steps, first observation (1, k) of the next episode, sum of the
+        rewards (1,), that the episode ended (1,), infos of its last step, and the actuator's
+        signals, each of shape (steps,).
         """
         vector: Any = self.env.env
         setup, start = vector.setup, vector.snapshot()
@@ -273,20 +292,31 @@ class CompiledEpisodes:
             self._physics.check_finite()
         columns = self._record[:length].T.copy()
         signals = setup.signals(columns, columns[0])
-        observations, infos = self.env.conclude(self._observation.copy(), total, length, not terminated, signals)
-        return length, observations, np.array([total], dtype=np.float32), np.array([True]), infos, signals
+        observations, infos = self.env.conclude(
+            self._observation.copy(), total, length, not terminated, signals
+        )
+        return (
+            length,
+            observations,
+            np.array([total], dtype=np.float32),
+            np.array([True]),
+            infos,
+            signals,
+        )
 
 
 class SARSA(BaseAlgorithm):
     """Episodic semi-gradient SARSA, Sutton and Barto (2018), section 10.1; with `trace_decay`, SARSA(lambda).
 
-    A rollout is an episode: `on_rollout_start` and `on_rollout_end` of callbacks are called once for each, and `learn`
-    finishes the one in which it reaches `total_timesteps`. A callback that stops it in mid-episode gives up the traces:
-    what is learned next begins with the observation that was reached.
+    A rollout is an episode: `on_rollout_start` and `on_rollout_end` of callbacks are called once
+    for each, and `learn` finishes the one in which it reaches `total_timesteps`. A callback that
+    stops it in mid-episode gives up the traces: what is learned next begins with the observation
+    that was reached.
 
-    In training, of equally good actions one is drawn at random, as in the program that the paper's agent comes from
-    (marcinbogdanski/rl-sketchpad, 1001_Episodic_Semi_Gradient_Sarsa). Unlike there, an episode that a time limit cut
-    off does not end: its last update is made with the value of what would have come next.
+    In training, of equally good actions one is drawn at random, as in the program that the paper's
+    agent comes from (marcinbogdanski/rl-sketchpad, 1001_Episodic_Semi_Gradient_Sarsa). Unlike
+    there, an episode that a time limit cut off does not end: its last update is made with the value
+    of what would have come next.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TileCodingPolicy": TileCodingPolicy}
@@ -295,13 +325,17 @@ class SARSA(BaseAlgorithm):
     """Whether to run whole episodes in compiled code where the environment can; the results are the same."""
     _last_obs: Any
 
-    def __init__(self, policy: str | type[TileCodingPolicy], env: Any, config: Any = None, **settings: Any) -> None:
+    def __init__(
+        self, policy: str | type[TileCodingPolicy], env: Any, config: Any = None, **settings: Any
+    ) -> None:
         """Take what `BaseAlgorithm` takes, for one environment, and a `SARSAConfig`: a saved model brings its own."""
         self.config = config
         self._episodes: CompiledEpisodes | None = None
         self.exploration_rate = getattr(config, "epsilon", 0.0)  # in the present episode
         if getattr(env, "num_envs", 1) != 1:
-            raise ValueError(f"num_envs = {env.num_envs}: SARSA learns from one environment: must be 1")
+            raise ValueError(
+                f"num_envs = {env.num_envs}: SARSA learns from one environment: must be 1"
+            )
         set_up = settings.pop("_init_setup_model", True)
         given = settings | {"policy_kwargs": {"config": self.config}, "device": "cpu"}
         super().__init__(policy, env, learning_rate=getattr(config, "step_size", 0.0), **given)
@@ -313,7 +347,9 @@ class SARSA(BaseAlgorithm):
         if "_generator" not in self.__dict__:  # a loaded model has the one that was saved
             # A child's seed: seeded alike, the environment's generator would draw the same numbers.
             self._generator = np.random.default_rng(np.random.SeedSequence(self.seed).spawn(1)[0])
-        self.policy = self.policy_class(self.observation_space, self.action_space, **self.policy_kwargs)  # type: ignore[assignment]
+        self.policy = self.policy_class(
+            self.observation_space, self.action_space, **self.policy_kwargs
+        )  # type: ignore[assignment]
         coder, table = self.policy.coder, self.policy.table
         self._learner = Learner(
             coder,
@@ -349,7 +385,9 @@ class SARSA(BaseAlgorithm):
         )
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
-            self.exploration_rate = self.config.epsilon * self.config.epsilon_decay**self._episode_num
+            self.exploration_rate = (
+                self.config.epsilon * self.config.epsilon_decay**self._episode_num
+            )
             callback.on_rollout_start()
             if not self._run_episode(callback):
                 break
@@ -381,7 +419,9 @@ class SARSA(BaseAlgorithm):
             terminated = bool(dones[0]) and not info.get("TimeLimit.truncated", False)
             seen = info["terminal_observation"] if dones[0] else new_obs[0]  # type: ignore[index]
             action = learn(learner, self._generator, action, float(rewards[0]), seen, terminated)
-            if not self._count(callback, 1, new_obs, rewards, dones, infos, getattr(self.env, "signals", None)):
+            if not self._count(
+                callback, 1, new_obs, rewards, dones, infos, getattr(self.env, "signals", None)
+            ):
                 return False
         return True
 
@@ -408,9 +448,13 @@ class SARSA(BaseAlgorithm):
         elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
         if self.ep_info_buffer:
             for name, key in (("ep_rew_mean", "r"), ("ep_len_mean", "l")):
-                self.logger.record(f"rollout/{name}", safe_mean([episode[key] for episode in self.ep_info_buffer]))
+                self.logger.record(
+                    f"rollout/{name}", safe_mean([episode[key] for episode in self.ep_info_buffer])
+                )
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
-        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
+        self.logger.record(
+            "time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed)
+        )
         self.logger.record("time/episodes", self._episode_num, exclude="tensorboard")
         self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")

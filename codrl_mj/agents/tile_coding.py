@@ -1,8 +1,8 @@
 """Tile coding: a point in space as the tiles that it lies in, one in each of several displaced grids; actions by tiles.
 
-Sutton and Barto, *Reinforcement Learning: An Introduction* (2018), section 9.5.4, with the displacements of Sutton's
-tiles3: along axis j (from 0), tiling t is displaced by (2 j + 1) t n-ths of a tile, where n is the number of tilings.
-Without hashing: every tile has an index of its own.
+Sutton and Barto, *Reinforcement Learning: An Introduction* (2018), section 9.5.4, with the
+displacements of Sutton's tiles3: along axis j (from 0), tiling t is displaced by (2 j + 1) t n-ths
+of a tile, where n is the number of tilings. Without hashing: every tile has an index of its own.
 """
 
 import math
@@ -41,43 +41,55 @@ class TileCoder(NamedTuple):
 
 
 def make_coder(
-    low: Sequence[float], high: Sequence[float], tilings: int, intervals: Sequence[int], angles: int = 0
+    low: Sequence[float],
+    high: Sequence[float],
+    tilings: int,
+    intervals: Sequence[int],
+    angles: int = 0,
 ) -> TileCoder:
     """A tile coder, with so many intervals between lower and upper end of every axis, and n tilings, a power of 2.
 
-    The first `angles` axes are angles, each of which the observation has as its cosine and sine; these axes wrap, and
-    have no ends to be given. The other axes are the observation's further entries in their order; entries beyond the
-    last axis are ignored.
+    The first `angles` axes are angles, each of which the observation has as its cosine and sine;
+    these axes wrap, and have no ends to be given. The other axes are the observation's further
+    entries in their order; entries beyond the last axis are ignored.
     """
     axes = len(intervals)
     if tilings < 1 or tilings & (tilings - 1):
-        raise ValueError(f"tilings = {tilings}: must be a power of 2, for the displacements of the tilings to differ")
+        raise ValueError(
+            f"tilings = {tilings}: must be a power of 2, for the displacements of the tilings to"
+            " differ"
+        )
     if not 0 <= angles <= axes:
         raise ValueError(f"angles = {angles}: must be from 0 to the number of intervals, {axes}")
     for name, ends in (("low", low), ("high", high)):
         if len(ends) != axes - angles:
             raise ValueError(
-                f"{name} = {tuple(ends)}: must have {axes - angles} numbers, one for each interval but the angles'"
+                f"{name} = {tuple(ends)}: must have {axes - angles} numbers, one for each interval"
+                " but the angles'"
             )
-    lower, upper = (np.append(np.full(angles, end), ends) for end, ends in ((-math.pi, low), (math.pi, high)))
+    lower, upper = (
+        np.append(np.full(angles, end), ends) for end, ends in ((-math.pi, low), (math.pi, high))
+    )
     for axis, (least, most) in enumerate(zip(lower, upper, strict=True)):
         if not (np.isfinite(least) and np.isfinite(most) and least < most):
             raise ValueError(
-                f"axis {axis} from {least:g} to {most:g}: must be finite, low < high; where the observation is not "
-                "bounded, set low and high"
+                f"axis {axis} from {least:g} to {most:g}: must be finite, low < high; where the"
+                " observation is not bounded, set low and high"
             )
     counts = np.array(intervals, dtype=np.int64)
     cells = counts + (np.arange(axes) >= angles)
     size = tilings * math.prod(cells.tolist())
     if size > LARGEST_TABLE:
         raise ValueError(
-            f"tilings = {tilings}, intervals = {tuple(intervals)}: {size} tiles: must be at most {LARGEST_TABLE}; take "
-            "fewer"
+            f"tilings = {tilings}, intervals = {tuple(intervals)}: {size} tiles: must be at most"
+            f" {LARGEST_TABLE}; take fewer"
         )
     entries = np.full((axes, 2), -1, dtype=np.int64)
     entries[:angles] = np.arange(2 * angles).reshape(angles, 2)
     entries[angles:, 0] = np.arange(2 * angles, axes + angles)
-    strides = np.array([math.prod(cells[axis + 1 :].tolist()) for axis in range(axes)], dtype=np.int64)
+    strides = np.array(
+        [math.prod(cells[axis + 1 :].tolist()) for axis in range(axes)], dtype=np.int64
+    )
     return TileCoder(
         entries=entries,
         low=lower,
@@ -95,8 +107,8 @@ def make_coder(
 def find_tiles(observation: np.ndarray, coder: TileCoder, tiles: np.ndarray) -> None:
     """Find the tiles (n,) of an observation (k,), one of each tiling: that of tiling t is in [t, t + 1) * size / n.
 
-    Entries outside the ends of their axis count as at the nearer end, and so lie in the outer tiles; NaN counts as at
-    the lower end.
+    Entries outside the ends of their axis count as at the nearer end, and so lie in the outer
+    tiles; NaN counts as at the lower end.
     """
     per_tiling = coder.size >> coder.shift
     for tiling in range(len(tiles)):
@@ -128,7 +140,9 @@ def action_value(weights: np.ndarray, tiles: np.ndarray, action: int) -> float:
 
 
 @njit(nogil=True, error_model="numpy")
-def choose_action(weights: np.ndarray, tiles: np.ndarray, epsilon: float, generator: np.random.Generator) -> int:
+def choose_action(
+    weights: np.ndarray, tiles: np.ndarray, epsilon: float, generator: np.random.Generator
+) -> int:
     """An action at random with probability `epsilon`, else the best; of equally good ones one at random."""
     actions = weights.shape[1]
     if generator.random() < epsilon:
@@ -162,7 +176,9 @@ def choose_actions(
         if deterministic:
             actions[row] = 0
             for action in range(1, weights.shape[1]):
-                if action_value(weights, tiles, action) > action_value(weights, tiles, actions[row]):
+                if action_value(weights, tiles, action) > action_value(
+                    weights, tiles, actions[row]
+                ):
                     actions[row] = action
         else:
             actions[row] = choose_action(weights, tiles, epsilon, generator)

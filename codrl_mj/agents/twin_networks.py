@@ -2,9 +2,10 @@
 
 Imports torch: import it where an agent is made.
 
-Networks of 64 units are so small that most of a gradient step is the bookkeeping around its arithmetic: modules, the
-graph of automatic differentiation, tensor by tensor optimisation. Here both networks pass through the same few batched
-products, forwards and backwards, and all their parameters are one vector.
+Networks of 64 units are so small that most of a gradient step is the bookkeeping around its
+arithmetic: modules, the graph of automatic differentiation, tensor by tensor optimisation. Here
+both networks pass through the same few batched products, forwards and backwards, and all their
+parameters are one vector.
 """
 
 from collections.abc import Iterable
@@ -16,7 +17,10 @@ from torch import nn
 
 _ACTIVATIONS: dict[type[nn.Module], tuple[Any, Any]] = {
     nn.Tanh: (torch.tanh, torch.ops.aten.tanh_backward),
-    nn.ReLU: (torch.relu, lambda gradient, output: torch.ops.aten.threshold_backward(gradient, output, 0.0)),
+    nn.ReLU: (
+        torch.relu,
+        lambda gradient, output: torch.ops.aten.threshold_backward(gradient, output, 0.0),
+    ),
 }
 """Activation -> its function, and (gradient by its output, its output) -> gradient by its input."""
 
@@ -24,7 +28,8 @@ _ACTIVATIONS: dict[type[nn.Module], tuple[Any, Any]] = {
 class TwinNetworks:
     """The networks of a Stable-Baselines3 `ActorCriticPolicy`, whose parameters become views of one vector.
 
-    The critic's last layer is filled up with zeros to as many outputs as the actor has; they stay zero.
+    The critic's last layer is filled up with zeros to as many outputs as the actor has; they stay
+    zero.
     """
 
     def __init__(self, policy: ActorCriticPolicy) -> None:
@@ -41,24 +46,31 @@ class TwinNetworks:
         inputs = [[size[0] for size in tower] for tower in sizes]
         if inputs[0] != inputs[1] or policy.activation_fn not in _ACTIVATIONS:
             raise ValueError(
-                f"actor and critic of {policy.net_arch} with {policy.activation_fn.__name__}: must have the same "
-                f"hidden layers, with {' or '.join(one.__name__ for one in _ACTIVATIONS)}; use Stable-Baselines3's PPO"
+                f"actor and critic of {policy.net_arch} with {policy.activation_fn.__name__}: must"
+                " have the same hidden layers, with"
+                f" {' or '.join(one.__name__ for one in _ACTIVATIONS)}; use Stable-Baselines3's PPO"
             )
         ours = sum((inputs + 1) * outputs for tower in sizes for inputs, outputs in tower)
         theirs = sum(one.numel() for one in policy.parameters() if one is not log_std)
         if ours != theirs:
             raise ValueError(
-                f"the policy has {theirs} weights and biases, of which {ours} are those of its two networks: a "
-                "features extractor must not learn; use Stable-Baselines3's PPO for one that does"
+                f"the policy has {theirs} weights and biases, of which {ours} are those of its two"
+                " networks: a features extractor must not learn; use Stable-Baselines3's PPO for"
+                " one that does"
             )
         shapes = [
-            (max(layer.out_features for layer in pair), pair[0].in_features) for pair in zip(*towers, strict=True)
+            (max(layer.out_features for layer in pair), pair[0].in_features)
+            for pair in zip(*towers, strict=True)
         ]
         self.outputs = shapes[-1][0]
         noise = 0 if log_std is None else log_std.numel()
-        self.parameters = torch.zeros(sum(2 * outputs * (inputs + 1) for outputs, inputs in shapes) + noise)
+        self.parameters = torch.zeros(
+            sum(2 * outputs * (inputs + 1) for outputs, inputs in shapes) + noise
+        )
         self.gradient = torch.zeros_like(self.parameters)
-        self.weights, self.biases = _carve(self.parameters, shapes)  # (2, outputs, inputs), (2, 1, outputs)
+        self.weights, self.biases = _carve(
+            self.parameters, shapes
+        )  # (2, outputs, inputs), (2, 1, outputs)
         self._weight_gradients, self._bias_gradients = _carve(self.gradient, shapes)
         for tower, linears in enumerate(towers):
             for layer, weight, bias in zip(linears, self.weights, self.biases, strict=True):
@@ -116,7 +128,10 @@ class VectorAdam(torch.optim.Adam):
         whole = super().state_dict()
         moments = whole["state"].get(0, {})
         state = {
-            number: {name: (one.as_strided(*place) if one.ndim else one).clone() for name, one in moments.items()}
+            number: {
+                name: (one.as_strided(*place) if one.ndim else one).clone()
+                for name, one in moments.items()
+            }
             for number, place in enumerate(self._layout)
         }
         group = whole["param_groups"][0] | {"params": list(state)}
@@ -126,18 +141,27 @@ class VectorAdam(torch.optim.Adam):
         """Take the moments of each parameter."""
         state, group = state_dict["state"], state_dict["param_groups"][0]
         if len(group["params"]) != len(self._layout):
-            raise ValueError(f"{len(group['params'])} parameters are optimised: must be {len(self._layout)}")
+            raise ValueError(
+                f"{len(group['params'])} parameters are optimised: must be {len(self._layout)}"
+            )
         vector = self.param_groups[0]["params"][0]
-        moments = {name: one if not one.ndim else torch.zeros_like(vector) for name, one in state.get(0, {}).items()}
+        moments = {
+            name: one if not one.ndim else torch.zeros_like(vector)
+            for name, one in state.get(0, {}).items()
+        }
         for number, place in enumerate(self._layout if moments else ()):
             for name, one in state[number].items():
                 if one.ndim:
                     moments[name].as_strided(*place).copy_(one)
         kept = {0: moments} if moments else {}
-        super().load_state_dict({"state": kept, "param_groups": [group | {"params": [0], "fused": True}]})
+        super().load_state_dict(
+            {"state": kept, "param_groups": [group | {"params": [0], "fused": True}]}
+        )
 
 
-def _carve(vector: torch.Tensor, shapes: list[tuple[int, int]]) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+def _carve(
+    vector: torch.Tensor, shapes: list[tuple[int, int]]
+) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     """Weights and biases of both networks as views of a vector, layer by layer."""
     weights: list[torch.Tensor] = []
     biases: list[torch.Tensor] = []
@@ -146,7 +170,9 @@ def _carve(vector: torch.Tensor, shapes: list[tuple[int, int]]) -> tuple[list[to
         for views, size in ((weights, inputs), (biases, 1)):
             count = 2 * outputs * size
             piece = vector[start : start + count]
-            views.append(piece.view(2, outputs, inputs) if views is weights else piece.view(2, 1, outputs))
+            views.append(
+                piece.view(2, outputs, inputs) if views is weights else piece.view(2, 1, outputs)
+            )
             start += count
     return weights, biases
 

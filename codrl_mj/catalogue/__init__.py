@@ -1,6 +1,13 @@
 """Off-the-shelf motors: datasheets as they are printed, the numbers that follow from them, and a catalogue."""
 
-from codrl_mj.catalogue.datasheet import Datasheet, MotorEntry, from_datasheet, motor_entry, motor_names, new_motor
+from codrl_mj.catalogue.datasheet import (
+    Datasheet,
+    MotorEntry,
+    from_datasheet,
+    motor_entry,
+    motor_names,
+    new_motor,
+)
 from codrl_mj.catalogue.derivation import Disagreement, MotorNumbers
 
 __all__ = [

@@ -15,22 +15,27 @@ from codrl_mj.own_code import asset_folder, read_text
 
 def _printed(unit: str, example: str, power: int = 0, zero: bool = False, also: str = "") -> Any:
     """A field that may be printed; `also` is what others call it."""
-    return dataclasses.field(default=None, metadata={"kind": Kind(unit, example, power, zero), "also": also})
+    return dataclasses.field(
+        default=None, metadata={"kind": Kind(unit, example, power, zero), "also": also}
+    )
 
 
 @dataclasses.dataclass(frozen=True)
 class Datasheet:
     """What a datasheet prints, each value as text with its unit; what it does not print is left out.
 
-    Any sufficient combination will do: the nominal voltage with stall torque, stall current, no-load speed and no-load
-    current; or resistance and torque constant (or back-EMF constant, or speed constant); or both, which are then
-    compared. The inductance, or an electrical time constant, is needed in any case.
+    Any sufficient combination will do: the nominal voltage with stall torque, stall current,
+    no-load speed and no-load current; or resistance and torque constant (or back-EMF constant, or
+    speed constant); or both, which are then compared. The inductance, or an electrical time
+    constant, is needed in any case.
 
-    Electrical values are those at the two terminals. Of a three-phase motor these are resistance and inductance between
-    two phases (what maxon, T-Motor and most makers print), with the voltage between the phases and the torque constant
-    that goes with it; of a star whose phase is printed, write `2 * 0.3 ohm`.
+    Electrical values are those at the two terminals. Of a three-phase motor these are resistance
+    and inductance between two phases (what maxon, T-Motor and most makers print), with the voltage
+    between the phases and the torque constant that goes with it; of a star whose phase is printed,
+    write `2 * 0.3 ohm`.
 
-    Torques, speeds, inertias and friction are at `shaft`, unless the value ends in `at motor` or `at output`.
+    Torques, speeds, inertias and friction are at `shaft`, unless the value ends in `at motor` or
+    `at output`.
     """
 
     shaft: str | None = None
@@ -45,11 +50,15 @@ class Datasheet:
     """Speed of the free shaft."""
     no_load_current: str | None = _printed("A", "2.7 A", zero=True)
     """Current of the free motor, which overcomes its friction."""
-    continuous_torque: str | None = _printed("N*m", "91.1 mN*m", -1, also="rated_torque nominal_torque")
+    continuous_torque: str | None = _printed(
+        "N*m", "91.1 mN*m", -1, also="rated_torque nominal_torque"
+    )
     """Torque that it bears for ever; many call it nominal or rated."""
     continuous_current: str | None = _printed("A", "2.52 A", also="rated_current nominal_current")
     """Current that it bears for ever."""
-    continuous_speed: str | None = _printed("rad/s", "5170 rpm", 1, also="rated_speed nominal_speed")
+    continuous_speed: str | None = _printed(
+        "rad/s", "5170 rpm", 1, also="rated_speed nominal_speed"
+    )
     """Speed at the nominal voltage and the continuous current."""
     peak_current: str | None = _printed("A", "24 A", also="max_current")
     """Largest current of motor or drive."""
@@ -66,8 +75,9 @@ class Datasheet:
     speed_constant: str | None = _printed("rad/s/V", "380 rpm/V", 1, also="kv")
     """Speed per voltage, Kv."""
     rotor_inertia: str | None = _printed("kg*m^2", "135 g*cm^2", -2)
-    """Inertia of the rotor; at the output, the reflected one (`armature`). With `shaft = "output"` it must end in
-    `at motor` or `at output`."""
+    """Inertia of the rotor; at the output, the reflected one (`armature`). With `shaft = "output"`
+    it must end in `at motor` or `at output`.
+    """
     mechanical_time_constant: str | None = _printed("s", "9.92 ms")
     """How fast the free rotor follows a step of voltage: R*J/(kT*kE)."""
     gear_ratio: str | float | None = _printed("", "30", also="gear reduction")
@@ -101,30 +111,54 @@ class Datasheet:
         """The values that are printed, each a `Reading` in the SI unit of its field, at the shaft it is printed at.
 
         Raises:
-            ValueError: a value has no unit or a wrong one, is not positive, or an efficiency is above 1; or nothing
-                says at which shaft of a gear one is.
+            ValueError: a value has no unit or a wrong one, is not positive, or an efficiency is
+                above 1; or nothing says at which shaft of a gear one is.
         """
         given = {name: getattr(self, name) for name in KINDS}
-        found = {name: read(name, printed, KINDS[name]) for name, printed in given.items() if printed is not None}
-        either = [name for name, reading in found.items() if KINDS[name].power and reading.shaft is None]
-        if self.shaft is None and either and "gear_ratio" in found and found["gear_ratio"].value != 1.0:
+        found = {
+            name: read(name, printed, KINDS[name])
+            for name, printed in given.items()
+            if printed is not None
+        }
+        either = [
+            name for name, reading in found.items() if KINDS[name].power and reading.shaft is None
+        ]
+        if (
+            self.shaft is None
+            and either
+            and "gear_ratio" in found
+            and found["gear_ratio"].value != 1.0
+        ):
             raise ValueError(
-                f"datasheet.shaft is missing: {', '.join(either)} may be before or past the gear of "
-                f'{self.gear_ratio}; write shaft = "motor" or shaft = "output", or "... at motor" in a single value'
+                f"datasheet.shaft is missing: {', '.join(either)} may be before or past the"
+                " gear of "
+                f'{self.gear_ratio}; write shaft = "motor" or shaft = "output", or "... at motor"'
+                " in a single value"
             )
         inertia, ratio = found.get("rotor_inertia"), found.get("gear_ratio")
-        if self.shaft == "output" and inertia and inertia.shaft is None and ratio and ratio.value != 1.0:
+        if (
+            self.shaft == "output"
+            and inertia
+            and inertia.shaft is None
+            and ratio
+            and ratio.value != 1.0
+        ):
             raise ValueError(
-                f"datasheet.rotor_inertia = {self.rotor_inertia!r}: the rotor's own, or as it is seen at the output, "
-                f'gear_ratio^2 times that? shaft = "output" leaves it open: write "{inertia.printed} at motor" (what '
-                f'motors\' datasheets print) or "{inertia.printed} at output" (reflected, an armature)'
+                f"datasheet.rotor_inertia = {self.rotor_inertia!r}: the rotor's own, or as it is"
+                " seen at the output, "
+                'gear_ratio^2 times that? shaft = "output" leaves it open: write'
+                f' "{inertia.printed} at motor" (what '
+                f'motors\' datasheets print) or "{inertia.printed} at output" (reflected, an'
+                " armature)"
             )
         at = self.shaft or "motor"
-        found = {name: reading._replace(shaft=reading.shaft or at) for name, reading in found.items()}
+        found = {
+            name: reading._replace(shaft=reading.shaft or at) for name, reading in found.items()
+        }
         if "gear_efficiency" in found and found["gear_efficiency"].value > 1.0:
             raise ValueError(
-                f"datasheet.gear_efficiency = {self.gear_efficiency!r}: must be a finite number > 0 and <= 1; "
-                'write percent as "74 %"'
+                f"datasheet.gear_efficiency = {self.gear_efficiency!r}: must be a finite number > 0"
+                ' and <= 1; write percent as "74 %"'
             )
         return found
 
@@ -133,12 +167,21 @@ class Datasheet:
         return derive(self.readings(), KINDS, strict, tolerance)
 
 
-KINDS: dict[str, Kind] = {f.name: f.metadata["kind"] for f in dataclasses.fields(Datasheet) if "kind" in f.metadata}
+KINDS: dict[str, Kind] = {
+    f.name: f.metadata["kind"] for f in dataclasses.fields(Datasheet) if "kind" in f.metadata
+}
 """The printed fields and what each may hold."""
-_OTHERWISE = {other: f.name for f in dataclasses.fields(Datasheet) for other in f.metadata.get("also", "").split()}
+_OTHERWISE = {
+    other: f.name
+    for f in dataclasses.fields(Datasheet)
+    for other in f.metadata.get("also", "").split()
+}
 _PHASE = "write what is between two phases: of a star twice the phase's, of a delta two thirds"
 _LEFT_OUT = {
-    "pole_pairs": "leave it out: turns are the rotor's here; where a maker prints electrical rpm, divide these by it",
+    "pole_pairs": (
+        "leave it out: turns are the rotor's here; where a maker prints electrical rpm, divide"
+        " these by it"
+    ),
     "phase_resistance": f'{_PHASE}, resistance = "2 * 0.3 ohm"',
     "phase_inductance": f'{_PHASE}, inductance = "2 * 0.1 mH"',
 }
@@ -155,9 +198,16 @@ def named(printed: Mapping[str, Any]) -> dict[str, Any]:
         field = _OTHERWISE.get(name.lower(), name.lower())
         if field in _LEFT_OUT:
             raise ValueError(f"datasheet.{name}: {_LEFT_OUT[field]}")
-        check_names([field if field in ("shaft", *KINDS) else name], ("shaft", *KINDS), "datasheet field", every=True)
+        check_names(
+            [field if field in ("shaft", *KINDS) else name],
+            ("shaft", *KINDS),
+            "datasheet field",
+            every=True,
+        )
         if field in found:
-            raise ValueError(f"datasheet.{name} is {field}, which is given already: leave one of them out")
+            raise ValueError(
+                f"datasheet.{name} is {field}, which is given already: leave one of them out"
+            )
         found[field] = value
     return found
 
@@ -174,13 +224,15 @@ def from_datasheet(*, strict: bool = True, tolerance: float = 0.2, **printed: An
 
     Args:
         strict: refuse a datasheet that contradicts itself; False: only list it in `disagreements`.
-        tolerance: relative difference above which two values contradict each other. 0.2 lets pass what makers round,
-            print of a warm motor or of one with saturated iron, and catches slips of units.
+        tolerance: relative difference above which two values contradict each other. 0.2 lets pass
+            what makers round, print of a warm motor or of one with saturated iron, and catches
+            slips of units.
         printed: the fields of `Datasheet`.
 
     Raises:
-        ValueError: a field is unknown, is without its unit, has a wrong one or is out of bounds; the fields do not
-            suffice; or two of them contradict each other. The message names field, value and remedy.
+        ValueError: a field is unknown, is without its unit, has a wrong one or is out of bounds;
+            the fields do not suffice; or two of them contradict each other. The message names
+            field, value and remedy.
     """
     return Datasheet(**named(printed)).numbers(strict, tolerance)
 
@@ -236,7 +288,10 @@ def new_motor(path: Path) -> None:
         ValueError: its name does not end in .toml, or it is there already.
     """
     if path.suffix != ".toml" or path.exists():
-        raise ValueError(f"{path}: {'is there already' if path.exists() else 'must end in .toml'}: give another name")
+        raise ValueError(
+            f"{path}: {'is there already' if path.exists() else 'must end in .toml'}: give another"
+            " name"
+        )
     path.write_bytes((asset_folder() / "motor_template.toml").read_bytes())
 
 
@@ -244,11 +299,12 @@ def motor_entry(name: str) -> MotorEntry:
     """A motor of the catalogue.
 
     Args:
-        name: one of `motor_names()`, or the path of a TOML file of your own, of which [datasheet] is enough.
+        name: one of `motor_names()`, or the path of a TOML file of your own, of which [datasheet]
+            is enough.
 
     Raises:
-        ValueError: there is no such motor (the nearest is suggested); the file lacks something or has something
-            unknown; or its datasheet is refused, see `from_datasheet`.
+        ValueError: there is no such motor (the nearest is suggested); the file lacks something or
+            has something unknown; or its datasheet is refused, see `from_datasheet`.
     """
     path = Path(name)
     if path.suffix != ".toml":
@@ -261,7 +317,9 @@ def motor_entry(name: str) -> MotorEntry:
             f"motor {name!r}: there is no such file; {command('motor', 'new', name)} writes one"
         ) from error
     except (OSError, tomllib.TOMLDecodeError) as error:
-        raise ValueError(f"motor {name!r}: {path} is no TOML file that can be read: {error}") from error
+        raise ValueError(
+            f"motor {name!r}: {path} is no TOML file that can be read: {error}"
+        ) from error
     except ValueError as error:
         raise ValueError(f"motor {name!r} ({path}): {error}") from error
 
@@ -279,9 +337,15 @@ def _entry(name: str, content: dict[str, Any], own: bool) -> MotorEntry:
     for key, value in content.items():
         table = key in ("datasheet", "sources", "estimated")
         if key != "tolerance" and not isinstance(value, Mapping if table else str):
-            raise ValueError(f"{key} = {value!r}: must be {f'a table, [{key}]' if table else 'text'}")
+            raise ValueError(
+                f"{key} = {value!r}: must be {f'a table, [{key}]' if table else 'text'}"
+            )
     printed = {key: value for key, value in named(content["datasheet"]).items() if value != ""}
-    content |= {"name": name, "datasheet": Datasheet(**printed), "estimated": named(content["estimated"])}
+    content |= {
+        "name": name,
+        "datasheet": Datasheet(**printed),
+        "estimated": named(content["estimated"]),
+    }
     _ = MotorEntry(**content).numbers  # refused here, not at first use
     check_names(content["estimated"], printed, "entry", "estimated.")
     sourced = [key for key in printed if key in KINDS and key not in content["estimated"]]
@@ -294,8 +358,12 @@ def _sources(sources: Mapping[str, Any], printed: list[str]) -> dict[str, str]:
     """The source of each printed value, from the values of each source."""
     found: dict[str, str] = {}
     for source, values in sources.items():
-        if values != _THE_REST and not (isinstance(values, list) and all(isinstance(one, str) for one in values)):
-            raise ValueError(f'sources.{source!r} = {values!r}: must be a list of entries, or "{_THE_REST}"')
+        if values != _THE_REST and not (
+            isinstance(values, list) and all(isinstance(one, str) for one in values)
+        ):
+            raise ValueError(
+                f'sources.{source!r} = {values!r}: must be a list of entries, or "{_THE_REST}"'
+            )
         if values != _THE_REST:
             values = named(dict.fromkeys(values, source))
             check_names(values, printed, "entry", f"sources.{source!r}: ")
@@ -303,5 +371,8 @@ def _sources(sources: Mapping[str, Any], printed: list[str]) -> dict[str, str]:
     rest = [name for name in printed if name not in found]
     for_the_rest = [source for source, values in sources.items() if values == _THE_REST]
     if rest and len(for_the_rest) != 1:
-        raise ValueError(f'sources: not one for {", ".join(rest)}; list these, or write "one source" = "{_THE_REST}"')
+        raise ValueError(
+            f'sources: not one for {", ".join(rest)}; list these, or write "one source" ='
+            f' "{_THE_REST}"'
+        )
     return found | dict.fromkeys(rest, "".join(for_the_rest))

@@ -1,8 +1,9 @@
 """From what a datasheet prints to the numbers of a motor: which follows from which, and which have to agree.
 
-The motor is V = R*I + kE*w with torque kT*I. The gear passes on `gear_efficiency` of it, and friction takes its part
-behind the gear, where the simulation has it: at no load it is gear_efficiency*kT*I0. Source of the relations: maxon's
-*Key information on maxon DC and EC motors*; they are those of any text on DC motors.
+The motor is V = R*I + kE*w with torque kT*I. The gear passes on `gear_efficiency` of it, and
+friction takes its part behind the gear, where the simulation has it: at no load it is
+gear_efficiency*kT*I0. Source of the relations: maxon's *Key information on maxon DC and EC motors*;
+they are those of any text on DC motors.
 """
 
 import dataclasses
@@ -24,49 +25,85 @@ def compiled(formula: str) -> CodeType:
     return compile(formula, "a rule of the catalogue", "eval")
 
 
-# A quantity, and how it follows from others. Torques at the output, past a gear's losses, have names of their own. The
-# first rule whose needs are known is taken.
+# A quantity, and how it follows from others. Torques at the output, past a gear's losses, have
+# names of their own. The first rule whose needs are known is taken.
 RULES = (
     ("resistance", "nominal_voltage / stall_current"),
-    ("resistance", "mechanical_time_constant * torque_constant * back_emf_constant / rotor_inertia"),
     (
         "resistance",
-        "nominal_voltage * (no_load_speed - continuous_speed) "
-        "/ (continuous_current * no_load_speed - no_load_current * continuous_speed)",
+        "mechanical_time_constant * torque_constant * back_emf_constant / rotor_inertia",
+    ),
+    (
+        "resistance",
+        (
+            "nominal_voltage * (no_load_speed - continuous_speed) "
+            "/ (continuous_current * no_load_speed - no_load_current * continuous_speed)"
+        ),
     ),
     ("stall_current", "nominal_voltage / resistance"),
     ("back_emf_constant", "1 / speed_constant"),
     ("back_emf_constant", "(nominal_voltage - resistance * no_load_current) / no_load_speed"),
     ("torque_constant", "stall_torque / (stall_current - no_load_current)"),
     ("torque_constant", "continuous_torque / (continuous_current - no_load_current)"),
-    ("torque_constant", "stall_torque_at_output / (gear_ratio * gear_efficiency * (stall_current - no_load_current))"),
+    (
+        "torque_constant",
+        (
+            "stall_torque_at_output / (gear_ratio * gear_efficiency * (stall_current -"
+            " no_load_current))"
+        ),
+    ),
     ("torque_constant", "back_emf_constant"),
     ("back_emf_constant", "torque_constant"),
     ("back_emf_constant", "(nominal_voltage - resistance * continuous_current) / continuous_speed"),
-    ("gear_efficiency", "stall_torque_at_output / (gear_ratio * torque_constant * (stall_current - no_load_current))"),
+    (
+        "gear_efficiency",
+        (
+            "stall_torque_at_output / (gear_ratio * torque_constant * (stall_current -"
+            " no_load_current))"
+        ),
+    ),
     ("gear_efficiency", "torque_constant_at_output / (gear_ratio * torque_constant)"),
     (
         "gear_efficiency",
-        "continuous_torque_at_output / (gear_ratio * torque_constant * (continuous_current - no_load_current))",
+        (
+            "continuous_torque_at_output / (gear_ratio * torque_constant * (continuous_current -"
+            " no_load_current))"
+        ),
     ),
-    ("rotor_inertia", "mechanical_time_constant * torque_constant * back_emf_constant / resistance"),
+    (
+        "rotor_inertia",
+        "mechanical_time_constant * torque_constant * back_emf_constant / resistance",
+    ),
     ("inductance", "electrical_time_constant * resistance"),
     ("continuous_current", "continuous_torque / torque_constant + no_load_current"),
     (
         "continuous_current",
-        "continuous_torque_at_output / (gear_ratio * gear_efficiency * torque_constant) + no_load_current",
+        (
+            "continuous_torque_at_output / (gear_ratio * gear_efficiency * torque_constant) +"
+            " no_load_current"
+        ),
     ),
     ("thermal_resistance", "thermal_resistance_winding + thermal_resistance_housing"),
 )
-_LOAD = "the shaft's torque is kT*(I - I0) here, many makers print kT*I; iron saturates at stall; warm motors give less"
-_SPEED = "iron losses and brushes are not in the model; many print a warm motor's speed, or a limit of the drive"
+_LOAD = (
+    "the shaft's torque is kT*(I - I0) here, many makers print kT*I; iron saturates at stall; warm"
+    " motors give less"
+)
+_SPEED = (
+    "iron losses and brushes are not in the model; many print a warm motor's speed, or a limit of"
+    " the drive"
+)
 CHECKS = (
-    # a printed quantity, what it should be by the numbers that were found, and what to make of a difference
+    # a printed quantity, what it should be by the numbers that were found, and what to make of a
+    # difference
     (
         "torque_constant",
         "back_emf_constant",
-        "equal in SI for an ideal motor. A smaller torque constant is lost in iron, or saturates at stall; a larger "
-        "one would make energy: distrust the stall torque, or the conventions of current and voltage",
+        (
+            "equal in SI for an ideal motor. A smaller torque constant is lost in iron, or"
+            " saturates at stall; a larger one would make energy: distrust the stall torque, or the"
+            " conventions of current and voltage"
+        ),
     ),
     (
         "speed_constant",
@@ -76,7 +113,10 @@ CHECKS = (
     (
         "stall_current",
         "nominal_voltage / resistance",
-        "rounding, or the resistance is without brushes and leads, or the stall current was measured on a warm motor",
+        (
+            "rounding, or the resistance is without brushes and leads, or the stall current was"
+            " measured on a warm motor"
+        ),
     ),
     ("stall_torque", "torque_constant * (stall_current - no_load_current)", _LOAD),
     (
@@ -91,8 +131,16 @@ CHECKS = (
         "gear_ratio * gear_efficiency * torque_constant * (continuous_current - no_load_current)",
         _LOAD,
     ),
-    ("no_load_speed", "(nominal_voltage - resistance * no_load_current) / back_emf_constant", _SPEED),
-    ("continuous_speed", "(nominal_voltage - resistance * continuous_current) / back_emf_constant", _SPEED),
+    (
+        "no_load_speed",
+        "(nominal_voltage - resistance * no_load_current) / back_emf_constant",
+        _SPEED,
+    ),
+    (
+        "continuous_speed",
+        "(nominal_voltage - resistance * continuous_current) / back_emf_constant",
+        _SPEED,
+    ),
     (
         "mechanical_time_constant",
         "resistance * rotor_inertia / (torque_constant * back_emf_constant)",
@@ -105,7 +153,10 @@ CHECKS = (
     ),
     (
         "no_load_current",
-        "(coulomb_friction + viscous_friction * no_load_speed) / (gear_efficiency * torque_constant)",
+        (
+            "(coulomb_friction + viscous_friction * no_load_speed) / (gear_efficiency *"
+            " torque_constant)"
+        ),
         "friction varies with temperature and from motor to motor",
     ),
     (
@@ -142,8 +193,8 @@ class Disagreement(NamedTuple):
         share = self.difference
         by = f"{100.0 * share:+.3g}%" if abs(share) < 1.0 else f"{share + 1.0:.3g} times that"
         return (
-            f"{self.quantity} = {self.printed:.4g} {self.unit}, but {self.formula} = {self.computed:.4g} {self.unit}, "
-            f"{by}: {self.reading}"
+            f"{self.quantity} = {self.printed:.4g} {self.unit}, but {self.formula} ="
+            f" {self.computed:.4g} {self.unit}, {by}: {self.reading}"
         )
 
 
@@ -205,14 +256,24 @@ OTHER_NAMES = {
 """Numbers whose printed field is called otherwise."""
 _NEEDED = {
     "resistance": "resistance, or nominal_voltage and stall_current",
-    "torque_constant": "torque_constant, or back_emf_constant, or speed_constant, or nominal_voltage and no_load_speed",
-    "back_emf_constant": "back_emf_constant, or speed_constant, or nominal_voltage and no_load_speed",
-    "inductance": 'inductance, such as inductance = "0.3 mH", or electrical_time_constant: it does not follow from the '
-    "rest. If the maker does not print it, measure it or take that of a similar motor, and say so",
+    "torque_constant": (
+        "torque_constant, or back_emf_constant, or speed_constant, or nominal_voltage and"
+        " no_load_speed"
+    ),
+    "back_emf_constant": (
+        "back_emf_constant, or speed_constant, or nominal_voltage and no_load_speed"
+    ),
+    "inductance": (
+        'inductance, such as inductance = "0.3 mH", or electrical_time_constant: it does not follow'
+        " from the rest. If the maker does not print it, measure it or take that of a similar"
+        " motor, and say so"
+    ),
 }
 
 
-def derive(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: bool, tolerance: float) -> MotorNumbers:
+def derive(
+    readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: bool, tolerance: float
+) -> MotorNumbers:
     """The numbers that follow from what is printed; the arguments and errors of `from_datasheet`."""
     if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance > 0.0:
         raise ValueError(f"tolerance = {tolerance!r}: must be a number > 0, such as 0.2")
@@ -223,9 +284,14 @@ def derive(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: b
     found.apply_rules()
     for name, remedy in _NEEDED.items():
         if name not in known:
-            raise ValueError(f"datasheet.{name} is not printed and does not follow from what is: give {remedy}")
+            raise ValueError(
+                f"datasheet.{name} is not printed and does not follow from what is: give {remedy}"
+            )
         if not known[name] > 0.0:
-            raise ValueError(f"datasheet.{name} = {known[name]:.4g}: must be > 0, but {how[name]}; check these values")
+            raise ValueError(
+                f"datasheet.{name} = {known[name]:.4g}: must be > 0, but {how[name]}; check these"
+                " values"
+            )
     found.settle_gear(strict, tolerance)
     if "no_load_current" in printed:
         found.settle_friction()
@@ -233,15 +299,27 @@ def derive(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: b
     if strict and disagreements and not abs(disagreements[0].difference) <= tolerance:
         worst = disagreements[0]
         behind = ", ".join(found.behind([worst.quantity, *found.named(worst.formula)]))
-        behind += ", and at which shaft they are (shaft, gear_ratio)" if known["gear_ratio"] != 1.0 else ""
+        behind += (
+            ", and at which shaft they are (shaft, gear_ratio)"
+            if known["gear_ratio"] != 1.0
+            else ""
+        )
         raise ValueError(
-            f"datasheet.{worst.quantity} contradicts the rest by more than {tolerance:.0%}: {worst}. Check the values "
-            f"and units of {behind}; raise tolerance, or pass strict=False, if the maker does print them so"
+            f"datasheet.{worst.quantity} contradicts the rest by more than {tolerance:.0%}:"
+            f" {worst}. Check the values and units of {behind}; raise tolerance, or pass"
+            " strict=False, if the maker does print them so"
         )
     for name, field in OTHER_NAMES.items():
         if field in printed:
-            known[name], how[name] = known[field], how[field].replace(field, name, 1) + f" as {field}"
-    fields = [f.name for f in dataclasses.fields(MotorNumbers) if f.name not in ("derived", "disagreements")]
+            known[name], how[name] = (
+                known[field],
+                how[field].replace(field, name, 1) + f" as {field}",
+            )
+    fields = [
+        f.name
+        for f in dataclasses.fields(MotorNumbers)
+        if f.name not in ("derived", "disagreements")
+    ]
     return MotorNumbers(
         **{name: known.get(name) for name in fields},  # type: ignore[arg-type]
         derived={name: how[name] for name in fields if name in known},
@@ -252,13 +330,20 @@ def derive(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: b
 def _has_loss(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], tolerance: float) -> bool:
     """Return True if a torque constant printed at the output can only be past the gear's losses, as servos print it.
 
-    That is, no efficiency is printed, and a gear without losses makes it smaller than the back-EMF constant, which
-    follows from the rest, by more than the tolerance.
+    That is, no efficiency is printed, and a gear without losses makes it smaller than the back-EMF
+    constant, which follows from the rest, by more than the tolerance.
     """
     reading, ratio = readings.get("torque_constant"), readings.get("gear_ratio")
-    if reading is None or ratio is None or reading.shaft != "output" or "gear_efficiency" in readings:
+    if (
+        reading is None
+        or ratio is None
+        or reading.shaft != "output"
+        or "gear_efficiency" in readings
+    ):
         return False
-    others = _Derivation({name: one for name, one in readings.items() if name != "torque_constant"}, kinds)
+    others = _Derivation(
+        {name: one for name, one in readings.items() if name != "torque_constant"}, kinds
+    )
     others.known.setdefault("no_load_current", 0.0)
     others.apply_rules()
     constant = others.known.get("back_emf_constant", 0.0)
@@ -268,7 +353,9 @@ def _has_loss(readings: Mapping[str, Reading], kinds: Mapping[str, Kind], tolera
 class _Derivation:
     """What is known of a motor, seen at its shaft, and a sentence on how each number came about."""
 
-    def __init__(self, readings: Mapping[str, Reading], kinds: Mapping[str, Kind], lossy: Sequence[str] = ()) -> None:
+    def __init__(
+        self, readings: Mapping[str, Reading], kinds: Mapping[str, Kind], lossy: Sequence[str] = ()
+    ) -> None:
         """Begin with what is printed; torques at the output, and what is `lossy`, keep their place, by other names."""
         self.known: dict[str, Any] = {}
         self.how: dict[str, str] = {}
@@ -279,8 +366,9 @@ class _Derivation:
             if shaft != "motor" and power != 0:
                 if "gear_ratio" not in readings:
                     raise ValueError(
-                        f"datasheet.{name} = {printed!r} at the output: needs the gear; write gear_ratio = 30, or "
-                        "gear_ratio = 1 to describe the motor as it is seen at the output"
+                        f"datasheet.{name} = {printed!r} at the output: needs the gear; write"
+                        " gear_ratio = 30, or gear_ratio = 1 to describe the motor as it is seen"
+                        " at the output"
                     )
                 place = " at the output"
                 if name.endswith("torque") or name in lossy:
@@ -296,12 +384,18 @@ class _Derivation:
 
     def _filled(self, formula: str) -> str:
         """A formula with numbers and their units for names."""
-        return re.sub(NAME, lambda match: f"{self.known[match[0]]:.4g} {self._units[match[0]]}".strip(), formula)
+        return re.sub(
+            NAME,
+            lambda match: f"{self.known[match[0]]:.4g} {self._units[match[0]]}".strip(),
+            formula,
+        )
 
     def _follow(self, name: str, formula: str, value: Any, more: str = "") -> None:
         """What a quantity is by a formula, and in a sentence."""
         self.known[name] = value
-        self.how[name] = f"{name} = {formula} = {self._filled(formula)} = {self._filled(name)}{more}"
+        self.how[name] = (
+            f"{name} = {formula} = {self._filled(formula)} = {self._filled(name)}{more}"
+        )
 
     def named(self, formula: str) -> list[str]:
         """The quantities in a formula."""
@@ -321,13 +415,16 @@ class _Derivation:
     def apply_rules(self) -> None:
         """Apply the first rule that tells something new, until none does."""
         known = self.known
-        while new := next((rule for rule in RULES if rule[0] not in known and self._tells(rule[1])), None):
+        while new := next(
+            (rule for rule in RULES if rule[0] not in known and self._tells(rule[1])), None
+        ):
             quantity, formula = new
             try:
                 self._follow(quantity, formula, eval(compiled(formula), {}, known))
             except ZeroDivisionError as error:
                 raise ValueError(
-                    f"datasheet.{quantity}: {formula} = {self._filled(formula)} divides by 0; check these values"
+                    f"datasheet.{quantity}: {formula} = {self._filled(formula)} divides by 0; check"
+                    " these values"
                 ) from error
 
     def settle_gear(self, strict: bool, tolerance: float) -> None:
@@ -341,9 +438,9 @@ class _Derivation:
             return
         if strict and not _LEAST_EFFICIENCY <= efficiency <= 1.0 + tolerance:
             raise ValueError(
-                f"datasheet.gear_efficiency = {efficiency:.4g}: must be in [{_LEAST_EFFICIENCY:g}, 1], but "
-                f"{how['gear_efficiency']}; check the units of these values, the gear_ratio, and at which shaft they "
-                "are"
+                f"datasheet.gear_efficiency = {efficiency:.4g}: must be in [{_LEAST_EFFICIENCY:g},"
+                f" 1], but {how['gear_efficiency']}; check the units of these values, the"
+                " gear_ratio, and at which shaft they are"
             )
         if efficiency > 1.0:
             known["gear_efficiency"] = 1.0
@@ -353,7 +450,10 @@ class _Derivation:
         """Friction from the no-load current: all of it Coulomb's, unless one of the two kinds is printed."""
         known = self.known
         coulomb, viscous = "coulomb_friction" in known, "viscous_friction" in known
-        total, free = known["torque_constant"] * known["no_load_current"], "torque_constant * no_load_current"
+        total, free = (
+            known["torque_constant"] * known["no_load_current"],
+            "torque_constant * no_load_current",
+        )
         if known.get("gear_efficiency", 1.0) != 1.0:  # friction is behind the gear
             total, free = known["gear_efficiency"] * total, f"gear_efficiency * {free}"
         if not coulomb and not viscous:
@@ -366,10 +466,14 @@ class _Derivation:
             speed, more = known["no_load_speed"], ", not below 0"
             if coulomb:
                 value = max(0.0, (total - known["coulomb_friction"]) / speed)
-                self._follow("viscous_friction", f"({free} - coulomb_friction) / no_load_speed", value, more)
+                self._follow(
+                    "viscous_friction", f"({free} - coulomb_friction) / no_load_speed", value, more
+                )
             else:
                 value = max(0.0, total - known["viscous_friction"] * speed)
-                self._follow("coulomb_friction", f"{free} - viscous_friction * no_load_speed", value, more)
+                self._follow(
+                    "coulomb_friction", f"{free} - viscous_friction * no_load_speed", value, more
+                )
 
     def disagreements(self, printed: set[str]) -> tuple[Disagreement, ...]:
         """What is printed and also follows, otherwise; the worst first."""
@@ -379,5 +483,9 @@ class _Derivation:
                 value, computed = self.known[quantity], eval(compiled(formula), {}, self.known)
                 if abs(computed - value) > 1e-9 * abs(value):
                     text = f"{formula} = {self._filled(formula)}"
-                    found.append(Disagreement(quantity, value, computed, self._units[quantity], text, reading))
+                    found.append(
+                        Disagreement(
+                            quantity, value, computed, self._units[quantity], text, reading
+                        )
+                    )
         return tuple(sorted(found, key=lambda one: -abs(one.difference)))

@@ -6,14 +6,24 @@ import re
 from typing import Any, NamedTuple
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_PRINTED = re.compile(rf"\s*({_NUMBER}(?:\s*\*\s*{_NUMBER})*)\s*(.*?)\s*(?:\bat\s+(?:the\s+)?(motor|output))?\s*", re.S)
+_PRINTED = re.compile(
+    rf"\s*({_NUMBER}(?:\s*\*\s*{_NUMBER})*)\s*(.*?)\s*(?:\bat\s+(?:the\s+)?(motor|output))?\s*",
+    re.S,
+)
 _TIME, _ANGLE = rf"({_NUMBER})\s*(m?)s(?:ec|econds?)?\.?", rf"({_NUMBER})\s*(?:°|º|deg(?:rees?)?)"
 _TRANSIT = re.compile(
     rf"\s*(?:{_TIME}\s*(?:/|per)\s*{_ANGLE}|{_ANGLE}\s*(?:/|per)\s*{_TIME})\s*(?:\bat\s+(?:the\s+)?(motor|output))?\s*",
     re.I,
 )
 """How servos print their speed: the time for an angle, 0.16 s/60deg."""
-_ANGLES = {"radian", "degree", "turn", "revolution", "revolutions_per_minute", "revolutions_per_second"}
+_ANGLES = {
+    "radian",
+    "degree",
+    "turn",
+    "revolution",
+    "revolutions_per_minute",
+    "revolutions_per_second",
+}
 _SPELLINGS = (
     (r"([mkµμ]?N)([cm]?)m\b", r"\1*\2m"),  # mNm, Nm, Ncm
     (r"(k?g)[-.*· ]?([cm]?)m(?:\^2|\*\*2|²|2)", r"\1*\2m**2"),  # gcm2, kg.m²
@@ -36,7 +46,12 @@ _USUAL = {
     "N*m*s/rad": {"N*m*s/rad": 1.0, "N*m/(rad/s)": 1.0},
     "N*m/A": {"N*m/A": 1.0, "Nm/A": 1.0, "mN*m/A": 1e-3, "mNm/A": 1e-3, "Wb": 1.0},
     "V": {"V": 1.0},
-    "V*s/rad": {"V/(rad/s)": 1.0, "V/rpm": 9.549296585513721, "mV/rpm": 9.54929658551372e-3, "Wb": 1.0},
+    "V*s/rad": {
+        "V/(rad/s)": 1.0,
+        "V/rpm": 9.549296585513721,
+        "mV/rpm": 9.54929658551372e-3,
+        "Wb": 1.0,
+    },
     "degC": {"degC": 1.0},
     "kg*m^2": {"kg*m^2": 1.0, "gcm2": 1.0000000000000001e-07, "gcm²": 1.0000000000000001e-07},
     "ohm": {"ohm": 1.0, "mohm": 1e-3},
@@ -75,47 +90,65 @@ def read(name: str, printed: Any, kind: Kind) -> Reading:
     """A printed value in SI, such as `25.1 mN*m/A`, `2 * 0.3 ohm`, `2.42 N*m at output`; without a unit, a number too.
 
     Raises:
-        ValueError: it has no unit, a wrong or unknown one, more than one number, or it is not positive.
+        ValueError: it has no unit, a wrong or unknown one, more than one number, or it is not
+            positive.
     """
     if not kind.unit and isinstance(printed, int | float) and not isinstance(printed, bool):
         printed = str(printed)
     if not kind.unit and isinstance(printed, str):
         printed = re.sub(r"\s*:\s*1\s*$", "", printed)  # 30:1
-    if kind.unit == "rad/s" and isinstance(printed, str) and (transit := _TRANSIT.fullmatch(printed)):
-        time, milli, angle = transit.groups()[:3] if transit[1] else (transit[5], transit[6], transit[4])
+    if (
+        kind.unit == "rad/s"
+        and isinstance(printed, str)
+        and (transit := _TRANSIT.fullmatch(printed))
+    ):
+        time, milli, angle = (
+            transit.groups()[:3] if transit[1] else (transit[5], transit[6], transit[4])
+        )
         time, angle = float(time) * (1e-3 if milli else 1.0), math.radians(float(angle))
         if time > 0.0 and angle > 0.0:
             return Reading(angle / time, printed.strip(), transit[7])
     match = _PRINTED.fullmatch(printed) if isinstance(printed, str) else None
     remedy = f'write a number and its unit, such as {name} = "{kind.example}"'
     if match is None:
-        raise ValueError(f"datasheet.{name} = {printed!r}: must be a number with its unit, as text; {remedy}")
+        raise ValueError(
+            f"datasheet.{name} = {printed!r}: must be a number with its unit, as text; {remedy}"
+        )
     factors, unit, shaft = match.groups()
     if re.match(r"[,:\d](?!/min)", unit):
         raise ValueError(
-            f"datasheet.{name} = {printed!r}: must be one number, without a space or a comma in it; {remedy}"
+            f"datasheet.{name} = {printed!r}: must be one number, without a space or a comma in it;"
+            f" {remedy}"
         )
     if re.search(r"(?i)\be-?rpm", unit):
         raise ValueError(
-            f"datasheet.{name} = {printed!r}: electrical turns are not the rotor's; divide by the pole pairs, write rpm"
+            f"datasheet.{name} = {printed!r}: electrical turns are not the rotor's; divide by the"
+            " pole pairs, write rpm"
         )
     if not unit and kind.unit:
         raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
     try:
-        value = float(in_si(math.prod(map(float, factors.split("*"))), unit, kind.unit, weights=True))
+        value = float(
+            in_si(math.prod(map(float, factors.split("*"))), unit, kind.unit, weights=True)
+        )
     except ValueError as error:
         raise ValueError(f"datasheet.{name} = {printed!r}: {error}; {remedy}") from error
     bound = "a finite number >= 0" if kind.zero else "a finite number > 0"
     if not (math.isfinite(value) and (value > 0.0 or (value == 0.0 and kind.zero))):
-        raise ValueError(f"datasheet.{name} = {printed!r}: must be {bound}; give its magnitude, or leave the field out")
+        raise ValueError(
+            f"datasheet.{name} = {printed!r}: must be {bound}; give its magnitude, or leave the"
+            " field out"
+        )
     return Reading(value, f"{factors} {unit}".strip(), shaft)
 
 
-def in_si(number: Any, unit: str, kind: str | None, of: str = "this quantity", weights: bool = False) -> Any:
+def in_si(
+    number: Any, unit: str, kind: str | None, of: str = "this quantity", weights: bool = False
+) -> Any:
     """A number of a unit, as datasheets and loggers spell it, in the SI unit of its kind; of kind None in any.
 
-    With `weights` a mass stands for its weight where that alone makes sense: kg*cm, oz*in. The error says what is wrong
-    with it as a unit `of` something, and leaves the remedy to who asks.
+    With `weights` a mass stands for its weight where that alone makes sense: kg*cm, oz*in. The
+    error says what is wrong with it as a unit `of` something, and leaves the remedy to who asks.
     """
     if kind is not None and unit in (usual := _USUAL.get(kind, {})):
         return number * usual[unit]

@@ -39,7 +39,10 @@ SAYS: dict[str, tuple[str, str]] = {
     "motor": ("List off-the-shelf motors, look at one, design its loop, choose one.", "list"),
     "advise": ("Say whether to train through an actuator or do something else.", "weak pendulum"),
     "identify": ("Identify a motor from its bench logs.", "check swing.csv --columns time=t:s"),
-    "data": ("List or fetch measurements of real motors that others have published.", "dfki_pendulum"),
+    "data": (
+        "List or fetch measurements of real motors that others have published.",
+        "dfki_pendulum",
+    ),
     "cache": ("Show or clear the compiled code that is kept on disk.", "--clear"),
     "export": ("Take a policy out: ONNX, and all that it assumes.", "runs/mine --out mine"),
     "board": ("Run the exported C as a controller, or check its log.", "test mine"),
@@ -77,15 +80,18 @@ VERBS = {
 }
 """The words of every verb -> its module, which is imported when it is called, and its class."""
 _ABOUT = (
-    "Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor. Each verb has "
-    "its own --help; -h leaves descriptions out; --version; --traceback shows where an error arose."
+    "Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor."
+    " Each verb has its own --help; -h leaves descriptions out; --version; --traceback shows where"
+    " an error arose."
 )
 
 
 _FILES: dict[str, Callable[[Path], None]] = {
     **dict.fromkeys(("Evaluate", "Runs", "SimulateLog", "CompareLog", "RunBoard"), check_file),
     **dict.fromkeys(("Replay", "Report"), check_page),
-    "Render": lambda path: check_writable(path.parent),  # a film or a folder, which it checks itself
+    "Render": lambda path: check_writable(
+        path.parent
+    ),  # a film or a folder, which it checks itself
 }
 """Verbs whose `--out` is a file and no folder -> its check."""
 
@@ -103,7 +109,8 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: the command line without the program's name; None takes the process's.
 
     Returns:
-        Exit status: 0, 1 when a validation fails, 2 for bad input and whatever else fails, 130 after Ctrl-C, 141 if
+        Exit status: 0, 1 when a validation fails, 2 for bad input and whatever else fails, 130
+        after Ctrl-C, 141 if
             nobody reads on, 143 after SIGTERM.
     """
     if signal.getsignal(signal.SIGINT) is codrl_mj._stopped_early:
@@ -127,14 +134,20 @@ def _run(arguments: list[str], traced: bool) -> int:
             _help(words)
         rest = words[1 + name.count(" ") :]
         kind = find_verb(name)  # or the one that it makes for a line on which its flags depend
-        verb = parse(kind.for_line(rest) if hasattr(kind, "for_line") else kind, f"codrl-mj {name}", rest)
+        verb = parse(
+            kind.for_line(rest) if hasattr(kind, "for_line") else kind, f"codrl-mj {name}", rest
+        )
         _check_outputs(verb)
         return _answer(verb)
     except BrokenPipeError:  # whoever read the output has enough of it, such as head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left is flushed at exit
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # what is left is flushed at exit
         return 141
     except (Exception, KeyboardInterrupt) as error:
-        if (stopped_by := getattr(error, "signal_number", None)) is not None:  # of a TrainingStoppedError
+        if (
+            stopped_by := getattr(error, "signal_number", None)
+        ) is not None:  # of a TrainingStoppedError
             print(f"codrl-mj: {error}", file=sys.stderr)
             return int(128 + stopped_by)
         if traced:
@@ -151,10 +164,16 @@ def _run(arguments: list[str], traced: bool) -> int:
 def _help(words: Sequence[str]) -> NoReturn:
     """Say what verbs there are, all or those that begin with the first word; SystemExit."""
     about, group = _ABOUT, words[0] if words[:1] and words[0] in SAYS else ""
-    helped = {name: f"{says}\n\nExample: codrl-mj {name} {line}" for name, (says, line) in SAYS.items()}
+    helped = {
+        name: f"{says}\n\nExample: codrl-mj {name} {line}" for name, (says, line) in SAYS.items()
+    }
     if group:
         about = helped[group]
-        helped = {name.split()[1]: find_verb(name).__doc__ for name in VERBS if name.startswith(f"{group} ")}
+        helped = {
+            name.split()[1]: find_verb(name).__doc__
+            for name in VERBS
+            if name.startswith(f"{group} ")
+        }
     parse(helped, f"codrl-mj {group}".strip(), words[1:] if group else words, about)
     raise SystemExit
 
@@ -196,7 +215,9 @@ def _check_outputs(verb: Any) -> None:
 
 def _interrupted(error: BaseException | None) -> bool:
     """Whether Ctrl-C is what an error comes from: libraries that are just imported turn it into errors of their own."""
-    return error is not None and (isinstance(error, KeyboardInterrupt) or _interrupted(error.__context__))
+    return error is not None and (
+        isinstance(error, KeyboardInterrupt) or _interrupted(error.__context__)
+    )
 
 
 def _sentence(error: BaseException) -> str:
@@ -206,7 +227,9 @@ def _sentence(error: BaseException) -> str:
         return missing_module_message(error)
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
-    if isinstance(error, ValueError | OSError | RuntimeError | ArithmeticError | gymnasium.error.Error):
+    if isinstance(
+        error, ValueError | OSError | RuntimeError | ArithmeticError | gymnasium.error.Error
+    ):
         return text
     return f"{type(error).__name__}: {textwrap.shorten(text, 300)} (--traceback shows where)"
 
@@ -215,7 +238,8 @@ def _sentence(error: BaseException) -> str:
 def _engine_warnings() -> Iterator[None]:
     """Show MuJoCo's warnings as ours, each kind once, for it would write MUJOCO_LOG.TXT; not if somebody else has them.
 
-    That a simulation diverged is left out, which ends in an error, and what Gymnasium's model of a cheetah is old in.
+    That a simulation diverged is left out, which ends in an error, and what Gymnasium's model of a
+    cheetah is old in.
     """
     shown = {"Nan, Inf or huge value in ", "compiler attribute 'settotalmass' is deprecated"}
 

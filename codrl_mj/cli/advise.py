@@ -26,27 +26,35 @@ _DELIVERED = {
 class Advise:
     """Say what to do about an actuator: train on ideal forces, tune, randomise, train through it, or buy another.
 
-    A bench measures how late, how much and how noisily the actuator delivers the task's largest force; the study's
-    results say what policies lose by that (docs/advise.md). --measure trains some, on ideal forces, on random actuators
-    and through it, and tests them on it, which takes minutes; killed, it goes on where it was.
+    A bench measures how late, how much and how noisily the actuator delivers the task's largest
+    force; the study's results say what policies lose by that (docs/advise.md). --measure trains
+    some, on ideal forces, on random actuators and through it, and tests them on it, which takes
+    minutes; killed, it goes on where it was.
 
-    Example: codrl-mj advise maxon-ec45-flat-50w pendulum --gear-ratio 20, or codrl-mj advise paper cartpole --measure 5
+    Example: codrl-mj advise maxon-ec45-flat-50w pendulum --gear-ratio 20, or codrl-mj advise paper
+    cartpole --measure 5
     """
 
     actuator: Annotated[
         tyro.conf.Positional[str],
         tyro.conf.arg(
             metavar="ACTUATOR",
-            help="A motor of the catalogue (codrl-mj motor list), a variation of the paper's (paper, weak "
-            "...), a file with the fields of an actuator or a datasheet, or module:NAME of your own.",
+            help=(
+                "A motor of the catalogue (codrl-mj motor list), a variation of the paper's (paper,"
+                " weak ...), a file with the fields of an actuator or a datasheet, or module:NAME"
+                " of your own."
+            ),
         ),
     ]
     task: Annotated[
         tyro.conf.Positional[str],
         tyro.conf.arg(
             metavar="TASK",
-            help="One of the study's tasks, such as pendulum; with --measure also a task of your own (module:NAME), an "
-            "environment (HalfCheetah-v5), or the folder of a run, whose environment, agent and budget are taken.",
+            help=(
+                "One of the study's tasks, such as pendulum; with --measure also a task of your own"
+                " (module:NAME), an environment (HalfCheetah-v5), or the folder of a run, whose"
+                " environment, agent and budget are taken."
+            ),
         ),
     ]
     gear_ratio: float | None = None
@@ -73,8 +81,9 @@ class Advise:
         known = self.task in REFERENCE_SPEEDS
         if not known and self.measure is None:
             raise ValueError(
-                f"TASK = {self.task!r}: {did_you_mean(self.task, REFERENCE_SPEEDS)}The study knows "
-                f"{', '.join(REFERENCE_SPEEDS)}; for any other, and for a run, train and test: --measure 5"
+                f"TASK = {self.task!r}: {did_you_mean(self.task, REFERENCE_SPEEDS)}The study knows"
+                f" {', '.join(REFERENCE_SPEEDS)}; for any other, and for a run, train and test:"
+                " --measure 5"
             )
         if self.measure is not None and self.measure < 2:
             raise ValueError(f"--measure {self.measure}: must be >= 2, or there is no interval")
@@ -104,10 +113,14 @@ class Advise:
             compute(asked.grid, Workers(self.jobs))
             options = asked.judged(asked.grid.collect())
             measured = {"options": options, "verdict": decide(options)}
-            _print_options(f"Measured: {self.measure} policies of either kind, 50 episodes each", options)
+            _print_options(
+                f"Measured: {self.measure} policies of either kind, 50 episodes each", options
+            )
             more = " by more policies (--measure)" * (measured["verdict"] == "measure it")
             say(f"measured: {measured['verdict']}{more}")
-        units = {name: unit or "1" for name, (_, unit, _) in _DELIVERED.items()} | {"loss": "share of the task's span"}
+        units = {name: unit or "1" for name, (_, unit, _) in _DELIVERED.items()} | {
+            "loss": "share of the task's span"
+        }
         return 0, {"units": units, "advice": found, "measured": measured}
 
 
@@ -127,10 +140,22 @@ def _print(name: str, found: Any) -> None:
             tested = ", ".join(dose.removeprefix(f"{one.axis} ") for dose in one.between)
             lost = _lost(one.outcome, "at least " * one.beyond)
             rows.append((one.axis, f"{one.dose:.3g}", unit, *lost, tested))
-        title = "What policies lose by it that were trained on ideal forces [shares of the task's span]"
-        print_table(title, ("by", "dose", "unit", *_LOST, "tested at"), rows, right=("dose", *_LOST), whole=_LOST)
+        title = (
+            "What policies lose by it that were trained on ideal forces [shares of the task's span]"
+        )
+        print_table(
+            title,
+            ("by", "dose", "unit", *_LOST, "tested at"),
+            rows,
+            right=("dose", *_LOST),
+            whole=_LOST,
+        )
         _print_options("What is known of what can be done", found.options)
-    say(f"{found.verdict}: {found.reason}" if found.verdict else f"no verdict: {found.reason} (--measure 5)")
+    say(
+        f"{found.verdict}: {found.reason}"
+        if found.verdict
+        else f"no verdict: {found.reason} (--measure 5)"
+    )
 
 
 _LOST = "loss", "95 %", "fail", "success\nlost"
@@ -143,7 +168,9 @@ def _print_options(title: str, options: Any) -> None:
     for name in OPTIONS:
         if name in options:
             told = options[name].most or options[name].least
-            rows.append((name, *(_lost(told, options[name].bound) if told else ("not tested", "", "", ""))))
+            rows.append(
+                (name, *(_lost(told, options[name].bound) if told else ("not tested", "", "", "")))
+            )
     print_table(f"{title} [shares of the task's span]", ("what is done", *_LOST), rows, right=_LOST)
 
 

@@ -14,7 +14,9 @@ from codrl_mj.cli.subject import Source, Subject
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import command, differing
 
-Exported = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="What export wrote.")]
+Exported = Annotated[
+    tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="What export wrote.")
+]
 """Type of a verb's folder."""
 
 
@@ -22,8 +24,9 @@ Exported = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER",
 class Export:
     """Take a trained policy out of the simulator: as ONNX, as C99, and contract.json with all that it assumes.
 
-    The contract has names, units, order and range of observations and actions, rate, actuator, delays, what to do when
-    late, and 200 observations of episodes with the policy's actions, to be computed again elsewhere (docs/deploy.md).
+    The contract has names, units, order and range of observations and actions, rate, actuator,
+    delays, what to do when late, and 200 observations of episodes with the policy's actions, to be
+    computed again elsewhere (docs/deploy.md).
 
     Example: codrl-mj export runs/furuta-ppo-ideal-0 --out furuta
     """
@@ -32,8 +35,10 @@ class Export:
         tyro.conf.Positional[Path],
         tyro.conf.arg(
             metavar="RUN",
-            help="Run folder; or a folder with a policy alone, or a Stable-Baselines3 zip, which take --task and what "
-            "else they were trained with, such as --env.action voltage.",
+            help=(
+                "Run folder; or a folder with a policy alone, or a Stable-Baselines3 zip, which"
+                " take --task and what else they were trained with, such as --env.action voltage."
+            ),
         ),
     ]
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
@@ -47,8 +52,9 @@ class Export:
     float64: bool = False
     """Compute in double in the C, not in float."""
     limit: tuple[str, ...] = ()
-    """Largest safe size of observations, as arm_velocity=30 arm=1.8: beyond, the command is that for safety. An angle
-    that is observed as cos_arm and sin_arm is called arm."""
+    """Largest safe size of observations, as arm_velocity=30 arm=1.8: beyond, the command is that
+    for safety. An angle that is observed as cos_arm and sin_arm is called arm.
+    """
     board: str | None = None
     """What it is to fit: arduino-uno, arduino-due, nucleo-f446re, raspberry-pi-pico or teensy-4.1."""
 
@@ -66,31 +72,50 @@ class Export:
         contract = export(subject.policy, env, subject.agent, *given)
         rows = [
             (side, one["name"], one.get("unit") or "?", _bounds(one))
-            for side, several in (("observation", contract.observations), ("action", contract.actions))
+            for side, several in (
+                ("observation", contract.observations),
+                ("action", contract.actions),
+            )
             for one in several
         ]
-        print_table(f"{contract.task}, {subject.agent}, {contract.rate:g} Hz", ("", "name", "unit", "range"), rows)
+        print_table(
+            f"{contract.task}, {subject.agent}, {contract.rate:g} Hz",
+            ("", "name", "unit", "range"),
+            rows,
+        )
         weights = network_of(subject.policy).size
         if contract.controller["loop"] is None and contract.actuators:
-            why = f"this policy commands a {env.action}" if env.action != "force" else "the motors differ, or have none"
+            why = (
+                f"this policy commands a {env.action}"
+                if env.action != "force"
+                else "the motors differ, or have none"
+            )
             print(f"no current loop: {why}")
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
         names = env.task, *(family_name(type(one)) for one in env.actuators)
-        print(f"{written}; try: {command('board', 'test', self.out, trust=any(':' in name for name in names))}")
+        print(
+            f"{written}; try:"
+            f" {command('board', 'test', self.out, trust=any(':' in name for name in names))}"
+        )
         return 0
 
     def _environment(self: Any, subject: Subject) -> EnvConfig:
         """Return the environment of the training: a run says it itself, of a zip the flags do."""
         from codrl_mj.training.folder import load_config
 
-        known = subject.env if subject.run is None else load_config(subject.run, self.source.trust).evaluation_env
+        known = (
+            subject.env
+            if subject.run is None
+            else load_config(subject.run, self.source.trust).evaluation_env
+        )
         env = environment(self, subject.env.task, self.actuator_name, known)
         if subject.run is None:
             return env
         if other := differing(known.as_mapping(), env.as_mapping()):
             raise ValueError(
-                f"{', '.join(other)}: {subject.run} says what it was trained in, and that is exported: leave the flags "
-                "of the environment out; evaluate and board test take another --actuator"
+                f"{', '.join(other)}: {subject.run} says what it was trained in, and that is"
+                " exported: leave the flags of the environment out; evaluate and board test take"
+                " another --actuator"
             )
         return subject.env
 
@@ -106,8 +131,9 @@ def _bounds(entry: dict[str, Any]) -> str:
 class Test:
     """Run the exported C as the controller of the simulation, frame by frame, and the ONNX model beside it.
 
-    The C is compiled for this machine, or for a Cortex-M4F that QEMU emulates. The status is 1 where fewer than 95 % of
-    the returns are within 1 % of Python's, unless frames are spoilt or the motor is another on purpose.
+    The C is compiled for this machine, or for a Cortex-M4F that QEMU emulates. The status is 1
+    where fewer than 95 % of the returns are within 1 % of Python's, unless frames are spoilt or the
+    motor is another on purpose.
 
     Example: codrl-mj board test furuta --target cortex-m4f
     """
@@ -153,18 +179,35 @@ class Test:
             from codrl_mj.films.film import check_film
 
             check_film(self.film, 640, 480)
-        link = Link(self.lost, self.damaged, self.late, self.counts, self.current_bits, self.pwm_bits)
+        link = Link(
+            self.lost, self.damaged, self.late, self.counts, self.current_bits, self.pwm_bits
+        )
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task(f"on {self.target}", total=self.episodes)
-            given = self.folder, self.target, self.episodes, self.seed, link, self.loop, self.actuator
+            given = (
+                self.folder,
+                self.target,
+                self.episodes,
+                self.seed,
+                link,
+                self.loop,
+                self.actuator,
+            )
             done = board_test(*given, lambda ended: bar.update(row, completed=ended), self.trust)
         board, python = done.returns.mean(axis=0)
-        taken = "not counted here" if done.instructions is None else "{} and {}".format(*done.instructions)
+        taken = (
+            "not counted here"
+            if done.instructions is None
+            else "{} and {}".format(*done.instructions)
+        )
         rows = [
             ("return on the board, mean", f"{board:.6g}"),
             ("return in Python, mean", f"{python:.6g}"),
             ("episodes within 1 %", f"{done.alike} of {self.episodes}"),
-            ("frames: sent, refused, without an answer", f"{done.frames}, {done.refused}, {done.unanswered}"),
+            (
+                "frames: sent, refused, without an answer",
+                f"{done.frames}, {done.refused}, {done.unanswered}",
+            ),
             ("observations beyond the limits", f"{done.stopped}"),
             ("samples of the current loop", f"{done.samples or 'none'}"),
             ("frames and samples a second", f"{done.rate:.0f}"),
@@ -177,7 +220,9 @@ class Test:
         if self.film is not None:
             from codrl_mj.films.film import film, record
 
-            with Board(self.folder, self.target, link, self.seed, self.loop, self.actuator, self.trust) as driving:
+            with Board(
+                self.folder, self.target, link, self.seed, self.loop, self.actuator, self.trust
+            ) as driving:
                 env = driving.rig
                 panel = record(driving, env, self.seed, 640, 480)
             title = f"{env.task} by its C on {self.target}: return {panel.episode.total:.0f}"
@@ -190,14 +235,17 @@ class Test:
 class CheckLog:
     """Hold a log of a controller against the contract: names, order, units, rate, ranges, and every command.
 
-    The log has comma-separated columns `name:unit`: time:s, the observations in their order, the commands. The status
-    is 1 where commands are not the policy's, or came late.
+    The log has comma-separated columns `name:unit`: time:s, the observations in their order, the
+    commands. The status is 1 where commands are not the policy's, or came late.
 
     Example: codrl-mj board check furuta swing.csv
     """
 
     folder: Exported
-    log: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="LOG.csv", help="What the controller recorded.")]
+    log: Annotated[
+        tyro.conf.Positional[Path],
+        tyro.conf.arg(metavar="LOG.csv", help="What the controller recorded."),
+    ]
 
     def run(self) -> int:
         """Check it and print a table."""
@@ -210,7 +258,10 @@ class CheckLog:
             ("rows; rate", f"{found.rows}; {found.rate:.4g} Hz"),
             ("came late", str(found.late)),
             ("outside of what the policy saw", outside or "none"),
-            ("commands that are not the policy's", f"{found.differing}, by {found.worst:.2g} at most"),
+            (
+                "commands that are not the policy's",
+                f"{found.differing}, by {found.worst:.2g} at most",
+            ),
         ]
         print_table(f"{self.log} by the contract of {self.folder}", ("", ""), rows)
         return int(found.differing > 0 or found.late > 0)
@@ -220,8 +271,9 @@ class CheckLog:
 class RunBoard:
     """Watch a real board at a serial port, or tell it to drive, and log what it says, until any key.
 
-    It watches unless told to --drive: the board says its observations and which commands it would give. A motor moves
-    only with --drive, which ends by itself when something is wrong, and always ends with the command for safety.
+    It watches unless told to --drive: the board says its observations and which commands it would
+    give. A motor moves only with --drive, which ends by itself when something is wrong, and always
+    ends with the command for safety.
 
     Example: codrl-mj board run furuta --port /dev/ttyACM0 --out swing.csv
     """
@@ -260,19 +312,26 @@ class RunBoard:
 class CompareLog:
     """Simulate the commands of a rig's log, and hold what is observed then against what the rig did.
 
-    The simulation begins anew at what was observed after each window. An error far below "if nothing changed" says that
-    the simulation knows the rig; try --actuator with what identify wrote beside the motor of the training.
+    The simulation begins anew at what was observed after each window. An error far below "if
+    nothing changed" says that the simulation knows the rig; try --actuator with what identify wrote
+    beside the motor of the training.
 
-    Example: codrl-mj identify compare runs/furuta swing.csv --actuator motor/actuator.yaml --out compared.png
+    Example: codrl-mj identify compare runs/furuta swing.csv --actuator motor/actuator.yaml --out
+    compared.png
     """
 
     run_folder: Annotated[
         tyro.conf.Positional[Path],
-        tyro.conf.arg(metavar="RUN", help="Run folder, or what export wrote of it: the environment of the training."),
+        tyro.conf.arg(
+            metavar="RUN",
+            help="Run folder, or what export wrote of it: the environment of the training.",
+        ),
     ]
     log: Annotated[
         tyro.conf.Positional[Path],
-        tyro.conf.arg(metavar="LOG.csv", help="What the controller recorded, with columns name:unit."),
+        tyro.conf.arg(
+            metavar="LOG.csv", help="What the controller recorded, with columns name:unit."
+        ),
     ]
     actuator: str | None = None
     """Actuator in the simulation, by name or file; that of the training unless told otherwise."""
@@ -299,9 +358,16 @@ class CompareLog:
             else load_config(self.run_folder, self.trust).env
         )
         found = compare(env, self.log, self.window, self.actuator)
-        columns = list(zip(found.names, found.units, found.errors.tolist(), found.moved.tolist(), strict=True))
-        title = f"{self.log.name} through {self.actuator or env.through}: {len(found.starts)} windows"
-        rows = [(name, unit or "?", f"{error:.3g}", f"{moved:.3g}") for name, unit, error, moved in columns]
+        columns = list(
+            zip(found.names, found.units, found.errors.tolist(), found.moved.tolist(), strict=True)
+        )
+        title = (
+            f"{self.log.name} through {self.actuator or env.through}: {len(found.starts)} windows"
+        )
+        rows = [
+            (name, unit or "?", f"{error:.3g}", f"{moved:.3g}")
+            for name, unit, error, moved in columns
+        ]
         heads = "", "unit", "error (RMS)", "if nothing changed"
         print_table(title, heads, rows, right=heads[2:])
         if self.out is not None:

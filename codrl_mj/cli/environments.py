@@ -11,7 +11,16 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.actuators import FAMILIES, NAMED, Actuator, Ideal, Supply, actuator_over, find_family, identified_ranges
+from codrl_mj.actuators import (
+    FAMILIES,
+    NAMED,
+    Actuator,
+    Ideal,
+    Supply,
+    actuator_over,
+    find_family,
+    identified_ranges,
+)
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.worlds import find_world, is_world
 from codrl_mj.fields import field_docs, parts
@@ -19,7 +28,9 @@ from codrl_mj.own_code import read_yaml, trusting_files
 from codrl_mj.runs import CONFIG
 
 
-def flags(kind: type, defaults: Any = None, leaving_out: tuple[str, ...] = (), adding: Sequence[Any] = ()) -> Any:
+def flags(
+    kind: type, defaults: Any = None, leaving_out: tuple[str, ...] = (), adding: Sequence[Any] = ()
+) -> Any:
     """A dataclass, and those in its fields, without validation, which the verb makes up for, to make flags from.
 
     Without an instance with the defaults all are optional: set over what is known only later.
@@ -30,7 +41,9 @@ def flags(kind: type, defaults: Any = None, leaving_out: tuple[str, ...] = (), a
         hint, value = hints[name], getattr(defaults, name, None)
         setting: dict[str, Any] = {"help": docs.get(name, "")}
         if name == "gear_ratio" or (kind is Supply and name == "voltage"):
-            setting["aliases"] = (f"--{name.replace('_', '-')}",)  # as the verbs about motors call it
+            setting["aliases"] = (
+                f"--{name.replace('_', '-')}",
+            )  # as the verbs about motors call it
         if name in nested:
             hint = flags(nested[name], value)
             value = hint()
@@ -48,9 +61,10 @@ ActuatorName = Annotated[
         metavar="NAME",
         help="What the force goes through. "
         + "; ".join(f"{name}: {description}" for name, (description, _) in NAMED.items())
-        + f"; a family with its defaults: {', '.join(name for name in FAMILIES if name not in NAMED)}; "
-        "an off-the-shelf motor (codrl-mj motor list), or a TOML file with its datasheet; "
-        "a YAML file with the fields of an actuator; or module:NAME of your own.",
+        + "; a family with its defaults:"
+        f" {', '.join(name for name in FAMILIES if name not in NAMED)}; an off-the-shelf motor"
+        " (codrl-mj motor list), or a TOML file with its datasheet; a YAML file with the fields"
+        " of an actuator; or module:NAME of your own.",
     ),
 ]
 
@@ -58,14 +72,20 @@ Actuators = Annotated[
     tuple[str, ...],
     tyro.conf.arg(
         metavar="PATTERN=NAME",
-        help="What single motors go through, over --actuator: names as there, for the motors whose names, or whose "
-        "joints', the regular expression matches from beginning to end; patterns joined by & put one motor behind "
-        "several actuators of a joint. Or a YAML file of patterns and actuators, such as codrl-mj motor choose writes.",
+        help=(
+            "What single motors go through, over --actuator: names as there, for the motors whose"
+            " names, or whose joints', the regular expression matches from beginning to end;"
+            " patterns joined by & put one motor behind several actuators of a joint. Or a YAML"
+            " file of patterns and actuators, such as codrl-mj motor choose writes."
+        ),
     ),
 ]
 FAMILY = "actuator.family"
 """Flag that `scan` is asked for besides `actuator`."""
-_FAMILY_HELP = "Another family for the same motor: `servo` makes a motor or datasheet one that is asked for positions."
+_FAMILY_HELP = (
+    "Another family for the same motor: `servo` makes a motor or datasheet one that is asked for"
+    " positions."
+)
 AS_TRAINED, AS_CONFIGURED = "as-trained", "as-configured"
 """Instead of a name: the actuator that the policy was trained on; that of the configuration file or run."""
 
@@ -73,16 +93,22 @@ AS_TRAINED, AS_CONFIGURED = "as-trained", "as-configured"
 def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: str) -> list[Any]:
     """Flags for an environment: single fields over its actuators, all else that its world has, and its options.
 
-    The family of what `--actuator` names, or `--actuator.family`, has the fields, of the ideal one a current loop, to
-    be refused. What cannot be made is refused here: its flags would be unknown. `environment` reads what
-    `dataclasses.make_dataclass` makes; `chosen` is what `scan` found of the two.
+    The family of what `--actuator` names, or `--actuator.family`, has the fields, of the ideal one
+    a current loop, to be refused. What cannot be made is refused here: its flags would be unknown.
+    `environment` reads what `dataclasses.make_dataclass` makes; `chosen` is what `scan` found of
+    the two.
     """
     world, every = defaults.world, (field.name for field in dataclasses.fields(EnvConfig))
-    without = tuple(one for one in every if one not in world.fields or one in ("task", "actuator", "options"))
+    without = tuple(
+        one for one in every if one not in world.fields or one in ("task", "actuator", "options")
+    )
     options = [
         (
             option,
-            Annotated[hint, tyro.conf.arg(help=text, metavar="NAME=VALUE" if option == "options" else None)],
+            Annotated[
+                hint,
+                tyro.conf.arg(help=text, metavar="NAME=VALUE" if option == "options" else None),
+            ],
             value,
         )
         for option, hint, text, value in world.option_flags(defaults)
@@ -94,17 +120,25 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
             family = type(EnvConfig(task, name).actuators[0])
         except ValueError as error:
             several = f"; a file of patterns and actuators goes by --actuators {name}"
-            raise ValueError(f"{error}{several if str(name).endswith(('.yaml', '.yml')) else ''}") from None
+            raise ValueError(
+                f"{error}{several if str(name).endswith(('.yaml', '.yml')) else ''}"
+            ) from None
     family = family if wanted is None else find_family(wanted)
     as_family = (
         "family",
-        Annotated[str | None, tyro.conf.arg(metavar="FAMILY", help=_FAMILY_HELP, help_behavior_hint="")],
+        Annotated[
+            str | None, tyro.conf.arg(metavar="FAMILY", help=_FAMILY_HELP, help_behavior_hint="")
+        ],
         None,
     )
     over = flags(Actuator if issubclass(family, Ideal) else family, adding=[as_family])
     return [
         ("actuators", Actuators, ()),
-        ("actuator_fields", Annotated[over, tyro.conf.arg(name="actuator", help="Single fields over it.")], over()),
+        (
+            "actuator_fields",
+            Annotated[over, tyro.conf.arg(name="actuator", help="Single fields over it.")],
+            over(),
+        ),
         ("env", Annotated[env, tyro.conf.arg(help="The environment.")], env()),
     ]
 
@@ -147,12 +181,18 @@ def with_environment(verb: Any, arguments: Sequence[str]) -> Any:
 def environment(verb: Any, task: str, name: str, known: EnvConfig) -> EnvConfig:
     """The environment that a verb's flags, those of `environment_fields`, describe; `known` has their defaults."""
     as_known = name in (AS_TRAINED, AS_CONFIGURED)
-    if not as_known and known.randomize and tuple(verb.env.randomize or ()) == tuple(known.randomize):
-        drawn = [text.partition("=")[0] for text in known.randomize if not text.startswith("model.")]
+    if (
+        not as_known
+        and known.randomize
+        and tuple(verb.env.randomize or ()) == tuple(known.randomize)
+    ):
+        drawn = [
+            text.partition("=")[0] for text in known.randomize if not text.startswith("model.")
+        ]
         if drawn:
             warnings.warn(
-                f"{', '.join(drawn)} of {name} are drawn as in the training, whatever {name} has there: for {name} as "
-                "it is add --env.randomize None",
+                f"{', '.join(drawn)} of {name} are drawn as in the training, whatever {name} has"
+                f" there: for {name} as it is add --env.randomize None",
                 stacklevel=2,
             )
     world, flags = find_world(task), dict(vars(verb.env))
@@ -187,7 +227,9 @@ def _patterns(items: Sequence[str]) -> dict[str, Any]:
             except ValueError as error:
                 raise ValueError(f"--actuators {item}: {error}") from None
         else:
-            pattern, equals, name = item.rpartition("=")  # the last: a regular expression may have its own
+            pattern, equals, name = item.rpartition(
+                "="
+            )  # the last: a regular expression may have its own
             if not equals or not pattern:
                 raise ValueError(f"--actuators {item}: must be PATTERN=NAME, or a YAML file")
             found[pattern] = name
@@ -200,11 +242,13 @@ def _ranges(randomize: Any, actuator: str, patterns: Mapping[str, Any]) -> Any:
         return randomize
     others = [one for one in randomize if one != "identified"]
     named = {one.partition("=")[0].strip() for one in others}
-    for before, one in [(f"{pattern}:", str(one)) for pattern, one in patterns.items()] or [("", actuator)]:
+    for before, one in [(f"{pattern}:", str(one)) for pattern, one in patterns.items()] or [
+        ("", actuator)
+    ]:
         if Path(one).suffix not in (".yaml", ".yml", ".json"):
             raise ValueError(
-                f"--env.randomize identified: draws within the intervals of a file; --actuator is {one!r}, must be "
-                "one that `codrl-mj identify` wrote"
+                "--env.randomize identified: draws within the intervals of a file; --actuator is"
+                f" {one!r}, must be one that `codrl-mj identify` wrote"
             )
         ranges = {f"{before}{name}": text for name, text in identified_ranges(one).items()}
         others += [f"{name}={text}" for name, text in ranges.items() if name not in named]

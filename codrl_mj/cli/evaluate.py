@@ -21,8 +21,8 @@ from codrl_mj.runs.files import write_json
 class Evaluate:
     """Measure a trained policy on any actuator: return, success, torque tracking, voltage, energy, heat.
 
-    Of several motors there is a second table, with what each of them did. Several policies have a row each, every one
-    in the environment of its own training.
+    Of several motors there is a second table, with what each of them did. Several policies have a
+    row each, every one in the environment of its own training.
 
     Example: codrl-mj evaluate runs/cartpole-ppo-ideal-0 --actuator weaker --episodes 100
     """
@@ -31,7 +31,10 @@ class Evaluate:
         tyro.conf.Positional[tuple[Path, ...]],
         tyro.conf.arg(
             metavar="POLICY",
-            help="Run folders; or folders with a policy alone, or Stable-Baselines3 zips (see --trust).",
+            help=(
+                "Run folders; or folders with a policy alone, or Stable-Baselines3 zips (see"
+                " --trust)."
+            ),
         ),
     ]
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
@@ -51,12 +54,19 @@ class Evaluate:
     def run(self: Any) -> tuple[int, Any]:
         """Evaluate and print tables."""
         if not self.policies:
-            raise ValueError("POLICY: none was given; name a run folder or more, such as runs/cartpole-ppo-ideal-0")
+            raise ValueError(
+                "POLICY: none was given; name a run folder or more, such as"
+                " runs/cartpole-ppo-ideal-0"
+            )
         to_do, found = {}, {}
         for path, name in zip(self.policies, told_apart(self.policies), strict=True):
             verb = self
             if len(self.policies) > 1:  # each run has the defaults of its flags
-                line = [word for word in self.line if Path(word) == path or Path(word) not in self.policies]
+                line = [
+                    word
+                    for word in self.line
+                    if Path(word) == path or Path(word) not in self.policies
+                ]
                 verb = tyro.cli(with_environment(Evaluate, line), args=line)
             subject = verb.source.load(path)
             env = environment(verb, subject.env.task, verb.actuator_name, subject.env)
@@ -98,7 +108,9 @@ def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = Tru
         return
     for title, evaluation in evaluations.items():
         if evaluation.motors:
-            _print_measures(f"motors of {title}: energies of an episode", "motor", evaluation.motors, _OF_MOTORS)
+            _print_measures(
+                f"motors of {title}: energies of an episode", "motor", evaluation.motors, _OF_MOTORS
+            )
     names = list(evaluations)
     for begin in range(0, len(names), 3):
         _print_details({name: evaluations[name] for name in names[begin : begin + 3]})
@@ -108,12 +120,24 @@ Columns = Mapping[str, tuple[str, Callable[[Any], str]]]
 """Measure -> its column's header, and its value as text."""
 
 
-def _print_measures(title: str, what: str, rows: Mapping[str, Mapping[str, Any]], columns: Columns) -> None:
+def _print_measures(
+    title: str, what: str, rows: Mapping[str, Mapping[str, Any]], columns: Columns
+) -> None:
     """A row for each of some measured things, a column for each measure that one of them has."""
-    shown = {name: columns[name] for name in columns if any(row.get(name) is not None for row in rows.values())}
+    shown = {
+        name: columns[name]
+        for name in columns
+        if any(row.get(name) is not None for row in rows.values())
+    }
     heads = [head for head, _ in shown.values()]
     cells = [
-        (label, *("–" if row[name] is None else as_text(row[name]) for name, (_, as_text) in shown.items()))
+        (
+            label,
+            *(
+                "–" if row[name] is None else as_text(row[name])
+                for name, (_, as_text) in shown.items()
+            ),
+        )
         for label, row in rows.items()
     ]
     print_table(title, (what, *heads), cells, right=heads, whole=heads)
@@ -121,12 +145,18 @@ def _print_measures(title: str, what: str, rows: Mapping[str, Mapping[str, Any]]
 
 def _print_details(evaluations: Mapping[str, Evaluation]) -> None:
     """A column for each evaluation, a row for each measure that one of them has and that is not whole in the first."""
-    ends = [f"{e.terminated} task, {e.episodes - e.terminated} time limit" for e in evaluations.values()]
+    ends = [
+        f"{e.terminated} task, {e.episodes - e.terminated} time limit" for e in evaluations.values()
+    ]
     rows = [("episodes ended by", *ends)]
     for name, field in MEASURES.items():
         values = [getattr(evaluation, name) for evaluation in evaluations.values()]
         spread = any(isinstance(value, Interval | Quartiles) for value in values)
-        if name in _SHOWN or (name in _TELLING and not spread) or all(value is None for value in values):
+        if (
+            name in _SHOWN
+            or (name in _TELLING and not spread)
+            or all(value is None for value in values)
+        ):
             continue
         unit = field.metadata["unit"]
         if unit == "share":

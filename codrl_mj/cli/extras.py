@@ -11,7 +11,8 @@ _NOT_FOR_USERS = {"bench", "dev", "docs"}
 def missing_module_message(error: ModuleNotFoundError) -> str:
     """Return a sentence that names a missing module, and the extras of this package that install it.
 
-    The extras are read from the metadata of the installed package, so there is no second list of them.
+    The extras are read from the metadata of the installed package, so there is no second list of
+    them.
 
     Args:
         error: the error of an import, or of `importlib.metadata`.
@@ -22,9 +23,15 @@ def missing_module_message(error: ModuleNotFoundError) -> str:
     if not extras:
         return f"{' '.join(str(error).split())}: install what provides it"
     if len(extras) == 1:
-        return f"{module} is not installed. The extra '{extras[0]}' brings it: pip install 'codrl-mj[{extras[0]}]'"
+        return (
+            f"{module} is not installed. The extra '{extras[0]}' brings it: pip install"
+            f" 'codrl-mj[{extras[0]}]'"
+        )
     names = ", ".join(f"'{extra}'" for extra in extras)
-    return f"{module} is not installed. Each of the extras {names} brings it: pip install one, or 'codrl-mj[all]'"
+    return (
+        f"{module} is not installed. Each of the extras {names} brings it: pip install one, or"
+        " 'codrl-mj[all]'"
+    )
 
 
 def _extras_with(distribution: str) -> list[str]:
@@ -40,4 +47,8 @@ def _extras_with(distribution: str) -> list[str]:
         if name and extra and extra["name"] not in _NOT_FOR_USERS:
             extras.setdefault(extra["name"], set()).add(name[0].lower())
     having = {extra: names for extra, names in extras.items() if distribution in names}
-    return [extra for extra, names in having.items() if not any(other < names for other in having.values())]
+    return [
+        extra
+        for extra, names in having.items()
+        if not any(other < names for other in having.values())
+    ]

@@ -15,8 +15,10 @@ MotorName = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(
         metavar="NAME",
-        help="A motor of the catalogue (codrl-mj motor list), a TOML file with a datasheet, a YAML or JSON file with "
-        "the fields of a drive, or module:NAME of your own.",
+        help=(
+            "A motor of the catalogue (codrl-mj motor list), a TOML file with a datasheet, a YAML"
+            " or JSON file with the fields of a drive, or module:NAME of your own."
+        ),
     ),
 ]
 
@@ -35,7 +37,9 @@ class Changes:
     """Voltage of the supply [V]; the nominal one of a motor of the catalogue, or 24."""
     delayed: tyro.conf.FlagCreatePairsOff[bool] = False
     """The voltage that a sample computes is applied in the next one, as by most digital drives."""
-    not_delayed: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(name="no-delayed")] = False
+    not_delayed: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(name="no-delayed")] = (
+        False
+    )
     """It is applied at once, as by the drive of a motor of the catalogue."""
     max_current: float | None = None
     """Largest current [A] that the drive asks for."""
@@ -72,8 +76,9 @@ _LISTED = {
 class List:
     """List the motors of the catalogue, with what they can do at their nominal voltage.
 
-    Power is the most that the motor makes; the torque that it bears for ever, that of the blocked shaft and the speed
-    of the free one are those of the gear's output, past friction; kT and J are the motor's alone. --json has more.
+    Power is the most that the motor makes; the torque that it bears for ever, that of the blocked
+    shaft and the speed of the free one are those of the gear's output, past friction; kT and J are
+    the motor's alone. --json has more.
 
     Example: codrl-mj motor list --sort power
     """
@@ -92,12 +97,24 @@ class List:
         rows = catalogue_rows(self.sort)
         columns = [f"{head}\n{unit}" for head, unit, _ in _LISTED.values()]
         scales = [(name, scale) for name, (*_, scale) in _LISTED.items() if name != "name"]
-        cells = [(row["name"], *(number(row[name] and row[name] * scale) for name, scale in scales)) for row in rows]
-        print_table("Motors of the catalogue", columns, cells, right=columns[1:], whole=columns[:1], padding=(0, 0))
+        cells = [
+            (row["name"], *(number(row[name] and row[name] * scale) for name, scale in scales))
+            for row in rows
+        ]
+        print_table(
+            "Motors of the catalogue",
+            columns,
+            cells,
+            right=columns[1:],
+            whole=columns[:1],
+            padding=(0, 0),
+        )
         say("at: nominal voltage. –: not printed; a voltage is then taken as 24 V.")
         print("codrl-mj motor show NAME says where each number is from")
         kinds = {name: KINDS.get(OTHER_NAMES.get(name, name)) for name in rows[0]}
-        units = ABILITY_UNITS | {name: kind.unit for name, kind in kinds.items() if kind is not None}
+        units = ABILITY_UNITS | {
+            name: kind.unit for name, kind in kinds.items() if kind is not None
+        }
         return 0, {"units": units, "motors": rows}
 
 
@@ -105,9 +122,10 @@ class List:
 class Show:
     """Show a motor: every number with its unit and where it is from, and its torque-speed diagram.
 
-    The diagram has the voltage limit (torque falls with speed, because the back-EMF takes its share of the voltage),
-    the peak and the continuous current, at the output of the gear and past friction, in all four quadrants: what the
-    motor drives with, and what it brakes with. Shaded is what it can do for a moment.
+    The diagram has the voltage limit (torque falls with speed, because the back-EMF takes its share
+    of the voltage), the peak and the continuous current, at the output of the gear and past
+    friction, in all four quadrants: what the motor drives with, and what it brakes with. Shaded is
+    what it can do for a moment.
 
     Example: codrl-mj motor show maxon-ec45-flat-50w --gear-ratio 12 --out motor
     """
@@ -157,9 +175,13 @@ def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
         for row in found["numbers"]:
             how = row["how"].removeprefix(f"{row['name']} = ")
             estimated = "" if row["name"] not in found["estimated"] else " (estimated)"
-            rows.append((row["name"], number(row["value"], 4), row["unit"], how + estimated, row["places"]))
+            rows.append(
+                (row["name"], number(row["value"], 4), row["unit"], how + estimated, row["places"])
+            )
         columns = "number", "value", "unit", "how it came about", "source"
-        print_table("The motor, at its rotor", columns, rows, right=("value",), whole=("number", "unit"))
+        print_table(
+            "The motor, at its rotor", columns, rows, right=("value",), whole=("number", "unit")
+        )
     show("As it is simulated", "drive")
     if "numbers" in found:
         for kind, texts in (
@@ -173,25 +195,41 @@ def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
 
 
 _DESIGNED = (
-    *("rate\nkHz", "delay\nsamples", "kp\nV/A", "ki\nV/(A·s)", "gain\nmargin dB", "phase\nmargin °"),
+    *(
+        "rate\nkHz",
+        "delay\nsamples",
+        "kp\nV/A",
+        "ki\nV/(A·s)",
+        "gain\nmargin dB",
+        "phase\nmargin °",
+    ),
     *("cross-\nover Hz", "band-\nwidth Hz", "2 % in\nms", "over-\nshoot %"),
 )
 
 
-_LOOP_UNITS = {"gain_margin": "1", "phase_margin": "deg", "kp": "V/A", "ki": "V/(A*s)", "settling_time": "s"}
-_LOOP_UNITS |= dict.fromkeys(("sample_rate", "phase_crossover", "crossover", "bandwidth"), "Hz") | {"overshoot": "1"}
+_LOOP_UNITS = {
+    "gain_margin": "1",
+    "phase_margin": "deg",
+    "kp": "V/A",
+    "ki": "V/(A*s)",
+    "settling_time": "s",
+}
+_LOOP_UNITS |= dict.fromkeys(("sample_rate", "phase_crossover", "crossover", "bandwidth"), "Hz") | {
+    "overshoot": "1"
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class Design:
     """Design the current loop: gains, margins, bandwidth, settling time, with and without a sample of delay.
 
-    The PI controller's zero cancels the winding's pole, which leaves one choice, the bandwidth. More of it follows
-    faster and stands less delay: a phase margin of 60 degrees is comfortable, 30 rings, 0 oscillates. A digital drive
-    computes a voltage from one sample and applies it in the next (--delayed), and the hold costs half a sample more,
-    so bandwidth is bought with sample rate. Margins count the delay and the hold; bandwidth is where the closed loop's
-    gain is -3 dB, above the one designed for where a delayed loop swings; settling time and overshoot are those of a
-    small step of the simulated drive.
+    The PI controller's zero cancels the winding's pole, which leaves one choice, the bandwidth.
+    More of it follows faster and stands less delay: a phase margin of 60 degrees is comfortable, 30
+    rings, 0 oscillates. A digital drive computes a voltage from one sample and applies it in the
+    next (--delayed), and the hold costs half a sample more, so bandwidth is bought with sample
+    rate. Margins count the delay and the hold; bandwidth is where the closed loop's gain is -3 dB,
+    above the one designed for where a delayed loop swings; settling time and overshoot are those of
+    a small step of the simulated drive.
 
     Example: codrl-mj motor design quanser-qube-servo-2 --bandwidth 1000 --delayed --out motor
     """
@@ -209,7 +247,10 @@ class Design:
         drive = self.changes.drive(self.name)
         own, every = design(drive), designs(drive)
         late = "a sample of delay" if own.delayed else "no delay"
-        say(f"{self.name} at {own.sample_rate:g} Hz, {late}: kp = {own.kp:.6g} V/A, ki = {own.ki:.6g} V/(A·s)")
+        say(
+            f"{self.name} at {own.sample_rate:g} Hz, {late}: kp = {own.kp:.6g} V/A, ki ="
+            f" {own.ki:.6g} V/(A·s)"
+        )
         rows = []
         for (rate, delayed), one in every.items():
             mark = "*" if (rate, delayed) == (own.sample_rate, own.delayed) else ""
@@ -217,7 +258,10 @@ class Design:
             if isinstance(one, LoopDesign):
                 margin = 20.0 * math.log10(one.gain_margin)
                 rest = one.kp, one.ki, margin, one.phase_margin, one.crossover, one.bandwidth
-                row += [number(value, 4) for value in (*rest, 1e3 * one.settling_time, 100.0 * one.overshoot)]
+                row += [
+                    number(value, 4)
+                    for value in (*rest, 1e3 * one.settling_time, 100.0 * one.overshoot)
+                ]
             rows.append(row)
         print_table(
             "The loop at other rates, with and without delay (*: as asked for)",
@@ -227,7 +271,11 @@ class Design:
             padding=(0, 0),
         )
         impossible = dict.fromkeys(one for one in every.values() if isinstance(one, str))
-        say(*(f"not possible: {why}" for why in impossible), sampled_too_seldom(drive), drive.assumed)
+        say(
+            *(f"not possible: {why}" for why in impossible),
+            sampled_too_seldom(drive),
+            drive.assumed,
+        )
         if self.out is not None:
             from codrl_mj.pages.diagrams import bode_diagram
 
@@ -240,9 +288,10 @@ class Design:
 class Step:
     """Step the current: a small step, and one out of saturation with each kind of anti-windup.
 
-    For 20 ms more current is asked for than the voltage can make against the back-EMF, then less. Without anti-windup
-    the controller's integral has grown meanwhile and has to be worked off before the current comes down
-    (recovery); with clamping it stands still, with back-calculation it follows what was possible.
+    For 20 ms more current is asked for than the voltage can make against the back-EMF, then less.
+    Without anti-windup the controller's integral has grown meanwhile and has to be worked off
+    before the current comes down (recovery); with clamping it stands still, with back-calculation
+    it follows what was possible.
 
     Example: codrl-mj motor step quanser-qube-servo-2 --out motor
     """
@@ -262,16 +311,21 @@ class Step:
         small, constant = steps.small, drive.motor.torque_constant
         settled, amplitude = small.settling_time(), float(small.reference[-1])
         responses = steps.recoveries.items()
-        recoveries = {k: {"time": one.settling_time(0.05), "undershoot": one.undershoot} for k, one in responses}
+        recoveries = {
+            k: {"time": one.settling_time(0.05), "undershoot": one.undershoot}
+            for k, one in responses
+        }
         say(
-            f"{self.name}: a step to {amplitude:.4g} A, {constant * amplitude:.4g} N·m at the rotor, stays within "
-            f"2 % after {number(1e3 * settled, 4)} ms and overshoots by {100.0 * small.overshoot:.2g} %",
-            f"at {steps.speed:.4g} rad/s of the rotor it is asked for {steps.unreachable:.4g} A, out of reach, for "
-            f"20 ms, then {steps.reachable:.4g} A, which it reaches:",
+            f"{self.name}: a step to {amplitude:.4g} A, {constant * amplitude:.4g} N·m at the"
+            f" rotor, stays within 2 % after {number(1e3 * settled, 4)} ms and overshoots by"
+            f" {100.0 * small.overshoot:.2g} %",
+            f"at {steps.speed:.4g} rad/s of the rotor it is asked for {steps.unreachable:.4g} A,"
+            f" out of reach, for 20 ms, then {steps.reachable:.4g} A, which it reaches:",
         )
         columns = "anti-windup", "within 5 %\nafter ms", "undershoot\n%"
         rows = [
-            (kind, number(1e3 * one["time"]), number(100.0 * one["undershoot"], 2)) for kind, one in recoveries.items()
+            (kind, number(1e3 * one["time"]), number(100.0 * one["undershoot"], 2))
+            for kind, one in recoveries.items()
         ]
         print_table("", columns, rows, right=columns[1:])
         say(sampled_too_seldom(drive), drive.assumed)
@@ -282,9 +336,19 @@ class Step:
             save_plot(shown, self.out / "step.png")
         content = {"current": amplitude, "settling_time": settled, "overshoot": small.overshoot}
         asked = {name: getattr(steps, name) for name in ("speed", "unreachable", "reachable")}
-        units = {"current": "A", "settling_time": "s", "overshoot": "1", "speed": "rad/s", "unreachable": "A"}
+        units = {
+            "current": "A",
+            "settling_time": "s",
+            "overshoot": "1",
+            "speed": "rad/s",
+            "unreachable": "A",
+        }
         units |= {"reachable": "A", "time": "s", "undershoot": "1"}
-        return 0, {"units": units, "small": content, "saturated": {**asked, "recoveries": recoveries}}
+        return 0, {
+            "units": units,
+            "small": content,
+            "saturated": {**asked, "recoveries": recoveries},
+        }
 
 
 @dataclasses.dataclass(frozen=True)

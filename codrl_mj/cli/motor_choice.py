@@ -17,14 +17,19 @@ Asked = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(
         metavar="TASK|RUN",
-        help="A task, which a scripted controller drives; a run folder, trained on the ideal actuator, of a task or of "
-        "somebody else's environment; or an .npz file with the arrays time [s], torque [N*m] and speed [rad/s] of a "
-        "joint.",
+        help=(
+            "A task, which a scripted controller drives; a run folder, trained on the ideal"
+            " actuator, of a task or of somebody else's environment; or an .npz file with the"
+            " arrays time [s], torque [N*m] and speed [rad/s] of a joint."
+        ),
     ),
 ]
 OfMotor = Annotated[
     str | None,
-    tyro.conf.arg(metavar="NAME", help="Of a run with several motors, the one that is asked about, by its name."),
+    tyro.conf.arg(
+        metavar="NAME",
+        help="Of a run with several motors, the one that is asked about, by its name.",
+    ),
 ]
 
 
@@ -32,13 +37,17 @@ OfMotor = Annotated[
 class Feasible:
     """Ask whether a motor can do a task, before training; docs/motors.md.
 
-    The last line is surely, it depends (on what the datasheet lacks), try it, hopeless or surely not; exit status 1 for
-    the last two. Example: codrl-mj motor feasible maxon-ec45-flat-50w pendulum --gear-ratio 20
+    The last line is surely, it depends (on what the datasheet lacks), try it, hopeless or surely
+    not; exit status 1 for the last two. Example: codrl-mj motor feasible maxon-ec45-flat-50w
+    pendulum --gear-ratio 20
     """
 
     name: Annotated[
         tyro.conf.Positional[str],
-        tyro.conf.arg(metavar="NAME", help="A motor of the catalogue (codrl-mj motor list), or a file or module:NAME."),
+        tyro.conf.arg(
+            metavar="NAME",
+            help="A motor of the catalogue (codrl-mj motor list), or a file or module:NAME.",
+        ),
     ]
     asked: Asked
     gear_ratio: float | None = None
@@ -56,9 +65,18 @@ class Feasible:
     def run(self) -> tuple[int, Any]:
         """Print the bounds, and the verdict last."""
         from codrl_mj import drives
-        from codrl_mj.drives import demand_of, feasibility, find_drive, find_entry, geared, uncounted
+        from codrl_mj.drives import (
+            demand_of,
+            feasibility,
+            find_drive,
+            find_entry,
+            geared,
+            uncounted,
+        )
 
-        drive = find_drive(self.name, self.gear_ratio, voltage=self.voltage, max_current=self.max_current)
+        drive = find_drive(
+            self.name, self.gear_ratio, voltage=self.voltage, max_current=self.max_current
+        )
         entry = find_entry(self.name)
         continuous, unknown = entry.numbers.continuous_current if entry else None, uncounted(entry)
         demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
@@ -66,19 +84,28 @@ class Feasible:
         title = f"{self.name}, {_gear(drive, demand)}, {drive.voltage_limit:g} V: {demand.source}"
         rows: list[Any] = []
         for bound in found.bounds:
-            numbers = (f"{value:.4g}" if value == value else "unknown" for value in (bound.needed, bound.available))
+            numbers = (
+                f"{value:.4g}" if value == value else "unknown"
+                for value in (bound.needed, bound.available)
+            )
             mark = Text("holds", "green") if bound.holds else Text("fails", "red")
             mark = Text("unknown", "yellow") if bound.verdict == drives.DEPENDS else mark
             rows.append((bound.name, bound.formula, *numbers, bound.unit, mark, bound.verdict))
-        print_table(title, ("bound", "of", "needs", "has", "unit", "", "says"), rows, right=("needs", "has"))
+        print_table(
+            title, ("bound", "of", "needs", "has", "unit", "", "says"), rows, right=("needs", "has")
+        )
         asked, best = found.operation, geared(drive, demand, continuous)
-        at_best, (low, high) = feasibility(best, demand, continuous), drives.equal_gears(best, demand, continuous)
+        at_best, (low, high) = (
+            feasibility(best, demand, continuous),
+            drives.equal_gears(best, demand, continuous),
+        )
         say(
-            f"{asked.energy_drawn:.3g} J drawn and {asked.copper_loss:.3g} J of heat in an episode, "
-            f"{asked.rms_current:.3g} A rms; share of rotor and friction in the largest load: {_share(drive, asked)}",
+            f"{asked.energy_drawn:.3g} J drawn and {asked.copper_loss:.3g} J of heat in an episode,"
+            f" {asked.rms_current:.3g} A rms; share of rotor and friction in the largest load:"
+            f" {_share(drive, asked)}",
             *map(str, found.in_the_way),
-            f"best {_gear(best, demand)}: {at_best.verdict}, with a margin of {at_best.margin:.0%}; the verdict is the "
-            f"same from {low:.3g} to {high:.3g}",
+            f"best {_gear(best, demand)}: {at_best.verdict}, with a margin of {at_best.margin:.0%};"
+            f" the verdict is the same from {low:.3g} to {high:.3g}",
             _uncounted(unknown, found.why),
             drive.assumed,
         )
@@ -95,7 +122,11 @@ class Feasible:
             "margin": found.margin,
             "bounds": found.bounds,
             **_asked(asked),
-            "best": {"gear_ratio": 1.0 / best.arm_radius, "verdict": at_best.verdict, "margin": at_best.margin},
+            "best": {
+                "gear_ratio": 1.0 / best.arm_radius,
+                "verdict": at_best.verdict,
+                "margin": at_best.margin,
+            },
             "gear_ratios_as_good": (low, high),
             "unknown": unknown,
         }
@@ -106,23 +137,26 @@ class Feasible:
 class Choose:
     """Rank motors for a task, the smallest that does it first, and say what is wrong with the others.
 
-    Exit status 1 if none does it.
-    Motors of your own (files) or of the catalogue are named beside the task; without any the catalogue's are ranked.
-    Each keeps the gear of its datasheet, gets its best one if it has none, or is judged with each of --gears. It does
-    the task if motor feasible says surely, with the margin; smallest means by the most mechanical power at its supply.
-    A run with several motors gets one for each of them. With --out there is the file actuators.yaml, which train,
-    evaluate and render take as --actuators FILE.
+    Exit status 1 if none does it. Motors of your own (files) or of the catalogue are named beside
+    the task; without any the catalogue's are ranked. Each keeps the gear of its datasheet, gets its
+    best one if it has none, or is judged with each of --gears. It does the task if motor feasible
+    says surely, with the margin; smallest means by the most mechanical power at its supply. A run
+    with several motors gets one for each of them. With --out there is the file actuators.yaml,
+    which train, evaluate and render take as --actuators FILE.
 
-    Example: codrl-mj motor choose pendulum --top 5 --out chosen, codrl-mj motor choose a.toml b.toml pendulum,
-    codrl-mj motor choose a.toml pendulum --gears 6.25 18.75 30, or codrl-mj motor choose runs/Hopper_v5-sac-ideal-0
+    Example: codrl-mj motor choose pendulum --top 5 --out chosen, codrl-mj motor choose a.toml
+    b.toml pendulum, codrl-mj motor choose a.toml pendulum --gears 6.25 18.75 30, or codrl-mj motor
+    choose runs/Hopper_v5-sac-ideal-0
     """
 
     words: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
         tyro.conf.arg(
             metavar="[MOTOR ...] TASK|RUN",
-            help="Motors to rank, as for motor show, if not the whole catalogue; and a task, run folder or .npz file, "
-            "as for motor feasible.",
+            help=(
+                "Motors to rank, as for motor show, if not the whole catalogue; and a task, run"
+                " folder or .npz file, as for motor feasible."
+            ),
         ),
     ]
     top: int = 5
@@ -134,8 +168,10 @@ class Choose:
     max_current: float | None = None
     """Largest current that the drive gives [A]; each motor's own unless given."""
     gears: Annotated[tuple[float, ...], tyro.conf.arg(metavar="RATIO ...")] = ()
-    """Gears that can be bought, turns of the rotor for a turn of the joint, or radians for a metre: every motor is
-    judged with each of them. None: the motor's own gear, or its best one if it has none."""
+    """Gears that can be bought, turns of the rotor for a turn of the joint, or radians for a metre:
+    every motor is judged with each of them. None: the motor's own gear, or its best one if it has
+    none.
+    """
     motor: OfMotor = None
     out: Path | None = None
     """Folder for NAME.png of those shown: what was asked for over what the motor can do."""
@@ -152,18 +188,29 @@ class Choose:
         if self.top < 1:
             raise ValueError(f"--top {self.top}: must be >= 1")
         asked, motors = _told_apart(self.words)
-        one = self.motor is not None and {self.motor: demand_of(asked, trust=self.trust, motor=self.motor)}
+        one = self.motor is not None and {
+            self.motor: demand_of(asked, trust=self.trust, motor=self.motor)
+        }
         demands = one or demands_of(asked, trust=self.trust)
         settings = motors or None, self.voltage, self.margin, self.gears, self.max_current
         ranked = {name: choose(demand, *settings) for name, demand in demands.items()}
         alone = next(iter(demands.values())) if len(demands) == 1 else None
         if alone is not None and alone.model_gear != 1.0:
-            text = f"gears are at the joint; the model's actuator has one of {alone.model_gear:g}, which the motor's "
+            text = (
+                f"gears are at the joint; the model's actuator has one of {alone.model_gear:g},"
+                " which the motor's "
+            )
             say(f"{text}arm_radius {alone.model_gear:g} undoes")
-        told = [(name, choice) for name, found in ranked.items() for choice in (found if alone else found[:1])]
+        told = [
+            (name, choice)
+            for name, found in ranked.items()
+            for choice in (found if alone else found[:1])
+        ]
         shown = told[: self.top] if alone else told
         source = alone.source if alone else asked
-        _print_ranking(shown, demands, f"smallest that does it with {self.margin:.0%} left first: {source}")
+        _print_ranking(
+            shown, demands, f"smallest that does it with {self.margin:.0%} left first: {source}"
+        )
         for place, (name, choice) in enumerate(told):
             at = f"{choice.name} at {_gear(choice.drive, demands[name])}"
             unknown = _uncounted(choice.unknown, choice.lacks)
@@ -174,16 +221,23 @@ class Choose:
         if self.out is not None:
             gears = [f"-{choice.ratio:.4g}" if self.gears else "" for _, choice in shown]
             stems = [choice.name.removesuffix(Path(choice.name).suffix) for _, choice in shown]
-            motors = told_apart([Path(f"{stem}{gear}") for stem, gear in zip(stems, gears, strict=True)])
+            motors = told_apart(
+                [Path(f"{stem}{gear}") for stem, gear in zip(stems, gears, strict=True)]
+            )
             for (name, choice), motor in zip(shown, motors, strict=True):
                 picture = motor.replace("/", "-") if alone else name
                 _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")
             with writing(self.out / "actuators.yaml") as temporary:
-                chosen = actuators_of({name: (found[0], demands[name]) for name, found in ranked.items()})
+                chosen = actuators_of(
+                    {name: (found[0], demands[name]) for name, found in ranked.items()}
+                )
                 temporary.write_text(yaml.safe_dump(chosen, sort_keys=False))
             print(f"wrote {self.out / 'actuators.yaml'}")
             if short:
-                say(f"no motor surely does it with that margin; written is the nearest: {', '.join(short)}")
+                say(
+                    "no motor surely does it with that margin; written is the nearest:"
+                    f" {', '.join(short)}"
+                )
         content = [
             {
                 "drives": name or None,
@@ -219,7 +273,10 @@ _UNITS = {
 
 def _asked(found: Any) -> dict[str, Any]:
     """What an episode asks of a motor, by names in `_UNITS`."""
-    named = {name: getattr(found, name) for name in ("own_share", "rms_current", "energy_drawn", "copper_loss")}
+    named = {
+        name: getattr(found, name)
+        for name in ("own_share", "rms_current", "energy_drawn", "copper_loss")
+    }
     return {"peak_current": float(abs(found.current).max()), **named}
 
 
@@ -234,13 +291,19 @@ def _told_apart(words: Sequence[str]) -> tuple[str, list[str]]:
     from codrl_mj.catalogue import motor_names
     from codrl_mj.tasks import TASKS
 
-    asked = [word for word in words if word in TASKS or Path(word).suffix == ".npz" or Path(word).is_dir()]
+    asked = [
+        word
+        for word in words
+        if word in TASKS or Path(word).suffix == ".npz" or Path(word).is_dir()
+    ]
     files = ".toml", ".yaml", ".yml", ".json"
-    asked = asked or [word for word in words if not word.endswith(files) and word not in motor_names()]
+    asked = asked or [
+        word for word in words if not word.endswith(files) and word not in motor_names()
+    ]
     if len(asked) != 1:
         raise ValueError(
-            f"motor choose: {' and '.join(asked) or 'nothing'} to choose for: name one task, run folder or .npz file, "
-            "such as codrl-mj motor choose a.toml b.toml pendulum"
+            f"motor choose: {' and '.join(asked) or 'nothing'} to choose for: name one task, run"
+            " folder or .npz file, such as codrl-mj motor choose a.toml b.toml pendulum"
         )
     return asked[0], [word for word in words if word != asked[0]]
 
@@ -255,10 +318,21 @@ def _share(drive: Any, asked: Any) -> str:
     return f"{asked.own_share:.0%}" if drive.motor.rotor_inertia > 0.0 else "unknown"
 
 
-def _print_ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str) -> None:
+def _print_ranking(
+    choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str
+) -> None:
     """A row for each choice; of several motors, each with what it drives."""
     columns: tuple[str, ...]
-    columns = ("motor", "gear", "supply\n[V]", "power\n[W]", "verdict", "mar-\ngin", "rotor\nshare", "peak\n[A]")
+    columns = (
+        "motor",
+        "gear",
+        "supply\n[V]",
+        "power\n[W]",
+        "verdict",
+        "mar-\ngin",
+        "rotor\nshare",
+        "peak\n[A]",
+    )
     columns += ("rms\n[A]", "drawn\n[J]", "heat\n[J]")
     right, rows = [name for name in columns if name not in ("motor", "verdict")], []
     several = len(demands) > 1
@@ -271,11 +345,27 @@ def _print_ranking(choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any
         )
         row = (
             *((name, choice.name) if several else (choice.name,)),
-            *(gear.removeprefix("gear "), f"{choice.drive.voltage_limit:g}", f"{choice.power:,.0f}", does),
-            *(f"{choice.feasibility.margin:.0%}", _share(choice.drive, asked), *(f"{one:.3g}" for one in numbers)),
+            *(
+                gear.removeprefix("gear "),
+                f"{choice.drive.voltage_limit:g}",
+                f"{choice.power:,.0f}",
+                does,
+            ),
+            *(
+                f"{choice.feasibility.margin:.0%}",
+                _share(choice.drive, asked),
+                *(f"{one:.3g}" for one in numbers),
+            ),
         )
         rows.append(row)
-    print_table(title, (*(("drives",) if several else ()), *columns), rows, right, columns[1:], padding=(0, 0))
+    print_table(
+        title,
+        (*(("drives",) if several else ()), *columns),
+        rows,
+        right,
+        columns[1:],
+        padding=(0, 0),
+    )
 
 
 def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:

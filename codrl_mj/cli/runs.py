@@ -24,9 +24,9 @@ class Runs:
     Example: codrl-mj runs runs --sort return, or codrl-mj runs --compare runs/one runs/other
     """
 
-    root: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Folder to look in, with its subfolders.")] = Path(
-        "runs"
-    )
+    root: Annotated[
+        tyro.conf.Positional[Path], tyro.conf.arg(help="Folder to look in, with its subfolders.")
+    ] = Path("runs")
     sort: Literal[SORT_KEYS] = "name"  # type: ignore[valid-type]
     """Order of the list: names from A, numbers and times from the highest."""
     compare: tuple[Path, ...] = ()
@@ -39,7 +39,9 @@ class Runs:
         """List or compare."""
         content: Any
         if self.compare:
-            comparison = summaries.compare([summaries.read_run(path, str(path)) for path in self.compare])
+            comparison = summaries.compare(
+                [summaries.read_run(path, str(path)) for path in self.compare]
+            )
             _print_comparison(comparison)
             content = vars(comparison)
         else:
@@ -62,11 +64,18 @@ def _print_runs(runs: Sequence[RunSummary]) -> None:
     rows: list[Any] = []
     for run in runs:
         known = map(number, (run.task, run.agent, run.actuator, run.seed))
-        returns = ["–" if value is None else f"{value:.1f}" for value in (run.mean_return, run.evaluation_return)]
+        returns = [
+            "–" if value is None else f"{value:.1f}"
+            for value in (run.mean_return, run.evaluation_return)
+        ]
         steps = "–" if run.steps is None else f"{run.steps:,}"
         if run.steps is not None and run.total_steps and run.state == "unfinished":
             steps += f" ({run.steps / run.total_steps:.0%})"
-        time = "–" if run.modified is None else f"{datetime.datetime.fromtimestamp(run.modified):%m-%d %H:%M}"
+        time = (
+            "–"
+            if run.modified is None
+            else f"{datetime.datetime.fromtimestamp(run.modified):%m-%d %H:%M}"
+        )
         rows.append((run.name, *known, steps, Text(run.state, _STATES[run.state]), *returns, time))
     columns: tuple[str, ...] = ("run", "task", "agent", "actuator", *_OF_RUNS)
     if console().width < 100:  # without what the names of most runs have, and the time
@@ -74,7 +83,10 @@ def _print_runs(runs: Sequence[RunSummary]) -> None:
         columns = tuple(name for name in columns if name not in ("seed", "modified"))
     title = f"{len(runs)} run{'' if len(runs) == 1 else 's'}"
     print_table(title, columns, rows, right=_OF_RUNS, whole=columns[1:], padding=(0, 0))
-    say(*(f"{run.name}: damaged: {run.problem}" for run in runs if run.problem is not None), style="red")
+    say(
+        *(f"{run.name}: damaged: {run.problem}" for run in runs if run.problem is not None),
+        style="red",
+    )
 
 
 def _print_comparison(comparison: Comparison) -> None:
@@ -83,10 +95,16 @@ def _print_comparison(comparison: Comparison) -> None:
     for begin in range(0, len(comparison.names), some):
         chunk = slice(begin, begin + some)
         names = comparison.names[chunk]
-        for title, content in (("settings that differ", comparison.configuration), ("results", comparison.results)):
+        for title, content in (
+            ("settings that differ", comparison.configuration),
+            ("results", comparison.results),
+        ):
             if content:
                 units = comparison.units if title == "results" else {}
-                rows = [(one, units.get(one, ""), *map(number, values[chunk])) for one, values in content.items()]
+                rows = [
+                    (one, units.get(one, ""), *map(number, values[chunk]))
+                    for one, values in content.items()
+                ]
                 print_table(title, ("", "unit" if units else "", *names), rows, right=names)
 
 
@@ -94,13 +112,15 @@ def _print_comparison(comparison: Comparison) -> None:
 class Data:
     """List measurements of real motors that others have published, or fetch one of the sets: docs/identify.md.
 
-    Nothing of them comes with codrl_mj: files are fetched from where their authors have them, and checked by digest.
+    Nothing of them comes with codrl_mj: files are fetched from where their authors have them, and
+    checked by digest.
 
     Example: codrl-mj data dfki_pendulum
     """
 
     name: Annotated[
-        tyro.conf.Positional[str | None], tyro.conf.arg(metavar="NAME", help="The set to fetch; lists them without it.")
+        tyro.conf.Positional[str | None],
+        tyro.conf.arg(metavar="NAME", help="The set to fetch; lists them without it."),
     ] = None
     out: Path = Path("data")
     """Folder that gets bench_logs/NAME."""
@@ -118,7 +138,10 @@ class Data:
         for file in files:
             print(file)
         known = published()[self.name]
-        say(f"{known['licence']}, {known['source']} at {known['commit'][:10]}; columns: {known['columns']}")
+        say(
+            f"{known['licence']}, {known['source']} at {known['commit'][:10]}; columns:"
+            f" {known['columns']}"
+        )
         return 0
 
 
@@ -126,8 +149,8 @@ class Data:
 class Cache:
     """Show what compiled code is kept on disk, which saves seconds in every process after the first, or clear it.
 
-    CODRL_MJ_CACHE names another folder; CODRL_MJ_CACHE=off keeps nothing. Code that does not fit any more is never
-    used, so that nothing has to be cleared: docs/engine.md.
+    CODRL_MJ_CACHE names another folder; CODRL_MJ_CACHE=off keeps nothing. Code that does not fit
+    any more is never used, so that nothing has to be cleared: docs/engine.md.
 
     Example: codrl-mj cache --clear
     """
@@ -142,9 +165,16 @@ class Cache:
             return 0
         files = [*place.glob("*.code")]
         size = sum(file.stat().st_size for file in files) / 1e6
-        told = f"{len(files)} file{'' if len(files) == 1 else 's'}, {size:.1f} MB" if files else "empty"
+        told = (
+            f"{len(files)} file{'' if len(files) == 1 else 's'}, {size:.1f} MB"
+            if files
+            else "empty"
+        )
         if self.clear:
             for file in files:
                 file.unlink(missing_ok=True)
-        print(f"{place}: {told}" + (", cleared" if self.clear and files else f"; at most {kept.MOST / 1e6:.0f} MB"))
+        print(
+            f"{place}: {told}"
+            + (", cleared" if self.clear and files else f"; at most {kept.MOST / 1e6:.0f} MB")
+        )
         return 0

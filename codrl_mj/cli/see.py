@@ -30,8 +30,10 @@ class OfEpisodes:
     subject: Annotated[
         tyro.conf.Positional[str],
         tyro.conf.arg(
-            help="Run folder, a folder with a policy alone, or a Stable-Baselines3 zip (see --trust); or a task name "
-            "or an environment's id, for random actions."
+            help=(
+                "Run folder, a folder with a policy alone, or a Stable-Baselines3 zip (see"
+                " --trust); or a task name or an environment's id, for random actions."
+            )
         ),
     ]
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
@@ -46,7 +48,8 @@ class OfEpisodes:
 class Render(OfEpisodes):
     """Film one episode: the scene, and a strip of desired and actual torque and the voltage below it.
 
-    Example: codrl-mj render runs/cartpole-ppo-weaker-0 --out balance.mp4, or codrl-mj render cartpole (random actions).
+    Example: codrl-mj render runs/cartpole-ppo-weaker-0 --out balance.mp4, or codrl-mj render
+    cartpole (random actions).
     """
 
     out: Path = Path("episode.mp4")
@@ -71,7 +74,10 @@ class Render(OfEpisodes):
 
         check_film(self.out, self.width, self.height)
         if self.trajectory is not None and self.trajectory.suffix != ".npz":
-            raise ValueError(f"--trajectory {self.trajectory}: the suffix is {self.trajectory.suffix!r}, must be .npz")
+            raise ValueError(
+                f"--trajectory {self.trajectory}: the suffix is {self.trajectory.suffix!r}, must be"
+                " .npz"
+            )
         policy, env, title = policy_and_environment(self)
         view = self.width, self.height, self.camera, self.pretty
         panel = record(policy, env, self.seed, *view)
@@ -86,7 +92,12 @@ class Render(OfEpisodes):
         panel = dataclasses.replace(panel, title=title, motor=strip)
         with progress_bar("{task.completed}/{task.total} frames") as bar:
             row = bar.add_task("filming", total=None)
-            film([panel], self.out, *view, lambda done, total: bar.update(row, completed=done, total=total))
+            film(
+                [panel],
+                self.out,
+                *view,
+                lambda done, total: bar.update(row, completed=done, total=total),
+            )
         print(f"wrote {self.out}{_rank(self, env, episode)}")
         if self.trajectory is not None:
             save_episode(episode, self.trajectory)
@@ -98,7 +109,8 @@ class Render(OfEpisodes):
 class Replay(OfEpisodes):
     """Write one episode as a page in three dimensions: to be turned, scrubbed and played at any speed.
 
-    Example: codrl-mj replay runs/cartpole-ppo-weaker-0 --out balance.html, or codrl-mj replay Ant-v5 (random actions).
+    Example: codrl-mj replay runs/cartpole-ppo-weaker-0 --out balance.html, or codrl-mj replay
+    Ant-v5 (random actions).
     """
 
     out: Path = Path("episode.html")
@@ -113,7 +125,9 @@ class Replay(OfEpisodes):
         (episode,) = run_episodes(policy, env.make, 1, self.seed)
         title = f"{title}: return {episode.total:.0f}"
         write_replay(motion_of_episode(episode, env), self.out, title)
-        print(f"wrote {self.out} ({self.out.stat().st_size / 1e6:.1f} MB){_rank(self, env, episode)}")
+        print(
+            f"wrote {self.out} ({self.out.stat().st_size / 1e6:.1f} MB){_rank(self, env, episode)}"
+        )
         return 0
 
 
@@ -125,7 +139,11 @@ def _rank(verb: Any, env: Any, episode: Any) -> str:
     try:
         with trusting(verb.source.trust):
             same = EnvConfig.from_mapping(evaluation["conditions"]["env"]) == env
-    except (KeyError, TypeError, ValueError):  # no evaluation, or one that this version does not read
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+    ):  # no evaluation, or one that this version does not read
         same = False
     said = rank(evaluation, episode.total) if same else ""
     return f": seed {verb.seed}, return {episode.total:.3g}; {said}" if said else ""
@@ -153,10 +171,13 @@ class LiveView(OfEpisodes):
         if not 1 <= self.port <= 65535:
             raise ValueError(f"--port {self.port}: must be from 1 to 65535")
         if self.native:
-            if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            if sys.platform == "linux" and not (
+                os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+            ):
                 raise RuntimeError(
-                    "--native needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set: leave it out to see the "
-                    "simulation in a browser, also through ssh -L 8080:localhost:8080"
+                    "--native needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set:"
+                    " leave it out to see the simulation in a browser, also through ssh -L"
+                    " 8080:localhost:8080"
                 )
         else:
             try:
@@ -165,7 +186,8 @@ class LiveView(OfEpisodes):
                 if (error.name or "").split(".")[0] not in ("viser", "trimesh", "websockets"):
                     raise
                 raise RuntimeError(
-                    f"the live view needs the extra 'view' ({error}): pip install 'codrl-mj[view]'; or pass --native"
+                    f"the live view needs the extra 'view' ({error}): pip install 'codrl-mj[view]';"
+                    " or pass --native"
                 ) from None
         policy, env, title = policy_and_environment(self)
         session = Session(env, self._policies(policy, env), self.seed)
@@ -174,7 +196,10 @@ class LiveView(OfEpisodes):
             return 0
         shown = Browser(session, self.port, title)
         print(f"{shown.url} (on this machine alone; Ctrl-C ends it)", flush=True)
-        with stopping(signal.SIGINT) as asked, contextlib.closing(shown):  # not amidst what libraries have locked
+        with (
+            stopping(signal.SIGINT) as asked,
+            contextlib.closing(shown),
+        ):  # not amidst what libraries have locked
             shown.run(lambda: bool(asked))
         if asked:
             signal.raise_signal(signal.SIGINT)
@@ -188,7 +213,9 @@ class LiveView(OfEpisodes):
             found[self.source.which] = lambda: given
             if (subject / "best").is_dir():
                 other = "best" if self.source.which == "last" else "last"
-                found[other] = lambda: dataclasses.replace(self.source, which=other).load(subject).policy
+                found[other] = lambda: (
+                    dataclasses.replace(self.source, which=other).load(subject).policy
+                )
 
         def policy_of(run: Path) -> Any:
             loaded = self.source.load(run)
@@ -210,7 +237,9 @@ class Report:
     Example: codrl-mj report runs/cartpole-ppo-weaker-0 --out balance.html
     """
 
-    runs: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN", help="Run folders.")]
+    runs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN", help="Run folders.")
+    ]
     out: Path = Path("report.html")
     """The page to write, .html."""
     which: Literal["last", "best"] = "last"

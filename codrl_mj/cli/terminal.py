@@ -36,11 +36,16 @@ def print_table(
 ) -> None:
     """Print a table of texts, not markup, and rich's: some columns to the right, some never wrapped, rows in styles."""
     usual: dict[str, Any] = {"title_justify": "left", "box": box.SIMPLE_HEAD, "pad_edge": False}
-    table = Table(title=escape(title) or None, row_styles=styles, **{**usual, "padding": (0, 1, 0, 0), **look})
+    table = Table(
+        title=escape(title) or None, row_styles=styles, **{**usual, "padding": (0, 1, 0, 0), **look}
+    )
     for name in columns:
         justify: Any = "right" if name in right else "left"
         table.add_column(
-            escape(name), justify=justify, no_wrap=name in whole, overflow="ellipsis" if name in whole else "fold"
+            escape(name),
+            justify=justify,
+            no_wrap=name in whole,
+            overflow="ellipsis" if name in whole else "fold",
         )
     for row in rows:
         table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in row))
@@ -50,23 +55,34 @@ def print_table(
 def number(value: Any, digits: int = 3) -> str:
     """A number with so many digits, thousands whole; – where there is none; a mean or a median with its interval."""
     if isinstance(value, Mapping | tuple):
-        middle, *ends = (number(one, digits) for one in (value.values() if isinstance(value, Mapping) else value))
+        middle, *ends = (
+            number(one, digits) for one in (value.values() if isinstance(value, Mapping) else value)
+        )
         return f"{middle} [{', '.join(ends)}]"
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "–"
     if not isinstance(value, float):
         return str(value)
-    return f"{value:,.0f}" if 1e3 <= abs(float(f"{value:.{digits}g}")) < 1e6 else f"{value:.{digits}g}"
+    return (
+        f"{value:,.0f}" if 1e3 <= abs(float(f"{value:.{digits}g}")) < 1e6 else f"{value:.{digits}g}"
+    )
 
 
 def progress_bar(*columns: str) -> Any:
     """A progress display with the given text columns, the time elapsed and the time left.
 
-    Text is in one line; nothing while numbers in it are not known, such as of how many a count is. Where all is too
-    long for a line, the bar and the description give way. It goes to standard error, and nowhere where that is no
-    terminal.
+    Text is in one line; nothing while numbers in it are not known, such as of how many a count is.
+    Where all is too long for a line, the bar and the description give way. It goes to standard
+    error, and nowhere where that is no terminal.
     """
-    from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        Task,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     class Line(TextColumn):
         def render(self, task: Task) -> Text:

@@ -66,7 +66,10 @@ def train_verb(arguments: list[str]) -> Any:
                 agents,
                 tyro.conf.arg(
                     name="agent",
-                    help="Who learns. Its settings are below; `codrl-mj train TASK --agent NAME --help` shows others'.",
+                    help=(
+                        "Who learns. Its settings are below; `codrl-mj train TASK --agent NAME"
+                        " --help` shows others'."
+                    ),
                 ),
             ],
             base.agent.known_as(),
@@ -76,18 +79,31 @@ def train_verb(arguments: list[str]) -> Any:
             Annotated[
                 Literal[SETTINGS],  # type: ignore[valid-type]
                 tyro.conf.arg(
-                    help="Where the defaults come from: `default` (ours), `paper` (as printed), `repaired` (the "
-                    "paper's, with what makes it fail changed), or `fast` (ours, for the least time)."
+                    help=(
+                        "Where the defaults come from: `default` (ours), `paper` (as printed),"
+                        " `repaired` (the paper's, with what makes it fail changed), or `fast`"
+                        " (ours, for the least time)."
+                    )
                 ),
             ],
             chosen.settings if chosen.settings in SETTINGS else "default",
         ),
-        ("actuator_name", ActuatorName, AS_CONFIGURED if configured else base.env.world.default_actuator),
+        (
+            "actuator_name",
+            ActuatorName,
+            AS_CONFIGURED if configured else base.env.world.default_actuator,
+        ),
         *((field.name, field.type, field.default) for field in dataclasses.fields(rest)),
-        ("agent", Annotated[agent_flags, tyro.conf.arg(help="The agent's settings.")], agent_flags()),
+        (
+            "agent",
+            Annotated[agent_flags, tyro.conf.arg(help="The agent's settings.")],
+            agent_flags(),
+        ),
         *environment_fields(base.env, chosen, base.task),
     ]
-    verb: Any = dataclasses.make_dataclass("Train", fields, bases=(Train,), frozen=True, kw_only=True)
+    verb: Any = dataclasses.make_dataclass(
+        "Train", fields, bases=(Train,), frozen=True, kw_only=True
+    )
     verb.__doc__ = Train.__doc__
     verb.base = base
     return verb
@@ -97,27 +113,33 @@ def train_verb(arguments: list[str]) -> Any:
 class Train:
     """Train an agent through an actuator and leave a run folder.
 
-    The folder gets the resolved configuration, tables of episodes and progress, checkpoints, the best and the last
-    policy (safetensors and JSON), an evaluation and the learning curve. Ctrl-C writes a checkpoint and stops.
+    The folder gets the resolved configuration, tables of episodes and progress, checkpoints, the
+    best and the last policy (safetensors and JSON), an evaluation and the learning curve. Ctrl-C
+    writes a checkpoint and stops.
 
-    Example: codrl-mj train cartpole --actuator weaker --env.center-radius 0.1 --out runs/through-weaker, and after an
-    interruption codrl-mj train --resume runs/through-weaker. Environments of others go by their Gymnasium ids:
-    codrl-mj train HalfCheetah-v5 --actuators 'b.*=maxon-ec45-flat-50w' 'f.*=lag'
+    Example: codrl-mj train cartpole --actuator weaker --env.center-radius 0.1 --out
+    runs/through-weaker, and after an interruption codrl-mj train --resume runs/through-weaker.
+    Environments of others go by their Gymnasium ids: codrl-mj train HalfCheetah-v5 --actuators
+    'b.*=maxon-ec45-flat-50w' 'f.*=lag'
     """
 
     config: Path | None = None
-    """YAML file with the configuration: the keys are the flags' names, nested at the dots, with underscores (agent:
-    {name: ppo, gamma: 0.98}). Flags win over it. A run's config.json will do as well."""
+    """YAML file with the configuration: the keys are the flags' names, nested at the dots, with
+    underscores (agent: {name: ppo, gamma: 0.98}). Flags win over it. A run's config.json will do as
+    well.
+    """
     out: Path | None = None
     """Run folder to make; the default is runs/TASK-AGENT-ACTUATOR-SEED."""
     resume: Path | None = None
-    """Run folder of a training that was interrupted, to be continued from its last checkpoint to the result that it
-    would have had. Needs no other flags."""
+    """Run folder of a training that was interrupted, to be continued from its last checkpoint to
+    the result that it would have had. Needs no other flags.
+    """
     accept_changes: bool = False
     """Continue even if the code or a package is no longer the one that the run was started with."""
     trust: bool = False
-    """Import the module of an actuator of somebody's own that the file or the run names as module:NAME, which executes
-    whatever its author wants."""
+    """Import the module of an actuator of somebody's own that the file or the run names as
+    module:NAME, which executes whatever its author wants.
+    """
     tensorboard: bool = True
     """Write events for TensorBoard, if it is installed."""
     wandb: str | None = None
@@ -129,10 +151,18 @@ class Train:
         """Train, with a progress bar."""
         from codrl_mj.training import train
 
-        if find_world(self.task).reference != find_world(self.base.task).reference and self.resume is None:
-            raise ValueError(f"name the task before the flags, as in {command('train', self.task, '--seed', 1)}")
+        if (
+            find_world(self.task).reference != find_world(self.base.task).reference
+            and self.resume is None
+        ):
+            raise ValueError(
+                f"name the task before the flags, as in {command('train', self.task, '--seed', 1)}"
+            )
         if self.resume is not None and self.out not in (None, self.resume):
-            raise ValueError(f"--out {self.out}: a run continues in its own folder, {self.resume}: leave --out out")
+            raise ValueError(
+                f"--out {self.out}: a run continues in its own folder, {self.resume}: leave"
+                " --out out"
+            )
         config = dataclasses.replace(
             self.base,
             env=environment(self, self.base.task, self.actuator_name, self.base.env),
@@ -143,10 +173,18 @@ class Train:
                 if field.name not in _OWN_FLAGS
             },
         )
-        through = "-".join(dict.fromkeys(Path(each.rpartition("=")[2]).stem for each in self.actuators))
-        through = "-".join(filter(None, (through or self.actuator_name, self.actuator_fields.family)))
+        through = "-".join(
+            dict.fromkeys(Path(each.rpartition("=")[2]).stem for each in self.actuators)
+        )
+        through = "-".join(
+            filter(None, (through or self.actuator_name, self.actuator_fields.family))
+        )
         parts = config.task, config.agent.name, through, str(config.seed)
-        if self.resume is not None and finished(self.resume) and config == load_config(self.resume, self.trust):
+        if (
+            self.resume is not None
+            and finished(self.resume)
+            and config == load_config(self.resume, self.trust)
+        ):
             print(f"{self.resume} is finished already; {_following(self.resume)}")
             return 0, _came_to(self.resume) if self.as_json else None
         name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
@@ -174,7 +212,12 @@ def _following(run: Path) -> str:
 
 def _came_to(run: Path) -> dict[str, Any]:
     """What there is to say of a finished run."""
-    units = {"mean_return": "reward", "evaluation_return": "reward", "best.return": "reward", "seconds": "s"}
+    units = {
+        "mean_return": "reward",
+        "evaluation_return": "reward",
+        "best.return": "reward",
+        "seconds": "s",
+    }
     return {"run": run, **read_json(run / RESULT, "result of a run"), "units": units}
 
 
@@ -187,14 +230,22 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
         "end torque err {task.fields[torque_error]:.2g} N·m",
         "{task.fields[steps_per_second]:.0f}/s",
     )
-    with progress_bar(*(one for one in columns if "torque" not in one or Console(stderr=True).width >= 100)) as bar:
+    with progress_bar(
+        *(one for one in columns if "torque" not in one or Console(stderr=True).width >= 100)
+    ) as bar:
         rows = {}
         for name, (config, folder) in runs.items():
             unit, total = (
-                ("episodes", config.total_episodes) if config.total_episodes else ("steps", config.total_steps)
+                ("episodes", config.total_episodes)
+                if config.total_episodes
+                else ("steps", config.total_steps)
             )
             nothing: dict[str, Any] = dict.fromkeys(REPORT_COLUMNS, math.nan)
-            rows[bar.add_task(name, total=total, unit=unit, **nothing)] = folder / PROGRESS, unit, total or 0
+            rows[bar.add_task(name, total=total, unit=unit, **nothing)] = (
+                folder / PROGRESS,
+                unit,
+                total or 0,
+            )
 
         def show() -> None:
             for row, (file, unit, total) in rows.items():
@@ -224,8 +275,8 @@ def _base(chosen: argparse.Namespace) -> TrainConfig:
         begun = load_config(Path(chosen.resume), chosen.trust)
         if chosen.settings is not None or chosen.agent not in (None, begun.agent.known_as()):
             raise ValueError(
-                f"{chosen.resume} is a training of {begun.agent.name} and continues as it began: leave --agent and "
-                "--settings out"
+                f"{chosen.resume} is a training of {begun.agent.name} and continues as it began:"
+                " leave --agent and --settings out"
             )
         return begun
     if chosen.config is not None:
@@ -234,6 +285,12 @@ def _base(chosen: argparse.Namespace) -> TrainConfig:
     task = chosen.task or "cartpole"
     world = find_world(task)
     options = world.options_of({"options": chosen.options}) if chosen.options else {}
-    agent = chosen.agent if chosen.agent in AGENTS or ":" in str(chosen.agent) else default_agent(task, options)
+    agent = (
+        chosen.agent
+        if chosen.agent in AGENTS or ":" in str(chosen.agent)
+        else default_agent(task, options)
+    )
     settings = chosen.settings if chosen.settings in SETTINGS else "default"
-    return TrainConfig.preset(task, agent, settings, world.default_actuator, {"options": options} if options else {})
+    return TrainConfig.preset(
+        task, agent, settings, world.default_actuator, {"options": options} if options else {}
+    )

@@ -19,8 +19,8 @@ from codrl_mj.validation import GROUPS, Caught, Certificate, Check
 class Validate:
     """Certify that the port is right: every check by name, with its oracle, its tolerance and the worst case found.
 
-    The exit status is 1 if a check fails. Example: codrl-mj validate cartpole --out certificate, or codrl-mj validate
-    --model robot.xml (your own model with our motors).
+    The exit status is 1 if a check fails. Example: codrl-mj validate cartpole --out certificate, or
+    codrl-mj validate --model robot.xml (your own model with our motors).
     """
 
     tasks: Annotated[
@@ -31,8 +31,9 @@ class Validate:
         ),
     ] = ()
     model: Path | None = None
-    """MJCF file of your own with any number of our motors, motorised or behind the control callback, to be put through
-    the checks that apply to it."""
+    """MJCF file of your own with any number of our motors, motorised or behind the control
+    callback, to be put through the checks that apply to it.
+    """
     quick: bool = False
     """Fewer states, runs and step sizes: seconds instead of minutes."""
     mutations: bool = False
@@ -47,7 +48,9 @@ class Validate:
         from codrl_mj.validation.mutations import as_mapping, faulty, unfailed
 
         if self.model is not None and (self.tasks or self.mutations):
-            raise ValueError("--model: give a model or tasks, and no --mutations, which are faults of the tasks")
+            raise ValueError(
+                "--model: give a model or tasks, and no --mutations, which are faults of the tasks"
+            )
         tasks = faulty(self.tasks) if self.mutations else self.tasks or None
         model = None if self.model is None else own_model.load(self.model)
         with progress_bar("{task.completed}/{task.total}") as bar:
@@ -85,7 +88,9 @@ def print_checks(checks: Sequence[Check], title: str = "MuJoCo against Gymnasium
         numbers = f"{check.samples:,}", f"{check.worst:.1e}", f"{check.tolerance:.0e}", check.margin
         verdict = Text("passed", "green") if check.passed else Text("FAILED", "red")
         rows.append((check.name, *numbers, check.unit, verdict))
-    print_table(title, columns, rows, right=columns[1:5], whole=("worst", "allowed", "verdict"), **_FRAMED)
+    print_table(
+        title, columns, rows, right=columns[1:5], whole=("worst", "allowed", "verdict"), **_FRAMED
+    )
     for check in checks:
         if not check.passed:
             said = f". Whose fault: {check.fault}" if check.fault else ""
@@ -104,7 +109,8 @@ def print_certificate(certificate: Certificate) -> None:
     colour = "green" if certificate.passed else "red"
     form = " (the quick form)" if certificate.quick else ""
     console().print(
-        f"[{colour}]{certificate.verdict}[/] of {certificate.subject}{form}, in {certificate.seconds:.0f} s",
+        f"[{colour}]{certificate.verdict}[/] of {certificate.subject}{form}, in"
+        f" {certificate.seconds:.0f} s",
         highlight=False,
     )
 

@@ -20,7 +20,10 @@ from codrl_mj.fields import Checked, check_names, integer, real
 
 SOURCES = ("controller.c", "wire.c", "board.c")
 _STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-Wconversion"]
-_CORTEX = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 -ffreestanding -nostartfiles -DBOARD_SEMIHOSTING"
+_CORTEX = (
+    "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 -ffreestanding -nostartfiles"
+    " -DBOARD_SEMIHOSTING"
+)
 _QEMU = "qemu-system-arm -M mps2-an386 -display none -monitor none -serial none -semihosting-config"
 TARGETS = {  # name -> what it needs: program -> the package of Debian's that has it
     "host": {"cc": "gcc"},
@@ -48,7 +51,9 @@ class OnnxPolicy:
         """Load what `codrl_mj.deploy.export` wrote into a folder."""
         import onnxruntime
 
-        self.session = onnxruntime.InferenceSession(folder / "policy.onnx", providers=["CPUExecutionProvider"])
+        self.session = onnxruntime.InferenceSession(
+            folder / "policy.onnx", providers=["CPUExecutionProvider"]
+        )
         self.contract = Contract.read(folder)
 
     def predict(
@@ -80,13 +85,15 @@ class Link(Checked):
     late: float = real(0.0, least=0.0, most=1.0)
     """Share of the answers that come a period late: the command before holds."""
     counts: int = integer(0, least=0)
-    """Steps of the encoders in a turn, in which observed angles come; speeds [rad/s] come as differences of them over a
-    period. 0: exact."""
+    """Steps of the encoders in a turn, in which observed angles come; speeds [rad/s] come as
+    differences of them over a period. 0: exact.
+    """
     current_bits: int = integer(0, least=0)
     """Bits of the converter that measures the current, over the drive's range both ways. 0: exact."""
     pwm_bits: int = integer(0, least=0)
-    """Bits of the bridge's voltages, which a current loop or the policy itself commands, over the supply both ways. 0:
-    exact."""
+    """Bits of the bridge's voltages, which a current loop or the policy itself commands, over the
+    supply both ways. 0: exact.
+    """
 
     def encoded(self, contract: Contract, observation: np.ndarray) -> np.ndarray:
         """An observation (k,) as encoders with so many counts say it."""
@@ -106,8 +113,9 @@ class Link(Checked):
 class Board(contextlib.AbstractContextManager["Board"]):
     """A policy that is computed by the exported C, in a process of its own, and asked frame by frame in lock step.
 
-    A context manager: the process ends with it. Where no answer comes, the contract's command for safety is taken.
-    While it is open, motors of this process ask another, of the same C, for the voltage of each sample of their loop.
+    A context manager: the process ends with it. Where no answer comes, the contract's command for
+    safety is taken. While it is open, motors of this process ask another, of the same C, for the
+    voltage of each sample of their loop.
     """
 
     def __init__(
@@ -127,15 +135,18 @@ class Board(contextlib.AbstractContextManager["Board"]):
             target: `host`, or `cortex-m4f`, which QEMU emulates.
             link: what stands between; None for nothing.
             seed: of what is lost, damaged and late.
-            loop: whether the C closes the current loop too, where it has one; else the simulation does.
-            actuator: what the simulation has for motors, by name, file or object; None: those of the training.
-            trust: whether to import the modules that the contract names as task or actuator, which executes them.
+            loop: whether the C closes the current loop too, where it has one; else the simulation
+                does.
+            actuator: what the simulation has for motors, by name, file or object; None: those of
+                the training.
+            trust: whether to import the modules that the contract names as task or actuator, which
+                executes them.
 
         Raises:
             FileNotFoundError: the folder has no contract or no C.
-            ValueError: the target or actuator is unknown, the actuator is of another family than the C's loop, the
-                contract names a module and `trust` is false, or bits are given where the C neither closes a loop nor
-                commands a voltage, or has no limit for them.
+            ValueError: the target or actuator is unknown, the actuator is of another family than
+                the C's loop, the contract names a module and `trust` is false, or bits are given
+                where the C neither closes a loop nor commands a voltage, or has no limit for them.
             RuntimeError: a tool is missing (the message installs it), or the C does not compile.
         """
         if install := missing_tools(target):
@@ -148,17 +159,23 @@ class Board(contextlib.AbstractContextManager["Board"]):
         self.env = self.contract.environment(trust)
         trained = type(self.env.actuators[0])
         if actuator is not None:
-            self.env = dataclasses.replace(self.env, actuator=dict.fromkeys(self.env.driven, actuator), randomize=None)
+            self.env = dataclasses.replace(
+                self.env, actuator=dict.fromkeys(self.env.driven, actuator), randomize=None
+            )
         motor: Any = self.env.actuators[0]
         if self.loop is not None and type(motor) is not trained:
             raise ValueError(
-                f"actuator: a {type(motor).__name__}, must be a {trained.__name__}, for which the C closes the loop; "
-                "or let the simulation close it (--no-loop)"
+                f"actuator: a {type(motor).__name__}, must be a {trained.__name__}, for which the C"
+                " closes the loop; or let the simulation close it (--no-loop)"
             )
-        self.rig = self.env  # where the drive's limit of the current is the C's, which knows its own motor alone
+        self.rig = (
+            self.env
+        )  # where the drive's limit of the current is the C's, which knows its own motor alone
         if self.loop is not None and actuator is not None and self.loop["kind"] == "sampled":
             unlimited = motor.replaced({"controller.max_current": np.inf})
-            self.rig = dataclasses.replace(self.env, actuator=dict.fromkeys(self.env.driven, unlimited))
+            self.rig = dataclasses.replace(
+                self.env, actuator=dict.fromkeys(self.env.driven, unlimited)
+            )
         steps = self._converters()
         with contextlib.ExitStack() as held:
             process = held.enter_context(_running(folder, target))
@@ -167,7 +184,11 @@ class Board(contextlib.AbstractContextManager["Board"]):
             if self.loop is not None:
                 from codrl_mj.deploy.on_board import loop_on_board
 
-                amperes = motor.arm_radius / motor.motor.torque_constant if self.env.action == "force" else 1.0
+                amperes = (
+                    motor.arm_radius / motor.motor.torque_constant
+                    if self.env.action == "force"
+                    else 1.0
+                )
                 drive = held.enter_context(_running(folder, target, "BOARD_DRIVE"))
                 self._samples = held.enter_context(loop_on_board(trained, drive, amperes, *steps))
             self._held = held.pop_all()
@@ -180,7 +201,9 @@ class Board(contextlib.AbstractContextManager["Board"]):
         """Samples of the current loop that the board computed."""
         return int(self._samples[0])
 
-    def episodes(self, count: int, seed: int = 0, on_episode: Callable[[int], None] = lambda _: None) -> list[Episode]:
+    def episodes(
+        self, count: int, seed: int = 0, on_episode: Callable[[int], None] = lambda _: None
+    ) -> list[Episode]:
         """Whole episodes, one after another: a late answer leaves the command before, which is an episode's own.
 
         Args:
@@ -213,12 +236,18 @@ class Board(contextlib.AbstractContextManager["Board"]):
         """The command for an observation, in the units of the contract; that for safety if no good answer comes."""
         self.frames += 1
         observation = self.link.encoded(self.contract, observation)
-        frame = bytearray(self._wire.frame(self.frames, self.frames * round(1e6 / self.contract.rate), observation))
+        frame = bytearray(
+            self._wire.frame(
+                self.frames, self.frames * round(1e6 / self.contract.rate), observation
+            )
+        )
         if self.random.random() < self.link.lost:
             self.unanswered += 1
             return self._safe
         if self.random.random() < self.link.damaged:
-            bit = int(self.random.integers(16, 8 * len(frame)))  # its start is found again in any case
+            bit = int(
+                self.random.integers(16, 8 * len(frame))
+            )  # its start is found again in any case
             frame[bit // 8] ^= 1 << bit % 8
         answer = self._wire.asked(bytes(frame), self.frames)
         if answer is None:
@@ -227,7 +256,9 @@ class Board(contextlib.AbstractContextManager["Board"]):
         self.refused += bool(answer.status & REFUSED)
         self.stopped += bool(answer.status & BEYOND)
         command, self._last = (
-            (self._last, answer.command) if self.random.random() < self.link.late else (answer.command,) * 2
+            (self._last, answer.command)
+            if self.random.random() < self.link.late
+            else (answer.command,) * 2
         )
         return command
 
@@ -241,27 +272,42 @@ class Board(contextlib.AbstractContextManager["Board"]):
             return 0.0, 0.0
         voltage = self.loop["voltage"]
         if voltage is None:
-            raise ValueError("current_bits, pwm_bits: must be 0 where the drive's voltage has no limit")
-        (resistance, _) = self.env.actuators[0].winding or (1.0, 0.0)
+            raise ValueError(
+                "current_bits, pwm_bits: must be 0 where the drive's voltage has no limit"
+            )
+        resistance, _ = self.env.actuators[0].winding or (1.0, 0.0)
         ranges = self.loop["most"] or voltage / resistance, voltage
-        return tuple(2.0 * most / 2**bit if bit else 0.0 for most, bit in zip(ranges, bits, strict=True))  # type: ignore[return-value]
+        return tuple(
+            2.0 * most / 2**bit if bit else 0.0 for most, bit in zip(ranges, bits, strict=True)
+        )  # type: ignore[return-value]
 
     def _with_bridge(self) -> EnvConfig:
         """Return the environment with a bridge of `pwm_bits` behind a policy that commands the voltages itself."""
         motor, disturbances, link = self.env.actuators[0], self.env.disturbances, self.link
         refusals = {
-            "the simulation closes the current loop: leave --no-loop out": self.contract.controller["loop"] is not None,
-            "the C neither closes a current loop nor commands a voltage": self.env.action != "voltage",
+            "the simulation closes the current loop: leave --no-loop out": (
+                self.contract.controller["loop"] is not None
+            ),
+            "the C neither closes a current loop nor commands a voltage": (
+                self.env.action != "voltage"
+            ),
             "the policy commands voltages, and the C measures no current": link.current_bits > 0,
             "the motors differ": any(one != motor for one in self.env.actuators),
-            "the environment has a disturbances.command_quantum already": disturbances.command_quantum > 0.0,
+            "the environment has a disturbances.command_quantum already": (
+                disturbances.command_quantum > 0.0
+            ),
         }
         for reason in (text for text, applies in refusals.items() if applies):
-            raise ValueError(f"current_bits = {link.current_bits}, pwm_bits = {link.pwm_bits}: must be 0: {reason}")
+            raise ValueError(
+                f"current_bits = {link.current_bits}, pwm_bits = {link.pwm_bits}: must be 0:"
+                f" {reason}"
+            )
         command = motor.commands()["voltage"]
         step = 2.0 * float(command.limit or 0.0) / 2**link.pwm_bits
         quantum = step * command.torque_per_unit / command.actuator.arm_radius
-        return dataclasses.replace(self.env, disturbances=dataclasses.replace(disturbances, command_quantum=quantum))
+        return dataclasses.replace(
+            self.env, disturbances=dataclasses.replace(disturbances, command_quantum=quantum)
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -291,7 +337,10 @@ class BoardTest:
     def returns(self) -> np.ndarray:
         """Returns on the board and in Python, shape (episodes, 2)."""
         return np.array(
-            [[one.reward.sum() for one in pair] for pair in zip(self.on_board, self.in_python, strict=True)]
+            [
+                [one.reward.sum() for one in pair]
+                for pair in zip(self.on_board, self.in_python, strict=True)
+            ]
         )
 
     @property
@@ -337,7 +386,9 @@ def board_test(
         rate = (board.frames + board.samples) / (time.perf_counter() - began)
         counts = board.frames, board.samples, board.refused, board.stopped, board.unanswered
     in_python = run_episodes(OnnxPolicy(folder), env.make, episodes, seed)
-    return BoardTest(on_board, in_python, *counts, rate, instructions(folder) if target == "cortex-m4f" else None)
+    return BoardTest(
+        on_board, in_python, *counts, rate, instructions(folder) if target == "cortex-m4f" else None
+    )
 
 
 def instructions(folder: Path) -> tuple[int, int]:
@@ -348,7 +399,9 @@ def instructions(folder: Path) -> tuple[int, int]:
         RuntimeError: a tool is missing (the message installs it), or the C does not compile.
     """
     contract = Contract.read(folder)
-    rows = np.array(contract.golden["observations"], "<f8" if contract.controller["real"] == "double" else "<f4")
+    rows = np.array(
+        contract.golden["observations"], "<f8" if contract.controller["real"] == "double" else "<f4"
+    )
     with _running(folder, "cortex-m4f", "BOARD_TICKS") as process:
         got = process.communicate(rows.tobytes(), timeout=60)[0]
     most = np.frombuffer(got, "<u4").reshape(len(rows), 2).max(axis=0) * _TICK / NANOSECONDS
@@ -360,8 +413,12 @@ def _running(folder: Path, target: str, define: str = "") -> Iterator[Any]:
     """The program of a folder, compiled and running, with pipes."""
     with tempfile.TemporaryDirectory() as built:
         command = _build(folder, target, Path(built), [f"-D{define}"] if define else [])
-        counted = ["-icount", f"shift={NANOSECONDS.bit_length() - 1}"] if define == "BOARD_TICKS" else []
-        process = subprocess.Popen([*command, *counted], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        counted = (
+            ["-icount", f"shift={NANOSECONDS.bit_length() - 1}"] if define == "BOARD_TICKS" else []
+        )
+        process = subprocess.Popen(
+            [*command, *counted], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
         try:
             yield process
         finally:
@@ -372,8 +429,12 @@ def _running(folder: Path, target: str, define: str = "") -> Iterator[Any]:
 
 def _build(folder: Path, target: str, built: Path, flags: list[str]) -> list[str]:
     """The command that runs the controller of a folder, compiled into another."""
-    sources = [str(folder / name) for name in SOURCES if not flags or name != "wire.c"]  # frames, or samples
-    if gone := [name for name in (*sources, str(folder / "controller.h")) if not Path(name).is_file()]:
+    sources = [
+        str(folder / name) for name in SOURCES if not flags or name != "wire.c"
+    ]  # frames, or samples
+    if gone := [
+        name for name in (*sources, str(folder / "controller.h")) if not Path(name).is_file()
+    ]:
         raise FileNotFoundError(f"{gone[0]}: missing: write the folder with codrl-mj export")
     program = str(built / "controller")
     command = ["cc", *_STRICT, *flags, *sources, "-lm", "-o", program]
@@ -383,6 +444,12 @@ def _build(folder: Path, target: str, built: Path, flags: list[str]) -> list[str
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         lines = done.stderr.splitlines()
-        said = next((line for line in lines if "error:" in line or "undefined" in line), done.stderr.strip())
+        said = next(
+            (line for line in lines if "error:" in line or "undefined" in line), done.stderr.strip()
+        )
         raise RuntimeError(f"{folder}: its C does not compile: {said}")
-    return [program] if target == "host" else [*_QEMU.split(), "enable=on,target=native", "-kernel", program]
+    return (
+        [program]
+        if target == "host"
+        else [*_QEMU.split(), "enable=on,target=native", "-kernel", program]
+    )

@@ -13,14 +13,18 @@ from codrl_mj.fields import check_names
 from codrl_mj.own_code import asset_path
 
 FILES = ("controller.h", "controller.c", "main.c", "wire.h", "wire.c", "board.c", "board.ld")
-BOARDS = {  # name -> bytes of flash memory for a program, of RAM; whether an AVR: constants lie in RAM, a double has 4
+# name -> bytes of flash memory for a program, of RAM; whether an AVR: constants lie in RAM, a
+# double has 4
+BOARDS = {
     "arduino-uno": (32_256, 2_048, True),
     "arduino-due": (524_288, 98_304, False),
     "nucleo-f446re": (524_288, 131_072, False),
     "raspberry-pi-pico": (2_097_152, 270_336, False),
     "teensy-4.1": (8_126_464, 1_048_576, False),
 }
-CODE = 6_000  # bytes beside the weights: 2,400 with tanhf, of a Cortex-M4 by gcc -O2; the rest for start-up and drivers
+# bytes beside the weights: 2,400 with tanhf, of a Cortex-M4 by gcc -O2; the rest for start-up and
+# drivers
+CODE = 6_000
 
 
 def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
@@ -28,7 +32,8 @@ def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
 
     Args:
         network: the policy.
-        contract: what it assumes, with the golden numbers, the loop's, and in which numbers it computes.
+        contract: what it assumes, with the golden numbers, the loop's, and in which numbers it
+            computes.
 
     Returns:
         Name -> content, of `FILES`.
@@ -47,7 +52,9 @@ def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
 
     golden = contract.golden
     levels = contract.levels
-    if network.low is None and levels is None:  # an environment of others: what they stand for is their index
+    if (
+        network.low is None and levels is None
+    ):  # an environment of others: what they stand for is their index
         levels = np.arange(network.choices, dtype=np.float64)[:, None]
     known = {
         "version": codrl_mj.__version__,
@@ -56,7 +63,10 @@ def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
         "array": array,
         "exact": repr,
         "current": loop,
-        "clamps": levels is None or bool(loop and (loop["voltage"] is not None or loop["most"] is not None)),
+        "clamps": (
+            levels is None
+            or bool(loop and (loop["voltage"] is not None or loop["most"] is not None))
+        ),
         "kept": "error" if loop and loop["kind"] == "pid" else "pending",
         "servo": loop and loop["servo"],
         "tanh": f"tanh{suffix}",
@@ -77,10 +87,19 @@ def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
         "safe": contract.late["command"],
         "golden_seen": golden["observations"],
         "golden_commands": contract.commands(np.array(golden["actions"])),
-        **_sizes(network, 8 if double else 4, 3 * len(contract.actions) if levels is None else levels.size),
+        **_sizes(
+            network,
+            8 if double else 4,
+            3 * len(contract.actions) if levels is None else levels.size,
+        ),
     }
-    made = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
-    return {name: made.from_string(asset_path(f"deploy/{name}.jinja").read_text()).render(known) for name in FILES}
+    made = jinja2.Environment(
+        undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False
+    )
+    return {
+        name: made.from_string(asset_path(f"deploy/{name}.jinja").read_text()).render(known)
+        for name in FILES
+    }
 
 
 def _sizes(network: Network | Tiles, size: int, further: int) -> dict[str, int]:
@@ -100,12 +119,17 @@ def check_board(board: str, network: Network | Tiles, double: bool = False) -> N
     size = 8 if double else 4
     flash, ram, avr = BOARDS[board]
     if avr and double:
-        raise ValueError(f"board {board}: its double has 4 bytes: leave out --float64, or name a larger board")
-    needs = ("flash", size * network.size + CODE, flash), ("RAM", size * (network.working + avr * network.size), ram)
+        raise ValueError(
+            f"board {board}: its double has 4 bytes: leave out --float64, or name a larger board"
+        )
+    needs = (
+        ("flash", size * network.size + CODE, flash),
+        ("RAM", size * (network.working + avr * network.size), ram),
+    )
     smaller = "tilings 4" if isinstance(network, Tiles) else "hidden 32 32"
     for what, needed, there in needs:
         if needed > there:
             raise ValueError(
-                f"board {board}: the policy needs about {needed} bytes of {what}, must be at most {there}: train a "
-                f"smaller one (--agent.{smaller}), or name a larger board"
+                f"board {board}: the policy needs about {needed} bytes of {what}, must be at most"
+                f" {there}: train a smaller one (--agent.{smaller}), or name a larger board"
             )

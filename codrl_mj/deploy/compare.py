@@ -41,53 +41,82 @@ class RigComparison:
     @property
     def moved(self) -> np.ndarray:
         """The same of a guess that nothing changes within a window, shape (k,), to hold the errors against."""
-        held = self.logged[self.starts[np.searchsorted(self.starts, np.arange(len(self.time)), "right") - 1]]
+        held = self.logged[
+            self.starts[np.searchsorted(self.starts, np.arange(len(self.time)), "right") - 1]
+        ]
         return np.sqrt(((held - self.logged) ** 2).mean(axis=0))
 
 
-def compare(env: EnvConfig, path: Path, window: float | None = None, actuator: Any = None) -> RigComparison:
+def compare(
+    env: EnvConfig, path: Path, window: float | None = None, actuator: Any = None
+) -> RigComparison:
     """Simulate the commands of a log, and hold what is observed then against what was observed on the rig.
 
-    The simulation begins at the first row's observation and again after each window; its motors go on as they are, as
-    the commands before have left them. What is drawn in the environment is not drawn here. Another motor gets the
-    current that a command stood for in the training, as on the rig: a controller knows no other torque constant.
+    The simulation begins at the first row's observation and again after each window; its motors go
+    on as they are, as the commands before have left them. What is drawn in the environment is not
+    drawn here. Another motor gets the current that a command stood for in the training, as on the
+    rig: a controller knows no other torque constant.
 
     Args:
         env: the environment that the policy was trained in.
         path: the log, as `codrl_mj.deploy.log.read_rows` reads it.
-        window: time [s] from one beginning to the next; None: half a second, and at least ten rows of the log.
-        actuator: what the simulation has for motors, by name, file or object; None: those of the training.
+        window: time [s] from one beginning to the next; None: half a second, and at least ten rows
+            of the log.
+        actuator: what the simulation has for motors, by name, file or object; None: those of the
+            training.
 
     Raises:
         FileNotFoundError: there is no such log.
-        ValueError: the log cannot be read, or is of another environment; `window` is shorter than two rows; or the
-            environment's state does not follow from what is observed.
+        ValueError: the log cannot be read, or is of another environment; `window` is shorter than
+            two rows; or the environment's state does not follow from what is observed.
     """
     env = dataclasses.replace(env, randomize=None)
     interface = Interface.between(env)
     time, observed, commands = read_rows(interface, path)
-    length = max(round(WINDOW * interface.rate), ROWS) if window is None else round(window * interface.rate)
+    length = (
+        max(round(WINDOW * interface.rate), ROWS)
+        if window is None
+        else round(window * interface.rate)
+    )
     if window is not None and length < 2:
-        raise ValueError(f"window = {window:g} s: must be at least {2 / interface.rate:g} s, two rows of the log")
+        raise ValueError(
+            f"window = {window:g} s: must be at least {2 / interface.rate:g} s, two rows of the log"
+        )
     starts = np.arange(0, len(time), length)
-    tried = env if actuator is None else dataclasses.replace(env, actuator=dict.fromkeys(env.driven, actuator))
+    tried = (
+        env
+        if actuator is None
+        else dataclasses.replace(env, actuator=dict.fromkeys(env.driven, actuator))
+    )
     if env.action == "force" and interface.levels is None:
-        constants = [  # force at the joint for an ampere; 0 of what has no motor, whose commands stay as they are
-            [one.motor.torque_constant / one.arm_radius if hasattr(one, "motor") else 0.0 for one in side]
+        # force at the joint for an ampere; 0 of what has no motor, whose commands stay as they are
+        constants = [
+            [
+                one.motor.torque_constant / one.arm_radius if hasattr(one, "motor") else 0.0
+                for one in side
+            ]
             for side in (tried.actuators, env.actuators)
         ]
-        commands = commands * [new / old if new and old else 1.0 for new, old in zip(*constants, strict=True)]
-        most = np.array([one["most"] for one in interface.actions], dtype=float)  # None is nan: nothing is above it
+        commands = commands * [
+            new / old if new and old else 1.0 for new, old in zip(*constants, strict=True)
+        ]
+        most = np.array(
+            [one["most"] for one in interface.actions], dtype=float
+        )  # None is nan: nothing is above it
         if beyond := int((np.abs(commands) > most * (1.0 + 1e-6)).any(axis=1).sum()):
             raise ValueError(
-                f"{path}: in {beyond} rows the command, as this motor gives it, is beyond the simulation's bound, "
-                f"{most.tolist()}: simulate the motor of the training, or convert the log"
+                f"{path}: in {beyond} rows the command, as this motor gives it, is beyond the"
+                f" simulation's bound, {most.tolist()}: simulate the motor of the training, or"
+                " convert the log"
             )
     simulated, actions = [], interface.actions_of(commands)
     with contextlib.closing(tried.make()) as made:
         moved: Any = made.unwrapped
         if (task := getattr(moved, "task", None)) is None:
-            raise ValueError(f"{interface.task}: only a task's state can be set to what was observed: must be a task")
+            raise ValueError(
+                f"{interface.task}: only a task's state can be set to what was observed: must be a"
+                " task"
+            )
         observation, _ = moved.reset(seed=0)
         for row, action in enumerate(actions):
             if row in starts:
@@ -115,5 +144,8 @@ def _state_of(task: Any, observed: np.ndarray, near: np.ndarray) -> np.ndarray:
         other = least_squares(off, near + random.uniform(-np.pi, np.pi, len(near)))
         found = other if other.cost < found.cost else found
     if np.linalg.matrix_rank(found.jac, tol=1e-6) < len(near):
-        raise ValueError(f"{task.name}: its state does not follow from its observation: the rig cannot be simulated")
+        raise ValueError(
+            f"{task.name}: its state does not follow from its observation: the rig cannot be"
+            " simulated"
+        )
     return np.asarray(found.x)

@@ -1,7 +1,7 @@
 """What a policy and its controller assume of each other, in one file: `contract.json`.
 
-A policy on a board fails quietly where an angle comes in degrees, two entries change places or the loop runs at another
-rate. So all of it is written down, and a reader refuses what differs.
+A policy on a board fails quietly where an angle comes in degrees, two entries change places or the
+loop runs at another rate. So all of it is written down, and a reader refuses what differs.
 """
 
 import contextlib
@@ -39,21 +39,27 @@ _PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "stable-baselines3", "t
 
 def _step_duration(env: Any) -> float:
     """Return the simulated time [s] between two actions: a task's own, else measured: a `dt` knows no wrappers."""
-    recorder, actions, durations = env.get_wrapper_attr("recorder"), copy.deepcopy(env.action_space), list[float]()
+    recorder, actions, durations = (
+        env.get_wrapper_attr("recorder"),
+        copy.deepcopy(env.action_space),
+        list[float](),
+    )
     if recorder is env.unwrapped:
         return float(recorder.step_duration)
     actions.seed(0)
     env.reset(seed=0)
     for _ in range(5):
         *_, terminated, truncated, _ = env.step(actions.sample())
-        if not durations or not (terminated or truncated):  # the last step of an episode may be cut short
+        if not durations or not (
+            terminated or truncated
+        ):  # the last step of an episode may be cut short
             durations.append(recorder.step_duration)
         if terminated or truncated:
             break
     if min(durations) <= 0.0 or not np.allclose(durations, durations[0], rtol=1e-6, atol=0.0):
         raise ValueError(
-            f"rate: the environment's first steps take {durations} s: must be equal and above 0, as a controller has "
-            "one rate"
+            f"rate: the environment's first steps take {durations} s: must be equal and above 0, as"
+            " a controller has one rate"
         )
     return durations[0]
 
@@ -67,9 +73,10 @@ class Interface:
     rate: float
     """Actions a second [Hz]."""
     observations: list[dict[str, Any]]
-    """Entries of an observation in their order: `name`, `unit`, bounds `least` and `most`; of a contract's also `scale`
-    and `offset` before the first layer (done by the policy itself), and `seen`, the least and the most of the golden
-    episodes."""
+    """Entries of an observation in their order: `name`, `unit`, bounds `least` and `most`; of a
+    contract's also `scale` and `offset` before the first layer (done by the policy itself), and
+    `seen`, the least and the most of the golden episodes.
+    """
     actions: list[dict[str, Any]]
     """Entries of an action, likewise; a discrete one has the `levels` that its indices stand for."""
 
@@ -92,39 +99,57 @@ class Interface:
 
     def actions_of(self, commands: np.ndarray) -> np.ndarray:
         """The actions (n, m) for commands (n, m), or the indices (n,) of the levels that are nearest to them."""
-        if (levels := self.levels) is None:  # of a discrete action of others nobody knows more than the index
-            return commands.astype(np.float32) if "least" in self.actions[0] else commands[:, 0].round().astype(int)
+        if (
+            levels := self.levels
+        ) is None:  # of a discrete action of others nobody knows more than the index
+            return (
+                commands.astype(np.float32)
+                if "least" in self.actions[0]
+                else commands[:, 0].round().astype(int)
+            )
         return np.abs(commands[:, None, :] - levels).sum(axis=2).argmin(axis=1)
 
-    def admit(self, observations: Sequence[tuple[str, str | None]], rate: float | None = None) -> None:
+    def admit(
+        self, observations: Sequence[tuple[str, str | None]], rate: float | None = None
+    ) -> None:
         """Refuse observations that are not those of the policy.
 
         Args:
-            observations: name and unit of each entry, in the order in which they come; a unit of None is not compared.
+            observations: name and unit of each entry, in the order in which they come; a unit of
+                None is not compared.
             rate: how many come in a second [Hz]; None is not compared.
 
         Raises:
-            ValueError: entries are missing, unknown, in another order or unit, or come at another rate.
+            ValueError: entries are missing, unknown, in another order or unit, or come at another
+                rate.
         """
-        names, given = [one["name"] for one in self.observations], [name for name, _ in observations]
+        names, given = (
+            [one["name"] for one in self.observations],
+            [name for name, _ in observations],
+        )
         if unknown := [name for name in given if name not in names]:
             raise ValueError(
-                f"observation {unknown[0]!r}: the policy knows none; {did_you_mean(unknown[0], names)}it has "
-                f"{', '.join(names)}"
+                f"observation {unknown[0]!r}: the policy knows none;"
+                f" {did_you_mean(unknown[0], names)}it has {', '.join(names)}"
             )
         if missing := [name for name in names if name not in given]:
-            raise ValueError(f"observations: {', '.join(missing)} missing: the policy takes {', '.join(names)}")
+            raise ValueError(
+                f"observations: {', '.join(missing)} missing: the policy takes {', '.join(names)}"
+            )
         if given != names:
             raise ValueError(
-                f"observations: their order is {', '.join(given)}, must be {', '.join(names)}: reorder the columns"
+                f"observations: their order is {', '.join(given)}, must be {', '.join(names)}:"
+                " reorder the columns"
             )
         for (name, unit), one in zip(observations, self.observations, strict=True):
             if unit is not None and one["unit"] is not None and unit != one["unit"]:
-                raise ValueError(f"observation {name!r}: its unit is {unit}, must be {one['unit']}: convert it")
+                raise ValueError(
+                    f"observation {name!r}: its unit is {unit}, must be {one['unit']}: convert it"
+                )
         if rate is not None and abs(rate / self.rate - 1.0) > 0.01:
             raise ValueError(
-                f"rate: observations come at {rate:.4g} Hz, must be {self.rate:.4g} Hz, at which the policy was "
-                "trained: it knows no other"
+                f"rate: observations come at {rate:.4g} Hz, must be {self.rate:.4g} Hz, at which"
+                " the policy was trained: it knows no other"
             )
 
 
@@ -166,14 +191,16 @@ class Contract(Interface):
             policy: as `codrl_mj.runs.policies.load_policy` returns it.
             env: what it was trained in.
             agent: the name of what trained it.
-            episodes: how many are run for golden numbers, each to its end; as many more if they end too soon.
+            episodes: how many are run for golden numbers, each to its end; as many more if they end
+                too soon.
             seed: of the first of them.
-            limits: observation -> largest size of it that is safe, in its unit; of an angle that is observed as
-                `cos_NAME` and `sin_NAME` by its NAME, below pi.
+            limits: observation -> largest size of it that is safe, in its unit; of an angle that is
+                observed as `cos_NAME` and `sin_NAME` by its NAME, below pi.
             double: whether the C computes in double, not float.
 
         Raises:
-            ValueError: the policy cannot be exported, `episodes` is below 1, or a limit is unknown or not positive.
+            ValueError: the policy cannot be exported, `episodes` is below 1, or a limit is unknown
+                or not positive.
         """
         network = network_of(policy)
         run = run_episodes(policy, env.make, episodes, seed)
@@ -194,8 +221,16 @@ class Contract(Interface):
             assumed=json.loads(json.dumps(env.as_mapping())),
             controller={"real": "double" if double else "float", "loop": current_loop(env)},
             limits=_limits([one["name"] for one in between.observations], limits or {}),
-            late={"after": LATE / between.rate, "unit": "s", "command": [0.0] * len(between.actions)},
-            golden={"observations": chosen.tolist(), "actions": acted.tolist(), "tolerance": CLOSE * largest},
+            late={
+                "after": LATE / between.rate,
+                "unit": "s",
+                "command": [0.0] * len(between.actions),
+            },
+            golden={
+                "observations": chosen.tolist(),
+                "actions": acted.tolist(),
+                "tolerance": CLOSE * largest,
+            },
             versions={
                 "python": platform.python_version(),
                 **{one: importlib.metadata.version(one) for one in _PACKAGES},
@@ -213,7 +248,9 @@ class Contract(Interface):
         path = folder / FILE if folder.is_dir() else folder
         content = read_json(path, "contract")
         if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ValueError(f"{path}: not a contract of this program: its format must be {FORMAT!r}")
+            raise ValueError(
+                f"{path}: not a contract of this program: its format must be {FORMAT!r}"
+            )
         entries = [field.name for field in dataclasses.fields(cls)]
         if missing := [name for name in entries if name not in content]:
             raise ValueError(f"{path}: has no {', '.join(missing)}: export it anew")
@@ -246,14 +283,16 @@ class Contract(Interface):
         """
         for name, mine in self.actuators.items():
             if name not in actuators:
-                raise ValueError(f"actuator {name!r}: missing: the policy was trained through {mine['fields']}")
+                raise ValueError(
+                    f"actuator {name!r}: missing: the policy was trained through {mine['fields']}"
+                )
             theirs = _told(mapping_of(actuators[name]))
             if theirs["sha256"] != mine["sha256"]:
                 found = differing(mine["fields"] or {}, theirs["fields"] or {})
                 where, (wanted, given) = next(iter(found.items()), ("family", (None, None)))
                 raise ValueError(
-                    f"actuator {name!r}: {where} = {given}, must be {wanted}, through which the policy was trained; "
-                    "evaluate it on yours, or train through that"
+                    f"actuator {name!r}: {where} = {given}, must be {wanted}, through which the"
+                    " policy was trained; evaluate it on yours, or train through that"
                 )
 
 
@@ -263,9 +302,14 @@ def _limits(names: list[str], limits: Mapping[str, float]) -> dict[str, list[flo
     check_names(limits, [*names, *angles], "limit")
     for name, most in limits.items():
         if not 0.0 < most < (np.pi if name in angles else np.inf):
-            raise ValueError(f"limit {name} = {most:g}: must be > 0{' and < pi' if name in angles else ''}, and finite")
+            raise ValueError(
+                f"limit {name} = {most:g}: must be > 0{' and < pi' if name in angles else ''}, and"
+                " finite"
+            )
     return {
-        f"cos_{name}" if name in angles else name: [float(np.cos(most)), None] if name in angles else [-most, most]
+        f"cos_{name}" if name in angles else name: (
+            [float(np.cos(most)), None] if name in angles else [-most, most]
+        )
         for name, most in limits.items()
     }
 

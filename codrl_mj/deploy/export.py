@@ -48,18 +48,32 @@ def onnx_model(network: Network | Tiles, about: Mapping[str, Any]) -> Any:
 
     network.graph(node)
     nodes[-1].output[0] = "action"
-    kind, shape = (TensorProto.INT64, ["N"]) if network.low is None else (TensorProto.FLOAT, ["N", len(network.low)])
+    kind, shape = (
+        (TensorProto.INT64, ["N"])
+        if network.low is None
+        else (TensorProto.FLOAT, ["N", len(network.low)])
+    )
     graph = helper.make_graph(
         nodes,
         "policy",
-        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["N", len(network.factors)])],
+        [
+            helper.make_tensor_value_info(
+                "observation", TensorProto.FLOAT, ["N", len(network.factors)]
+            )
+        ],
         [helper.make_tensor_value_info("action", kind, shape)],
         constants,
     )
     model = helper.make_model(
-        graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR, producer_name="codrl_mj"
+        graph,
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR,
+        producer_name="codrl_mj",
     )
-    texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in about.items()}
+    texts = {
+        name: value if isinstance(value, str) else json.dumps(value)
+        for name, value in about.items()
+    }
     helper.set_model_props(model, texts)
     onnx.checker.check_model(model, full_check=True)
     return model
@@ -78,8 +92,9 @@ def export(
 ) -> Contract:
     """Write `policy.onnx`, `contract.json` and C99 into a new folder, whole or not at all.
 
-    The C is `controller.h`, `controller.c` and `main.c`, which computes the golden commands again; the loops are in
-    it where all motors have the same `codrl_mj.actuators.Drive`, `Servo` or the paper's `Actuator`.
+    The C is `controller.h`, `controller.c` and `main.c`, which computes the golden commands again;
+    the loops are in it where all motors have the same `codrl_mj.actuators.Drive`, `Servo` or the
+    paper's `Actuator`.
 
     Args:
         policy: as `codrl_mj.runs.policies.load_policy` returns it, of PPO, SAC, TD3, DDPG, DQN
@@ -98,24 +113,28 @@ def export(
 
     Raises:
         FileExistsError: the folder holds something.
-        ValueError: the policy cannot be exported, does not fit the board, or what was written does not act as it does.
+        ValueError: the policy cannot be exported, does not fit the board, or what was written does
+            not act as it does.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileExistsError(f"--out {out}: it exists, and is no empty folder: name another, or delete it")
+        raise FileExistsError(
+            f"--out {out}: it exists, and is no empty folder: name another, or delete it"
+        )
     check_spaces(policy, env)
     network = network_of(policy)
     if board is not None:
         check_board(board, network, double)
     contract = Contract.of(policy, env, agent, episodes, seed, limits, double)
     about: dict[str, Any] = {
-        name: getattr(contract, name) for name in ("task", "agent", "rate", "observations", "actions", "versions")
+        name: getattr(contract, name)
+        for name in ("task", "agent", "rate", "observations", "actions", "versions")
     }
     golden = contract.golden
     acted = network(np.array(golden["observations"], np.float32))
     if (worst := np.abs(acted - np.array(golden["actions"])).max()) > golden["tolerance"]:
         raise ValueError(
-            f"the exported policy's actions differ by {worst:.3g} from the policy's own, must be at most "
-            f"{golden['tolerance']:g}: it is not what its class says"
+            f"the exported policy's actions differ by {worst:.3g} from the policy's own, must be at"
+            f" most {golden['tolerance']:g}: it is not what its class says"
         )
     with writing_folder(out) as folder:
         (folder / ONNX).write_bytes(onnx_model(network, about).SerializeToString())
@@ -123,5 +142,7 @@ def export(
         for name, content in c_files(network, contract).items():
             (folder / name).write_text(content)
         if isinstance(network, Tiles):
-            (folder / TABLE).write_text(network.as_csv([one["name"] for one in contract.observations]))
+            (folder / TABLE).write_text(
+                network.as_csv([one["name"] for one in contract.observations])
+            )
     return contract

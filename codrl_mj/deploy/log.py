@@ -32,21 +32,27 @@ class LogCheck:
 
 def columns(interface: Interface) -> list[str]:
     """What a log's columns are called: `time:s`, observations and commands, `name:unit`."""
-    named = [("time", "s"), *((one["name"], one["unit"]) for one in (*interface.observations, *interface.actions))]
+    named = [
+        ("time", "s"),
+        *((one["name"], one["unit"]) for one in (*interface.observations, *interface.actions)),
+    ]
     return [f"{name}:{unit}" if unit else name for name, unit in named]
 
 
 def motor_columns(interface: Interface) -> list[str]:
     """What a board may tell besides, of each motor."""
     units = {"voltage": "V", "current": "A", "position": "rad"}
-    return [f"{one['name']}_{name}:{unit}" for one in interface.actions for name, unit in units.items()]
+    return [
+        f"{one['name']}_{name}:{unit}" for one in interface.actions for name, unit in units.items()
+    ]
 
 
 def write_log(path: Path, contract: Contract, episode: Episode) -> None:
     """Write an episode as a log, as a board writes it: what it saw, did and measured at the motors.
 
     Args:
-        path: CSV file for `columns` and, of motors that have voltages and currents, `motor_columns`.
+        path: CSV file for `columns` and, of motors that have voltages and currents,
+            `motor_columns`.
         contract: of what acted.
         episode: what it did.
     """
@@ -55,7 +61,9 @@ def write_log(path: Path, contract: Contract, episode: Episode) -> None:
         table = csv.writer(file)
         table.writerow(columns(contract) + (motor_columns(contract) if motors.size else []))
         commands = contract.commands(episode.action)
-        for step, row in enumerate(np.hstack([episode.observation[:-1], commands, motors]).tolist()):
+        for step, row in enumerate(
+            np.hstack([episode.observation[:-1], commands, motors]).tolist()
+        ):
             table.writerow([step / contract.rate, *row])
 
 
@@ -66,8 +74,13 @@ def _measured(contract: Contract, episode: Episode) -> np.ndarray:
         return np.zeros((steps, 0))
     speeds = np.vstack([episode.first_speeds, np.reshape(episode.trace["speed"], (-1, count))])
     turned = np.cumsum(episode.timestep * (speeds[1:] + speeds[:-1]) / 2.0, axis=0)
-    turned = turned[episode.inner_steps - 1 :: episode.inner_steps] / [one.arm_radius for one in episode.actuators]
-    ends = [np.reshape(one, (steps, count)) for one in (episode.signals["voltage"], episode.signals["current"], turned)]
+    turned = turned[episode.inner_steps - 1 :: episode.inner_steps] / [
+        one.arm_radius for one in episode.actuators
+    ]
+    ends = [
+        np.reshape(one, (steps, count))
+        for one in (episode.signals["voltage"], episode.signals["current"], turned)
+    ]
     before = np.stack([np.vstack([np.zeros((1, count)), one[:-1]]) for one in ends], axis=2)
     return before.reshape(steps, -1)
 
@@ -77,30 +90,42 @@ def read_rows(interface: Interface, path: Path) -> tuple[np.ndarray, np.ndarray,
 
     Args:
         interface: what passes between the policy and what it controls, as its contract has it.
-        path: comma-separated columns `name:unit`: `time:s`, the observations in the order in which they came, and the
-            commands that were sent. Columns are known by their names; a unit that is left out is not compared. Those
-            of `motor_columns` are passed over.
+        path: comma-separated columns `name:unit`: `time:s`, the observations in the order in which
+            they came, and the commands that were sent. Columns are known by their names; a unit
+            that is left out is not compared. Those of `motor_columns` are passed over.
 
     Returns:
-        Time [s], shape (n,), increasing; what was observed, shape (n, k); and the commands, shape (n, m), in the units
+        Time [s], shape (n,), increasing; what was observed, shape (n, k); and the commands, shape
+        (n, m), in the units
             of the interface's actions.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the table cannot be read, or its observations are not those of the policy: permuted, missing,
-            unknown, of another unit, at another rate.
+        ValueError: the table cannot be read, or its observations are not those of the policy:
+            permuted, missing, unknown, of another unit, at another rate.
     """
     with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
         header, *rows = list(csv.reader(file)) or [[]]
     while rows and not rows[-1]:
         rows.pop()
-    told = [(name.strip(), unit.strip() or None) for name, _, unit in (one.partition(":") for one in header)]
+    told = [
+        (name.strip(), unit.strip() or None)
+        for name, _, unit in (one.partition(":") for one in header)
+    ]
     names = [name for name, _ in told]
     where = {name: place for place, name in enumerate(names)}  # of equal names the last
-    if missing := [one for one in ("time", *(one["name"] for one in interface.actions)) if one not in names]:
-        raise ValueError(f"{path}: has no column {missing[0]!r}, only {', '.join(names)}: call the columns name:unit")
+    if missing := [
+        one for one in ("time", *(one["name"] for one in interface.actions)) if one not in names
+    ]:
+        raise ValueError(
+            f"{path}: has no column {missing[0]!r}, only {', '.join(names)}: call the columns"
+            " name:unit"
+        )
     if told[where["time"]][1] not in (None, "s"):
-        raise ValueError(f"{path}: column 'time': its unit is {told[names.index('time')][1]}, must be s: convert it")
+        raise ValueError(
+            f"{path}: column 'time': its unit is {told[names.index('time')][1]}, must be s:"
+            " convert it"
+        )
     for place, row in enumerate(rows, 2):
         if len(row) != len(header):
             raise ValueError(f"{path}: line {place} has {len(row)} cells, must have {len(header)}")
@@ -113,17 +138,26 @@ def read_rows(interface: Interface, path: Path) -> tuple[np.ndarray, np.ndarray,
         for row, place in np.argwhere(~np.isfinite(table))[:1]
     ]
     if wrong or len(table) < 2:
-        raise ValueError(f"{path}: {wrong[0] if wrong else f'must have at least two rows, has {len(table)}'}")
+        raise ValueError(
+            f"{path}: {wrong[0] if wrong else f'must have at least two rows, has {len(table)}'}"
+        )
     if (steps := np.diff(table[:, where["time"]])).min() <= 0.0:
-        raise ValueError(f"{path}: line {int(steps.argmin()) + 3}: time must increase from row to row")
+        raise ValueError(
+            f"{path}: line {int(steps.argmin()) + 3}: time must increase from row to row"
+        )
     sent = [where[one["name"]] for one in interface.actions]
     beside = {one.partition(":")[0] for one in motor_columns(interface)}
-    seen = [place for place, name in enumerate(names) if place not in (*sent, where["time"]) and name not in beside]
+    seen = [
+        place
+        for place, name in enumerate(names)
+        if place not in (*sent, where["time"]) and name not in beside
+    ]
     interface.admit([told[place] for place in seen], 1.0 / float(np.median(steps)))
     for one, place in zip(interface.actions, sent, strict=True):
         if None not in (told[place][1], one["unit"]) and told[place][1] != one["unit"]:
             raise ValueError(
-                f"{path}: action {one['name']!r}: its unit is {told[place][1]}, must be {one['unit']}: convert it"
+                f"{path}: action {one['name']!r}: its unit is {told[place][1]}, must be"
+                f" {one['unit']}: convert it"
             )
     return table[:, where["time"]], table[:, seen], table[:, sent]
 
@@ -143,7 +177,9 @@ def check_log(folder: Path, path: Path) -> LogCheck:
     time, observed, commands = read_rows(contract, path)
     steps = np.diff(time)
     expected = contract.commands(OnnxPolicy(folder).predict(observed)[0])
-    expected[~contract.within(observed)] = contract.late["command"]  # what the C gives beyond a limit
+    expected[~contract.within(observed)] = contract.late[
+        "command"
+    ]  # what the C gives beyond a limit
     off = np.abs(commands - expected).max(axis=1)
     low, high = np.array([one["seen"] for one in contract.observations]).T
     beyond = (observed < low - 0.1 * (high - low)) | (observed > high + 0.1 * (high - low))
@@ -151,7 +187,10 @@ def check_log(folder: Path, path: Path) -> LogCheck:
         rows=len(time),
         rate=1.0 / float(np.median(steps)),
         late=int((steps > contract.late["after"]).sum()),
-        outside={one["name"]: int(beyond[:, place].sum()) for place, one in enumerate(contract.observations)},
+        outside={
+            one["name"]: int(beyond[:, place].sum())
+            for place, one in enumerate(contract.observations)
+        },
         differing=int((off > contract.golden["tolerance"]).sum()),
         worst=float(off.max()),
     )

@@ -13,8 +13,9 @@ from codrl_mj.envs.config import EnvConfig
 def current_loop(env: EnvConfig) -> dict[str, Any] | None:
     """The numbers of the loop that all motors share; None where there is none to be computed on a board.
 
-    Those of a `codrl_mj.actuators.Drive` at 25 degC, whose gains are computed as it computes them, of a `Servo`, or of
-    the paper's `Actuator`. Amperes for a command, limits [A] and [V], gains, and the rate of its samples [Hz].
+    Those of a `codrl_mj.actuators.Drive` at 25 degC, whose gains are computed as it computes them,
+    of a `Servo`, or of the paper's `Actuator`. Amperes for a command, limits [A] and [V], gains,
+    and the rate of its samples [Hz].
     """
     first: Any = env.actuators[0]
     asked = ("position", "velocity") if type(first) is Servo else ("force", "current")
@@ -34,11 +35,17 @@ def current_loop(env: EnvConfig) -> dict[str, Any] | None:
     if type(first) is Actuator:
         with contextlib.closing(env.make()) as made:
             model = getattr(made.unwrapped, "model", None)
-        return None if model is None else shared | _paper_loop(first, float(model.opt.timestep) / loop.substeps)
+        return (
+            None
+            if model is None
+            else shared | _paper_loop(first, float(model.opt.timestep) / loop.substeps)
+        )
     kp, ki = loop.kp, loop.ki / loop.sample_rate
     if loop.kp == 0.0 and loop.ki == 0.0:
         bandwidth = 2.0 * np.pi * (loop.bandwidth or DEFAULT_BANDWIDTH * loop.sample_rate)
-        kp, ki = sampled.designed_gains(motor.resistance, motor.inductance, 1.0 / loop.sample_rate, bandwidth)
+        kp, ki = sampled.designed_gains(
+            motor.resistance, motor.inductance, 1.0 / loop.sample_rate, bandwidth
+        )
     return shared | {
         "kind": "sampled",
         "sag": first.sag,
@@ -58,7 +65,9 @@ def _paper_loop(actuator: Actuator, period: float) -> dict[str, Any]:
     """The numbers of `codrl_mj.actuators.electrical_step` at its electrical step [s]; None: no limit."""
     loop, supply = actuator.controller, actuator.supply
     limits = {"voltage": actuator.voltage_limit, "most_voltage": loop.max_voltage}
-    if supply is not None and supply.resistance:  # it sags from what the supply has without a current
+    if (
+        supply is not None and supply.resistance
+    ):  # it sags from what the supply has without a current
         limits["voltage"] = supply.voltage if np.isfinite(supply.voltage) else loop.max_voltage
     return {name: value if np.isfinite(value) else None for name, value in limits.items()} | {
         "kind": "pid",

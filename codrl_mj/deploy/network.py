@@ -48,9 +48,10 @@ class Normalization(NamedTuple):
 class Network:
     """A policy that takes its most likely action: an observation (k,) to an action.
 
-    The observation is normalized if the training's was, multiplied by `factors`, goes through the layers, and what they
-    give is multiplied by `gains`. Of a box it is then brought between `low` and `high`: clipped or, `squashed`, by
-    (y + 1)/2 of the way. Without bounds the action is the index of the largest.
+    The observation is normalized if the training's was, multiplied by `factors`, goes through the
+    layers, and what they give is multiplied by `gains`. Of a box it is then brought between `low`
+    and `high`: clipped or, `squashed`, by (y + 1)/2 of the way. Without bounds the action is the
+    index of the largest.
     """
 
     factors: np.ndarray
@@ -72,7 +73,9 @@ class Network:
         """The name of what an ONNX graph gives that computes it, by `node(kind, *inputs, **attributes)`."""
         values = "observation"
         if (norm := self.normalization) is not None:
-            values = node("Div", node("Sub", node("Cast", values, to=11), norm.mean), norm.deviation)  # 11: double
+            values = node(
+                "Div", node("Sub", node("Cast", values, to=11), norm.mean), norm.deviation
+            )  # 11: double
             values = node("Min", node("Max", values, np.full(1, -norm.clip)), np.full(1, norm.clip))
             values = node("Cast", values, to=1)
         values = node("Mul", values, self.factors)
@@ -85,7 +88,9 @@ class Network:
             return str(node("ArgMax", values, axis=1, keepdims=0))
         if not self.squashed:
             return str(node("Min", node("Max", values, self.low), self.high))
-        share = node("Mul", node("Add", values, np.ones(1, np.float32)), np.full(1, 0.5, np.float32))
+        share = node(
+            "Mul", node("Add", values, np.ones(1, np.float32)), np.full(1, 0.5, np.float32)
+        )
         return str(node("Add", node("Mul", share, self.high - self.low), self.low))
 
     def __call__(self, observations: np.ndarray, kind: Any = np.float32) -> np.ndarray:
@@ -95,12 +100,18 @@ class Network:
             values = np.clip((values - norm.mean) / norm.deviation, -norm.clip, norm.clip)
         values = values.astype(kind) * self.factors.astype(kind)
         for layer in self.layers:
-            values = ACTIVATIONS[layer.activation](values @ layer.weight.astype(kind).T + layer.bias.astype(kind))
+            values = ACTIVATIONS[layer.activation](
+                values @ layer.weight.astype(kind).T + layer.bias.astype(kind)
+            )
         values = values * self.gains.astype(kind)
         if self.low is None or self.high is None:
             return values.argmax(axis=1)
         low, high = self.low.astype(kind), self.high.astype(kind)
-        return low + kind(0.5) * (values + kind(1.0)) * (high - low) if self.squashed else np.clip(values, low, high)
+        return (
+            low + kind(0.5) * (values + kind(1.0)) * (high - low)
+            if self.squashed
+            else np.clip(values, low, high)
+        )
 
     @property
     def width(self) -> int:
@@ -129,7 +140,11 @@ class Network:
         if norm is None:
             return {"scale": factor, "offset": 0.0}
         mean, deviation = float(norm.mean[index]), float(norm.deviation[index])
-        told = {"mean": mean, "variance": deviation**2, "clip": norm.clip if np.isfinite(norm.clip) else None}
+        told = {
+            "mean": mean,
+            "variance": deviation**2,
+            "clip": norm.clip if np.isfinite(norm.clip) else None,
+        }
         return {"scale": factor / deviation, "offset": -factor * mean / deviation, **told}
 
 
@@ -165,7 +180,10 @@ def network_of(policy: Policy) -> Network | Tiles:
     one: Any = policy
     squashed = isinstance(one, SACPolicy | TD3Policy)
     if isinstance(one, ActorCriticPolicy) and not one.squash_output:
-        extractor, parts = one.pi_features_extractor, [*one.mlp_extractor.policy_net, one.action_net]
+        extractor, parts = (
+            one.pi_features_extractor,
+            [*one.mlp_extractor.policy_net, one.action_net],
+        )
     elif isinstance(one, SACPolicy):
         extractor, parts = one.actor.features_extractor, [*one.actor.latent_pi, one.actor.mu]
     elif isinstance(one, TD3Policy):
@@ -174,8 +192,8 @@ def network_of(policy: Policy) -> Network | Tiles:
         extractor, parts = one.q_net.features_extractor, [*one.q_net.q_net]
     else:
         raise ValueError(
-            f"policy: a {type(one).__name__} cannot be exported: it must be of PPO, SAC, TD3, DDPG or DQN, which "
-            "are dense layers, or SARSA's"
+            f"policy: a {type(one).__name__} cannot be exported: it must be of PPO, SAC, TD3, DDPG"
+            " or DQN, which are dense layers, or SARSA's"
         )
     seen, acts = one.observation_space, one.action_space
     if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
@@ -201,9 +219,17 @@ def _layers(parts: list[Any]) -> list[Layer]:
     for part in parts:
         kind = type(part).__name__
         if kind == "Linear":
-            found.append(Layer(part.weight.detach().numpy().copy(), part.bias.detach().numpy().copy(), "Identity"))
+            found.append(
+                Layer(
+                    part.weight.detach().numpy().copy(),
+                    part.bias.detach().numpy().copy(),
+                    "Identity",
+                )
+            )
         elif kind in ACTIVATIONS and found and found[-1].activation == "Identity":
             found[-1] = dataclasses.replace(found[-1], activation=kind)
         else:
-            raise ValueError(f"policy: a layer is {part}: must be Linear, or {', '.join(ACTIVATIONS)} after one")
+            raise ValueError(
+                f"policy: a layer is {part}: must be Linear, or {', '.join(ACTIVATIONS)} after one"
+            )
     return found

@@ -1,8 +1,9 @@
 """The current loop of the exported C in the simulation's motor: each sample is asked of a process, the winding is here.
 
-A family's own step runs with one function of it replaced: where `Drive` and `Servo` compute samples of their loop, and
-the paper's `Actuator` its one, these ask for a voltage and bring it to the winding. Nothing else of a motor changes.
-The loop's memory goes with each sample and comes back, since the engine may ask for a step twice.
+A family's own step runs with one function of it replaced: where `Drive` and `Servo` compute samples
+of their loop, and the paper's `Actuator` its one, these ask for a voltage and bring it to the
+winding. Nothing else of a motor changes. The loop's memory goes with each sample and comes back,
+since the engine may ask for a step twice.
 """
 
 import contextlib
@@ -25,7 +26,9 @@ from codrl_mj.kept import external
 WITHIN = 5000
 """Milliseconds after which a sample counts as not answered."""
 _POLL_IN = 1 << 32
-_TABLE = np.zeros(32)  # these, and 1: what `poll` is told; from 8 on a sample, from 16 on its answer
+_TABLE = np.zeros(
+    32
+)  # these, and 1: what `poll` is told; from 8 on a sample, from 16 on its answer
 _table_at = symbol("codrl_mj_board", _TABLE.ctypes.data)
 _TO, _AMPERES, _CURRENT, _VOLTAGE, _SAMPLES, _LOST = 0, 2, 3, 4, 5, 6
 _C: Any = ctypes.CDLL(None)
@@ -45,7 +48,11 @@ def asked_of_board(
 ) -> tuple[float, float, float]:
     """The voltage [V] of a sample and the loop's memory after it, by [A], [A], [rad/s] and its memory; 0 V if none."""
     table = f64(_table_at())
-    table[8], table[9], table[10] = reference / table[_AMPERES], rounded(measured, table[_CURRENT]), speed
+    table[8], table[9], table[10] = (
+        reference / table[_AMPERES],
+        rounded(measured, table[_CURRENT]),
+        speed,
+    )
     table[11], table[12] = integral, kept
     table[_SAMPLES] += 1.0
     got = 0
@@ -86,11 +93,20 @@ def run_over(
         reached = (applied - back_emf) / resistance
         off = current - reached
         within = reached + off * lost / x  # the sample's mean current
-        heat += reached * reached + off * (2.0 * reached * lost + off * lost * (1.0 - 0.5 * lost)) / x
+        heat += (
+            reached * reached + off * (2.0 * reached * lost + off * lost * (1.0 - 0.5 * lost)) / x
+        )
         mean, volts, power = mean + within, volts + applied, power + applied * within
         current = reached + off * (1.0 - lost)
     after = Winding(current, integral, pending)
-    return after, mean / samples, volts / samples, saturated, power / samples, resistance * heat / samples
+    return (
+        after,
+        mean / samples,
+        volts / samples,
+        saturated,
+        power / samples,
+        resistance * heat / samples,
+    )
 
 
 def electrical_step(
@@ -106,16 +122,26 @@ def electrical_step(
 ) -> tuple[float, float, float, float]:
     """`codrl_mj.actuators.electrical_step` of a loop on the board."""
     asked = desired_torque / parameters.torque_constant
-    voltage, integral, error = asked_of_board(asked, current + sensor_error, speed, integral, previous_error)
+    voltage, integral, error = asked_of_board(
+        asked, current + sensor_error, speed, integral, previous_error
+    )
     voltage = min(max(voltage, -limit), limit)
     back_emf = parameters.back_emf_constant * speed
-    current = current + (voltage - back_emf - parameters.resistance * current) / parameters.inductance * dt
+    current = (
+        current
+        + (voltage - back_emf - parameters.resistance * current) / parameters.inductance * dt
+    )
     return current, integral, error, voltage
 
 
 def _with(function: Any, **others: Any) -> Any:
     """A function of which some globals are others."""
-    return FunctionType(function.__code__, {**function.__globals__, **others}, function.__name__, function.__defaults__)
+    return FunctionType(
+        function.__code__,
+        {**function.__globals__, **others},
+        function.__name__,
+        function.__defaults__,
+    )
 
 
 _shaft = ModuleType("codrl_mj.actuators.shaft")
@@ -129,7 +155,11 @@ _ADVANCE = {
 
 @contextlib.contextmanager
 def loop_on_board(
-    family: Family, process: Any, amperes: float, current_step: float = 0.0, voltage_step: float = 0.0
+    family: Family,
+    process: Any,
+    amperes: float,
+    current_step: float = 0.0,
+    voltage_step: float = 0.0,
 ) -> Iterator[np.ndarray]:
     """Let motors of a family ask a process for the voltage of each sample, in a `with` block.
 
@@ -143,9 +173,16 @@ def loop_on_board(
     Returns:
         Where samples are counted, and whether one was not answered: a view of two numbers.
     """
-    one = type(family.__name__, (family,), {"advance": staticmethod(_ADVANCE[family]), "family": ""})
+    one = type(
+        family.__name__, (family,), {"advance": staticmethod(_ADVANCE[family]), "family": ""}
+    )
     _TABLE[:] = 0.0
-    _TABLE[[_TO, _AMPERES, _CURRENT, _VOLTAGE]] = process.stdin.fileno(), amperes, current_step, voltage_step
+    _TABLE[[_TO, _AMPERES, _CURRENT, _VOLTAGE]] = (
+        process.stdin.fileno(),
+        amperes,
+        current_step,
+        voltage_step,
+    )
     _TABLE[1:2].view(np.uint64)[0] = process.stdout.fileno() | _POLL_IN
     with replaced(family, one):
         yield _TABLE[_SAMPLES : _LOST + 1]

@@ -13,8 +13,9 @@ import numpy as np
 from codrl_mj.deploy.contract import Contract
 
 ASK, WATCH, DRIVE = 0, 1, 2
-"""What is asked for: the policy's command for the observation that is sent; that for the controller's own observation,
-which it does not give to the drive; or does."""
+"""What is asked for: the policy's command for the observation that is sent; that for the
+controller's own observation, which it does not give to the drive; or does.
+"""
 DAMAGED, OLD, NOT_FINITE, LATE, BEYOND, NO_SENSORS = (1 << bit for bit in range(6))
 REFUSED = DAMAGED | OLD | NOT_FINITE
 """Bits of an answer's status with which the policy was not asked for the frame's sake."""
@@ -51,7 +52,9 @@ class Wire:
 
     def frame(self, sequence: int, stamp: int, observation: np.ndarray, kind: int = ASK) -> bytes:
         """A frame with an observation (k,), at a time [us]."""
-        return _framed(self._request.pack(sequence % 256, kind, stamp % 2**32, *observation.tolist()))
+        return _framed(
+            self._request.pack(sequence % 256, kind, stamp % 2**32, *observation.tolist())
+        )
 
     def asked(self, frame: bytes, sequence: int, within: float = ANSWER_WITHIN) -> Answer | None:
         """Send a frame, and what comes back within some time [s]; None for nothing, or what is damaged.
@@ -62,7 +65,9 @@ class Wire:
         with contextlib.suppress(BrokenPipeError):  # reading says that it ended
             os.write(self._to, frame)
         while (answer := self._read(sequence, within)) is not None:
-            if answer.sequence == sequence % 256 or answer.status & DAMAGED:  # and not one that came too late
+            if (
+                answer.sequence == sequence % 256 or answer.status & DAMAGED
+            ):  # and not one that came too late
                 return answer
         return None
 
@@ -72,11 +77,15 @@ class Wire:
         until = time.monotonic() + within
         while True:
             begin = got.find(_START)
-            del got[: begin if begin >= 0 else len(got) - got.endswith(_START[:1])]  # noise before it
+            del got[
+                : begin if begin >= 0 else len(got) - got.endswith(_START[:1])
+            ]  # noise before it
             if len(got) >= size:
                 content = bytes(got[2 : size - 2])
                 damaged = got[:size] != _framed(content)
-                del got[: 1 if damaged else size]  # within what is damaged may be the start of one that is not
+                del got[
+                    : 1 if damaged else size
+                ]  # within what is damaged may be the start of one that is not
                 if not damaged:
                     break
             elif damaged and not got:

@@ -66,13 +66,15 @@ def actuators_of(choices: Mapping[str, tuple[Candidate, Demand]]) -> dict[str, A
     """What `codrl_mj.make` and `--actuators` take: pattern -> fields of the actuator.
 
     Args:
-        choices: name of a motor of the model -> what was chosen for it, and for what; of a single one the name may be
-            empty.
+        choices: name of a motor of the model -> what was chosen for it, and for what; of a single
+            one the name may be empty.
     """
     found = {}
     for name, (choice, demand) in choices.items():
         drive = labelled(choice.behind(demand.model_gear), Path(choice.name).stem)
-        found[" & ".join(map(re.escape, name.split(" & "))) if name else ".*"] = named_mapping(drive)
+        found[" & ".join(map(re.escape, name.split(" & "))) if name else ".*"] = named_mapping(
+            drive
+        )
     return found
 
 
@@ -93,17 +95,18 @@ def choose(
 ) -> list[Candidate]:
     """Rank motors with their gears: those that do it, from the smallest; then the others by verdict and shortage.
 
-    A motor does it if `feasibility` says `surely`, with a margin. More than enough of a motor is no merit: it is dear
-    and heavy, and moves itself. A motor with a gear of its own keeps it, and on a slide gets a wheel; the others get
-    the gear of `geared`.
+    A motor does it if `feasibility` says `surely`, with a margin. More than enough of a motor is no
+    merit: it is dear and heavy, and moves itself. A motor with a gear of its own keeps it, and on a
+    slide gets a wheel; the others get the gear of `geared`.
 
     Args:
         demand: what is asked.
         motors: names; None: the whole catalogue.
         voltage: of the supply [V]; None: each motor's own.
-        least_margin: share of voltage, largest and continuous current that has to be left, in [0, 1).
-        gears: ratios that can be had, turns of the rotor for one of the joint, on a slide rad/m; every motor is judged
-            with each of them.
+        least_margin: share of voltage, largest and continuous current that has to be left, in [0,
+            1).
+        gears: ratios that can be had, turns of the rotor for one of the joint, on a slide rad/m;
+            every motor is judged with each of them.
         max_current: that the drive gives [A]; None: each motor's own.
 
     Raises:
@@ -111,7 +114,8 @@ def choose(
     """
     if not 0.0 <= least_margin < 1.0:
         raise ValueError(
-            f"least_margin = {least_margin:g}: must be >= 0 and < 1, the share that is to be left, such as {MARGIN:g}"
+            f"least_margin = {least_margin:g}: must be >= 0 and < 1, the share that is to be left,"
+            f" such as {MARGIN:g}"
         )
     choices = []
     for name in motor_names() if motors is None else motors:
@@ -122,7 +126,9 @@ def choose(
             fixed = gear is not None or (drive.motor.gear_ratio != 1.0 and not demand.linear)
             drive = drive if fixed else geared(drive, demand, continuous)
             found = feasibility(drive, demand, continuous)
-            choices.append(Candidate(name, drive, uncounted(entry), found, _lacks(found, least_margin)))
+            choices.append(
+                Candidate(name, drive, uncounted(entry), found, _lacks(found, least_margin))
+            )
 
     def rank(choice: Candidate) -> tuple[bool, int, float, float]:
         found = choice.feasibility
@@ -136,14 +142,19 @@ def _lacks(found: Feasibility, least: float) -> str:
     """Return the reason why a motor is not to be taken; empty where it is."""
     if found.verdict != SURELY:
         return f"{found.verdict}. {found.why}"
-    return "" if found.margin >= least else f"surely, but with a margin of {found.margin:.0%}, must be {least:.0%}"
+    return (
+        ""
+        if found.margin >= least
+        else f"surely, but with a margin of {found.margin:.0%}, must be {least:.0%}"
+    )
 
 
 def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Drive:
     """Return the drive with its best gear, or on a slide wheel: that of the largest margin, rotor and friction counted.
 
-    A gear has a ratio >= 1. Friction may take `MOST_FRICTION` of the load where that leaves a margin. Each of the
-    margin's parts is, but for friction, the largest of functions a/N + b*N, so it has one maximum over N.
+    A gear has a ratio >= 1. Friction may take `MOST_FRICTION` of the load where that leaves a
+    margin. Each of the margin's parts is, but for friction, the largest of functions a/N + b*N, so
+    it has one maximum over N.
 
     Args:
         drive: the motor, with any gear.
@@ -167,7 +178,9 @@ def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Dri
         at = minimize_scalar(load, bounds=within, method="bounded", options={"xatol": 0.01}).x
         return _with_ratio(drive, demand, float(at))
 
-    rubbed = 0.0 if demand.exact else friction_share(_with_ratio(drive, demand, 0.0), demand)  # it grows with the ratio
+    rubbed = (
+        0.0 if demand.exact else friction_share(_with_ratio(drive, demand, 0.0), demand)
+    )  # it grows with the ratio
     if rubbed > 0.0 and MOST_FRICTION / rubbed > math.exp(low):
         smooth = best(math.log(MOST_FRICTION / rubbed))
         if margin(smooth, operation(demand, smooth), continuous) >= 0.0:
@@ -175,7 +188,9 @@ def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Dri
     return best(math.inf)
 
 
-def equal_gears(best: Drive, demand: Demand, continuous: float | None = None) -> tuple[float, float]:
+def equal_gears(
+    best: Drive, demand: Demand, continuous: float | None = None
+) -> tuple[float, float]:
     """Return the lowest and the highest ratio around the best one that have its verdict."""
     verdict, middle = feasibility(best, demand, continuous).verdict, -math.log(best.arm_radius)
 
@@ -183,7 +198,9 @@ def equal_gears(best: Drive, demand: Demand, continuous: float | None = None) ->
         within = middle
         for _ in range(12):
             tried = (within + beyond) / 2.0
-            same = feasibility(_with_ratio(best, demand, tried), demand, continuous).verdict == verdict
+            same = (
+                feasibility(_with_ratio(best, demand, tried), demand, continuous).verdict == verdict
+            )
             within, beyond = (tried, beyond) if same else (within, tried)
         return math.exp(within)
 

@@ -31,8 +31,9 @@ class Operation(NamedTuple):
     energy_drawn: float
     """Electrical energy drawn from the supply in an episode [J], what comes back not taken off."""
     own_share: float
-    """Largest torque that rotor and friction take, over the largest that the joint is asked for; at least that, where
-    the rotor's inertia is unknown and thus 0."""
+    """Largest torque that rotor and friction take, over the largest that the joint is asked for; at
+    least that, where the rotor's inertia is unknown and thus 0.
+    """
 
 
 def operation(demand: Demand, drive: Drive) -> Operation:
@@ -40,12 +41,13 @@ def operation(demand: Demand, drive: Drive) -> Operation:
 
     With N turns of the rotor for one of the joint (1/arm on a slide),
 
-        tau_rotor = (tau + N^2 (J alpha + b omega) + N tau_c sign(omega)) / (N eta),   i = tau_rotor / kT,
-        V >= |R i + N kE omega| + R_supply |i|, and with L di/dt while i comes from its value in the step before.
+        tau_rotor = (tau + N^2 (J alpha + b omega) + N tau_c sign(omega)) / (N eta),   i = tau_rotor
+        / kT, V >= |R i + N kE omega| + R_supply |i|, and with L di/dt while i comes from its value
+        in the step before.
 
-    with Stribeck friction in tau_c. A change of the torque is to be made within a step of the demand; so is that from
-    one episode to the next. Where the motor brakes or holds, eta is 1: the gear helps then. Energies
-    are of the mean speed in a step, all else of that at its start.
+    with Stribeck friction in tau_c. A change of the torque is to be made within a step of the
+    demand; so is that from one episode to the next. Where the motor brakes or holds, eta is 1: the
+    gear helps then. Energies are of the mean speed in a step, all else of that at its start.
     """
     motor, added, arm = drive.motor, drive.additions, drive.arm_radius
     sticking = motor.stribeck(demand.speed / arm) / arm
@@ -76,12 +78,20 @@ def best_ratio(torque: Any, speed: Any, motor: GearMotor) -> Any:
 
     The minimum of R tau/(N kT) + N kE omega over N; rotor and friction are not in it.
     """
-    return np.sqrt(motor.resistance * torque / (motor.torque_constant * motor.back_emf_constant * speed))
+    return np.sqrt(
+        motor.resistance * torque / (motor.torque_constant * motor.back_emf_constant * speed)
+    )
 
 
 # -- what follows ---------------------------------------------------------------------------------------------------
 
-SURELY, DEPENDS, TRY_IT, HOPELESS, SURELY_NOT = "surely", "it depends", "try it", "hopeless", "surely not"
+SURELY, DEPENDS, TRY_IT, HOPELESS, SURELY_NOT = (
+    "surely",
+    "it depends",
+    "try it",
+    "hopeless",
+    "surely not",
+)
 VERDICTS = (SURELY, DEPENDS, TRY_IT, HOPELESS, SURELY_NOT)
 """From the best."""
 SUFFICIENT = ("voltage", "current", "heat", "rotor", "friction")
@@ -89,8 +99,10 @@ SUFFICIENT = ("voltage", "current", "heat", "rotor", "friction")
 MOST_SHARE = 0.5
 """Largest share that rotor and friction may take of the largest load: in a task a policy can ask for no more."""
 MOST_FRICTION = 0.05
-"""Largest share that Coulomb friction at the joint may take of it. Policies that never met as much lost at most 0.05 of
-the score on five tasks and 0.10 on Mountain Car, and with twice as much up to 0.18 (docs/results/actuators.md)."""
+"""Largest share that Coulomb friction at the joint may take of it. Policies that never met as much
+lost at most 0.05 of the score on five tasks and 0.10 on Mountain Car, and with twice as much up to
+0.18 (docs/results/actuators.md).
+"""
 SHORT = 10.0
 """What is short by this factor is hopeless: in simulations none that was short by more than 7 got anywhere."""
 BRIEF = 0.01
@@ -114,8 +126,9 @@ class Bound:
     holds: bool
     """Whether the motor has what is needed."""
     verdict: str
-    """`surely`, `surely not`, or where nothing follows `try it`; `hopeless` where most of it is missing; `it depends`
-    where one of the sides is not known, and NaN."""
+    """`surely`, `surely not`, or where nothing follows `try it`; `hopeless` where most of it is
+    missing; `it depends` where one of the sides is not known, and NaN.
+    """
     remedy: str
     """Change or missing number that would make it hold; empty if it holds."""
 
@@ -123,7 +136,10 @@ class Bound:
         """In a sentence."""
         if self.verdict == DEPENDS:
             return f"{self.name}: {self.remedy}"
-        text = f"{self.name}: {self.formula}, needs {self.needed:.4g} {self.unit}, has {self.available:.4g} {self.unit}"
+        text = (
+            f"{self.name}: {self.formula}, needs {self.needed:.4g} {self.unit}, has"
+            f" {self.available:.4g} {self.unit}"
+        )
         return text if self.holds else f"{text}: {self.remedy}"
 
 
@@ -144,7 +160,9 @@ class Feasibility:
         worst = max((bound.verdict for bound in self.bounds), key=VERDICTS.index)
         if worst in (HOPELESS, SURELY_NOT):
             return worst
-        return max((bound.verdict for bound in self.bounds if bound.name in SUFFICIENT), key=VERDICTS.index)
+        return max(
+            (bound.verdict for bound in self.bounds if bound.name in SUFFICIENT), key=VERDICTS.index
+        )
 
     @property
     def shortage(self) -> float:
@@ -160,7 +178,9 @@ class Feasibility:
     @property
     def in_the_way(self) -> list[Bound]:
         """The bounds that do not hold or are not known, the decisive first."""
-        return sorted((b for b in self.bounds if not b.holds), key=lambda b: -VERDICTS.index(b.verdict))
+        return sorted(
+            (b for b in self.bounds if not b.holds), key=lambda b: -VERDICTS.index(b.verdict)
+        )
 
 
 def margin(drive: Drive, asked: Operation, continuous_current: float | None) -> float:
@@ -172,11 +192,14 @@ def margin(drive: Drive, asked: Operation, continuous_current: float | None) -> 
     )
 
 
-def feasibility(drive: Drive, demand: Demand, continuous_current: float | None = None) -> Feasibility:
+def feasibility(
+    drive: Drive, demand: Demand, continuous_current: float | None = None
+) -> Feasibility:
     """Judge whether a motor can deliver what a run asked of the ideal actuator.
 
-    The bounds of `SUFFICIENT` suffice together. `stall` and `power` are necessary for the run, and so decide where the
-    demand is exact; another policy may do a task with less. `swing` is necessary for any policy.
+    The bounds of `SUFFICIENT` suffice together. `stall` and `power` are necessary for the run, and
+    so decide where the demand is exact; another policy may do a task with less. `swing` is
+    necessary for any policy.
 
     Args:
         drive: the motor with gear and supply; a rotor inertia of 0 is taken as not known.
@@ -188,7 +211,8 @@ def feasibility(drive: Drive, demand: Demand, continuous_current: float | None =
     """
     if not isinstance(drive, Drive):
         raise ValueError(
-            f"{drive!r}: must be a codrl_mj.actuators.Drive, a motor with gear and supply, or a catalogue's name"
+            f"{drive!r}: must be a codrl_mj.actuators.Drive, a motor with gear and supply, or a"
+            " catalogue's name"
         )
     asked, unmet = operation(demand, drive), SURELY_NOT if demand.exact else TRY_IT
     bounds = []
@@ -196,16 +220,31 @@ def feasibility(drive: Drive, demand: Demand, continuous_current: float | None =
     for name, formula, load, available, unit, verdicts, remedy in rows:
         needed = float(np.max(load))
         holds = needed <= available
-        verdict, most = verdicts[not holds], available * (math.sqrt(SHORT) if name == "heat" else SHORT)
+        verdict, most = (
+            verdicts[not holds],
+            available * (math.sqrt(SHORT) if name == "heat" else SHORT),
+        )
         lasting = float(np.quantile(load, 1.0 - BRIEF))
-        if name in _HOPELESS and not holds and verdict == TRY_IT and lasting >= most and not demand.servo:
+        if (
+            name in _HOPELESS
+            and not holds
+            and verdict == TRY_IT
+            and lasting >= most
+            and not demand.servo
+        ):
             verdict = HOPELESS
         if math.isnan(available):
             verdict = DEPENDS
         elif demand.servo and name in _LATER:
-            remedy = "its servo asks for less where the motor is slower: evaluate the run on this motor"
-        bounds.append(Bound(name, formula, needed, available, unit, holds, verdict, "" if holds else remedy))
-    if drive.motor.rotor_inertia == 0.0 and all(bound.holds for bound in bounds if bound.name == "rotor"):
+            remedy = (
+                "its servo asks for less where the motor is slower: evaluate the run on this motor"
+            )
+        bounds.append(
+            Bound(name, formula, needed, available, unit, holds, verdict, "" if holds else remedy)
+        )
+    if drive.motor.rotor_inertia == 0.0 and all(
+        bound.holds for bound in bounds if bound.name == "rotor"
+    ):
         unknown = _unknown_rotor(drive, demand, continuous_current)
         bounds = [bound for bound in bounds if bound.name != "rotor"] + unknown
     if demand.swing is not None:
@@ -220,49 +259,90 @@ _LATER = ("voltage", "current", "rotor", "power")
 _Row = tuple[str, str, Any, float, str, tuple[str, str], str]
 
 
-def _conditions(drive: Drive, demand: Demand, asked: Operation, continuous: float | None, unmet: str) -> Iterator[_Row]:
+def _conditions(
+    drive: Drive, demand: Demand, asked: Operation, continuous: float | None, unmet: str
+) -> Iterator[_Row]:
     """Yield name, formula, load over time, available, unit, verdicts and remedy of each bound but a swing-up's.
 
-    Voltage and current at every operating point, the heat of all of them, and of a task what rotor and friction leave
-    suffice; torque at standstill, and power whatever the gear, are what any motor needs to deliver the run.
+    Voltage and current at every operating point, the heat of all of them, and of a task what rotor
+    and friction leave suffice; torque at standstill, and power whatever the gear, are what any
+    motor needs to deliver the run.
     """
     motor, limit, most = drive.motor, drive.voltage_limit, drive.controller.max_current
     currents, unit = np.abs(asked.current), "N" if demand.linear else "N*m"
     volts, largest = float(asked.voltage.max()), float(currents.max())
     remedy = f"raise the supply to {volts:.4g} V{_time_within(asked.voltage, limit, 'V')}"
-    yield "voltage", "|R i + L di/dt + N kE omega|, largest", asked.voltage, limit, "V", (SURELY, unmet), remedy
-    remedy = f"raise controller.max_current to {largest:.4g} A, or the gear {largest / most:.3g} times"
+    yield (
+        "voltage",
+        "|R i + L di/dt + N kE omega|, largest",
+        asked.voltage,
+        limit,
+        "V",
+        (SURELY, unmet),
+        remedy,
+    )
+    remedy = (
+        f"raise controller.max_current to {largest:.4g} A, or the gear {largest / most:.3g} times"
+    )
     remedy += _time_within(currents, most, "A")
     yield "current", "|i|, largest", currents, most, "A", (SURELY, unmet), remedy
-    bears, remedy = math.nan, f"its continuous current is not known, must be at least {asked.rms_current:.3g} A"
+    bears, remedy = (
+        math.nan,
+        f"its continuous current is not known, must be at least {asked.rms_current:.3g} A",
+    )
     if continuous is not None:
         bears = continuous
-        remedy = f"let it rest, cool it, or raise the gear {asked.rms_current / continuous:.3g} times"
+        remedy = (
+            f"let it rest, cool it, or raise the gear {asked.rms_current / continuous:.3g} times"
+        )
     yield "heat", "i, rms", asked.rms_current, bears, "A", (SURELY, TRY_IT), remedy
     if not demand.exact:
         yield from _taken(drive, demand, asked)
     power = demand.torque * demand.speed
     driving = np.where(power >= 0.0, np.abs(demand.torque), 0.0)
     current = min(limit / (motor.resistance + drive.sag), most)
-    still = motor.torque_constant * motor.gear_efficiency * current / drive.arm_radius - drive.additions.friction
+    still = (
+        motor.torque_constant * motor.gear_efficiency * current / drive.arm_radius
+        - drive.additions.friction
+    )
     still -= motor.stribeck_friction / drive.arm_radius
     verdicts = TRY_IT, unmet if still > 0.0 else SURELY_NOT
     remedy = "raise the supply, the largest current or the gear"
     yield "stall", "|tau| but of braking, largest", driving, still, unit, verdicts, remedy
     at = int(np.argmax(power))
-    torque, speed, least = abs(float(demand.torque[at])) / motor.gear_efficiency, abs(float(demand.speed[at])), 0.0
-    if torque * speed * motor.back_emf_constant > 0.0:  # what the largest power takes at any gear [V]
+    torque, speed, least = (
+        abs(float(demand.torque[at])) / motor.gear_efficiency,
+        abs(float(demand.speed[at])),
+        0.0,
+    )
+    if (
+        torque * speed * motor.back_emf_constant > 0.0
+    ):  # what the largest power takes at any gear [V]
         least = 2.0 * float(best_ratio(torque, speed, motor)) * motor.back_emf_constant * speed
         least *= math.sqrt(1.0 + drive.sag / motor.resistance)
     needed = float(power.max(initial=0.0)) / motor.gear_efficiency
-    remedy = f"no gear helps: raise the supply to {least:.4g} V and the largest current, or take a stronger motor"
+    remedy = (
+        f"no gear helps: raise the supply to {least:.4g} V and the largest current, or take a"
+        " stronger motor"
+    )
     remedy = remedy if demand.exact else f"to follow this very run {remedy}"
-    yield "power", "tau omega / eta, largest", needed, most_power(drive), "W", (TRY_IT, unmet), remedy
+    yield (
+        "power",
+        "tau omega / eta, largest",
+        needed,
+        most_power(drive),
+        "W",
+        (TRY_IT, unmet),
+        remedy,
+    )
 
 
 def _time_within(load: np.ndarray, available: float, unit: str) -> str:
     """Say for how much of the time a motor has what is needed."""
-    return f" ({available:.4g} {unit} suffice for {math.floor(100.0 * float(np.mean(load <= available)))}% of the time)"
+    return (
+        f" ({available:.4g} {unit} suffice for"
+        f" {math.floor(100.0 * float(np.mean(load <= available)))}% of the time)"
+    )
 
 
 def _taken(drive: Drive, demand: Demand, asked: Operation) -> Iterator[_Row]:
@@ -274,12 +354,30 @@ def _taken(drive: Drive, demand: Demand, asked: Operation) -> Iterator[_Row]:
     inertial = max(asked.own_share - rubbed, 1e-9)
     scale = (math.sqrt(rubbed * rubbed + 4.0 * inertial * MOST_SHARE) - rubbed) / (2.0 * inertial)
     rows = (
-        ("rotor", "rotor and friction", asked.own_share, MOST_SHARE, scale, "let policies command voltage"),
-        ("friction", "Coulomb friction", rubbed, MOST_FRICTION, MOST_FRICTION / max(rubbed, 1e-300), "train with it"),
+        (
+            "rotor",
+            "rotor and friction",
+            asked.own_share,
+            MOST_SHARE,
+            scale,
+            "let policies command voltage",
+        ),
+        (
+            "friction",
+            "Coulomb friction",
+            rubbed,
+            MOST_FRICTION,
+            MOST_FRICTION / max(rubbed, 1e-300),
+            "train with it",
+        ),
     )
     for name, formula, taken, most, times, otherwise in rows:
         gear = times / drive.arm_radius
-        remedy = f"lower the gear to {gear:.3g}" if demand.linear or gear >= 1.0 else "take a smaller motor"
+        remedy = (
+            f"lower the gear to {gear:.3g}"
+            if demand.linear or gear >= 1.0
+            else "take a smaller motor"
+        )
         formula, remedy = f"{formula}, share of the largest load", f"{remedy}, or {otherwise}"
         yield name, formula, 100.0 * taken, 100.0 * most, "%", (SURELY, TRY_IT), remedy
 
@@ -295,7 +393,9 @@ def _unknown_rotor(drive: Drive, demand: Demand, continuous: float | None) -> li
     def suffices(inertia: float) -> bool:
         heavier = drive.replaced({"motor.rotor_inertia": inertia})
         asked = operation(demand, heavier)
-        return margin(heavier, asked, continuous) >= 0.0 and (demand.exact or asked.own_share <= MOST_SHARE)
+        return margin(heavier, asked, continuous) >= 0.0 and (
+            demand.exact or asked.own_share <= MOST_SHARE
+        )
 
     low, high = 1e-12, 1.0
     if suffices(high):
@@ -306,7 +406,9 @@ def _unknown_rotor(drive: Drive, demand: Demand, continuous: float | None) -> li
             middle = math.sqrt(low * high)
             low, high = (middle, high) if suffices(middle) else (low, middle)
         remedy, most = f"{remedy}, must be at most {low:.3g} kg*m^2 at the motor", low
-    return [Bound("rotor", "inertia of the rotor", math.nan, most, "kg*m^2", False, DEPENDS, remedy)]
+    return [
+        Bound("rotor", "inertia of the rotor", math.nan, most, "kg*m^2", False, DEPENDS, remedy)
+    ]
 
 
 def _swinging(drive: Drive, swing: Swing) -> list[Bound]:
@@ -319,7 +421,22 @@ def _swinging(drive: Drive, swing: Swing) -> list[Bound]:
         gained, remedy = energy(swing, drive), ""
         if gained <= 0.0:
             volts = least_voltage(swing, drive, energy)
-            remedy = f"raise the supply to {volts:.3g} V" if math.isfinite(volts) else "raise the largest current"
+            remedy = (
+                f"raise the supply to {volts:.3g} V"
+                if math.isfinite(volts)
+                else "raise the largest current"
+            )
             remedy += ", or change the gear"
-        bounds.append(Bound(name, formula, 0.0, gained, "J", gained > 0.0, TRY_IT if gained > 0.0 else unmet, remedy))
+        bounds.append(
+            Bound(
+                name,
+                formula,
+                0.0,
+                gained,
+                "J",
+                gained > 0.0,
+                TRY_IT if gained > 0.0 else unmet,
+                remedy,
+            )
+        )
     return bounds

@@ -1,10 +1,11 @@
 """The current loop of a drive or an `Actuator`: gains, margins, bandwidth, and steps by their own equations.
 
-As the sampled current sees it: the winding under a zero-order hold is (1 - e)/R/(z - e) with e = exp(-R*T/L), the PI
-controller ((kp + ki*T)*z - kp)/(z - 1), the delay of a sample 1/z. Source: Franklin, Powell, Workman, *Digital Control
-of Dynamic Systems*, ch. 4; `codrl_mj.actuators.sampled` has the design. An `Actuator`'s winding is stepped by Euler's
-rule, T/L/(z - 1 + R*T/L), under the PID controller of `codrl_mj.actuators.current_loop`; its sample rate is that of the
-mechanical steps, times its substeps, so that its functions take a mechanical step [s].
+As the sampled current sees it: the winding under a zero-order hold is (1 - e)/R/(z - e) with e =
+exp(-R*T/L), the PI controller ((kp + ki*T)*z - kp)/(z - 1), the delay of a sample 1/z. Source:
+Franklin, Powell, Workman, *Digital Control of Dynamic Systems*, ch. 4; `codrl_mj.actuators.sampled`
+has the design. An `Actuator`'s winding is stepped by Euler's rule, T/L/(z - 1 + R*T/L), under the
+PID controller of `codrl_mj.actuators.current_loop`; its sample rate is that of the mechanical
+steps, times its substeps, so that its functions take a mechanical step [s].
 """
 
 import dataclasses
@@ -19,7 +20,9 @@ from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 from codrl_mj.fields import check_memory
 
 Looped = Drive | Actuator
-_SAMPLE_SIZE = 500  # memory [bytes] of a sample in the responses to a step, with each kind of anti-windup
+_SAMPLE_SIZE = (
+    500  # memory [bytes] of a sample in the responses to a step, with each kind of anti-windup
+)
 RATES = (10e3, 20e3, 40e3)
 """Sample rates [Hz] that drives commonly have."""
 
@@ -42,7 +45,10 @@ def gains(drive: Drive) -> tuple[float, float]:
 def sampled_too_seldom(drive: Drive) -> str:
     """What to say of less than a sample in three L/R, within which 95 % of a current's change happen; else empty."""
     rate, constant = drive.controller.sample_rate, drive.motor.electrical_time_constant
-    text = f"sample_rate = {rate:g} Hz: a sample lasts {1.0 / rate / constant:,.1f} times the winding's L/R = "
+    text = (
+        f"sample_rate = {rate:g} Hz: a sample lasts {1.0 / rate / constant:,.1f} times the"
+        " winding's L/R = "
+    )
     text += f"{1e3 * constant:.3g} ms, so that the current settles before the loop sees it: take "
     return "" if 3.0 * rate * constant >= 1.0 else f"{text}{1.0 / 3.0 / constant:,.0f} Hz or more"
 
@@ -69,7 +75,9 @@ def _sampled(one: Looped, timestep: float | None) -> _Sampled:
         (kp, ki), rate = gains(one), one.controller.sample_rate
         time = 1.0 / rate
         if one.controller.kp == 0.0 and one.controller.ki == 0.0:
-            constant = 1.0 / (2.0 * math.pi * (one.controller.bandwidth or DEFAULT_BANDWIDTH * rate))
+            constant = 1.0 / (
+                2.0 * math.pi * (one.controller.bandwidth or DEFAULT_BANDWIDTH * rate)
+            )
         decay = math.exp(-resistance * time / inductance)
         effect = -math.expm1(-resistance * time / inductance) / resistance  # [A/V], of a sample
         over = np.array([effect * (kp + ki * time), -effect * kp])
@@ -78,19 +86,31 @@ def _sampled(one: Looped, timestep: float | None) -> _Sampled:
         most, delayed = one.controller.max_current, one.controller.delayed
         return _Sampled(rate, (kp, ki), over, under, over, kp + ki / rate, constant, most, delayed)
     if timestep is None:
-        raise ValueError("timestep = None: must be the mechanical step [s] of an Actuator, whose loop is closed in it")
+        raise ValueError(
+            "timestep = None: must be the mechanical step [s] of an Actuator, whose loop is closed"
+            " in it"
+        )
     rate, loop = one.controller.substeps / timestep, one.controller
     time = 1.0 / rate
     pid, below = np.array([loop.kp]), np.array([1.0])  # from error [A] to voltage [V]
     for gain, up, down in (
         (loop.ki, [time, 0.0], [1.0 + loop.integral_leak * time, -1.0]),
-        (loop.kd, [1.0, -1.0], [time + loop.derivative_time_constant, -loop.derivative_time_constant]),
+        (
+            loop.kd,
+            [1.0, -1.0],
+            [time + loop.derivative_time_constant, -loop.derivative_time_constant],
+        ),
     ):
         if gain:
-            pid, below = np.polyadd(np.polymul(pid, down), gain * np.polymul(up, below)), np.polymul(below, down)
+            pid, below = (
+                np.polyadd(np.polymul(pid, down), gain * np.polymul(up, below)),
+                np.polymul(below, down),
+            )
     over = pid * time / inductance
     under = np.polymul(below, [1.0, resistance * time / inductance - 1.0])
-    forward = np.polyadd(over, loop.kff * time / inductance * below)  # feed-forward goes past the error
+    forward = np.polyadd(
+        over, loop.kff * time / inductance * below
+    )  # feed-forward goes past the error
     at_once = pid[0] / below[0] + loop.kff
     return _Sampled(rate, (loop.kp, loop.ki), over, under, forward, at_once, constant)
 
@@ -108,7 +128,9 @@ def closed_loop(one: Looped, timestep: float | None = None) -> Any:
     import control
 
     loop = _sampled(one, timestep)
-    return control.TransferFunction(loop.forward, np.polyadd(loop.under, loop.over), 1.0 / loop.rate)
+    return control.TransferFunction(
+        loop.forward, np.polyadd(loop.under, loop.over), 1.0 / loop.rate
+    )
 
 
 class Response(NamedTuple):
@@ -142,10 +164,16 @@ class Response(NamedTuple):
         """When the current stays within a share of the last reference [s after that came]; NaN: not within sight."""
         wrong = np.flatnonzero(np.abs(self.current[self._last :] / self.reference[-1] - 1.0) > band)
         settled = self._last + (int(wrong[-1]) + 1 if len(wrong) else 0)
-        return float(self.time[settled] - self.time[self._last]) if settled < len(self.time) else math.nan
+        return (
+            float(self.time[settled] - self.time[self._last])
+            if settled < len(self.time)
+            else math.nan
+        )
 
 
-def respond(one: Looped, references: Any, speed: float = 0.0, timestep: float | None = None) -> Response:
+def respond(
+    one: Looped, references: Any, speed: float = 0.0, timestep: float | None = None
+) -> Response:
     """Step a loop one sample at a time, through its own `advance`, from where it has held a current of 0 at its speed.
 
     Args:
@@ -169,7 +197,9 @@ def respond(one: Looped, references: Any, speed: float = 0.0, timestep: float | 
     for reference in references:
         before = state.current
         torque = one.motor.torque_constant * float(reference)
-        state, _, signals = one.advance(parameters, time, state, Inputs(torque, 0.0, speed, 0.0, 0.0))
+        state, _, signals = one.advance(
+            parameters, time, state, Inputs(torque, 0.0, speed, 0.0, 0.0)
+        )
         rows.append((signals.reference_current, before, signals.voltage))
     return Response(time * np.arange(len(rows)), *np.array(rows).T)
 
@@ -177,14 +207,16 @@ def respond(one: Looped, references: Any, speed: float = 0.0, timestep: float | 
 def small_step(one: Looped, timestep: float | None = None) -> Response:
     """The step from rest to a current that does not saturate.
 
-    It is a tenth of V/R, or what half the voltage makes at once, or `max_current`, whichever is smallest; 1 A where the
-    voltage has no limit. It lasts 20 time constants of the designed loop, or of the winding under given gains, and 100
-    to 20000 samples.
+    It is a tenth of V/R, or what half the voltage makes at once, or `max_current`, whichever is
+    smallest; 1 A where the voltage has no limit. It lasts 20 time constants of the designed loop,
+    or of the winding under given gains, and 100 to 20000 samples.
     """
     loop, limit = _sampled(one, timestep), one.voltage_limit
     amplitude = min(0.1 * limit / one.winding[0], 0.5 * limit / loop.at_once, loop.most)
     samples = min(max(math.ceil(20.0 * loop.constant * loop.rate), 100), 20_000)
-    return respond(one, np.full(samples, amplitude if math.isfinite(amplitude) else 1.0), timestep=timestep)
+    return respond(
+        one, np.full(samples, amplitude if math.isfinite(amplitude) else 1.0), timestep=timestep
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,10 +255,14 @@ def design(one: Looped, timestep: float | None = None) -> LoopDesign:
     """
     loop = _sampled(one, timestep)
     one.check(1.0 / loop.rate if timestep is None else timestep)
-    opened, closed, step = open_loop(one, timestep), closed_loop(one, timestep), small_step(one, timestep)
-    # margins are searched for on the unit circle, which slow loops and the pole at z = 1 leave exact; python-control's,
-    # by the roots of polynomials, are not. At half the sample rate, z = -1, the loop is real: without a crossing before
-    # it the gain margin is read there
+    opened, closed, step = (
+        open_loop(one, timestep),
+        closed_loop(one, timestep),
+        small_step(one, timestep),
+    )
+    # margins are searched for on the unit circle, which slow loops and the pole at z = 1 leave
+    # exact; python-control's, by the roots of polynomials, are not. At half the sample rate, z =
+    # -1, the loop is real: without a crossing before it the gain margin is read there
     turned = _first_below(lambda z: -opened(z).imag, loop.rate)
     turned = 0.5 * loop.rate if math.isnan(turned) else turned
     crossover = _first_below(lambda z: abs(opened(z)) - 1.0, loop.rate)
@@ -307,14 +343,19 @@ class Steps(NamedTuple):
 def step(drive: Drive) -> Steps:
     """Step a drive's current: small, and out of saturation with each kind of anti-windup.
 
-    In saturation 1.8 times of what the voltage can make at `Steps.speed` is asked for, then 0.4 times of it.
+    In saturation 1.8 times of what the voltage can make at `Steps.speed` is asked for, then 0.4
+    times of it.
 
     Raises:
-        ValueError: the loop is unstable, the message has the spectral radius and a remedy; or its samples are too few.
+        ValueError: the loop is unstable, the message has the spectral radius and a remedy; or its
+            samples are too few.
     """
     loop = drive.controller
     if loop.sample_rate < 1e3:
-        raise ValueError(f"SampledLoop.sample_rate = {loop.sample_rate:g}: must be >= 1000 Hz, to see a step; raise it")
+        raise ValueError(
+            f"SampledLoop.sample_rate = {loop.sample_rate:g}: must be >= 1000 Hz, to see a step;"
+            " raise it"
+        )
     samples = (_UNREACHABLE + _AFTER) * loop.sample_rate
     what = f"SampledLoop.sample_rate = {loop.sample_rate:g}: {samples:,.0f} samples of a step"
     check_memory(_SAMPLE_SIZE * samples, what, "lower it")
@@ -326,8 +367,11 @@ def step(drive: Drive) -> Steps:
         speed = (voltage - motor.resistance * unreachable / 1.8) / motor.back_emf_constant
     reachable = 0.4 / 1.8 * unreachable
     spans = (_UNREACHABLE, unreachable), (_AFTER, reachable)
-    references = np.concatenate([np.full(round(time * loop.sample_rate), current) for time, current in spans])
+    references = np.concatenate(
+        [np.full(round(time * loop.sample_rate), current) for time, current in spans]
+    )
     recoveries = {
-        kind: respond(drive.replaced({"controller.anti_windup": kind}), references, speed) for kind in ANTI_WINDUPS
+        kind: respond(drive.replaced({"controller.anti_windup": kind}), references, speed)
+        for kind in ANTI_WINDUPS
     }
     return Steps(small_step(drive), speed, unreachable, reachable, recoveries)

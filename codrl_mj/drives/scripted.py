@@ -30,8 +30,8 @@ def swing_up_and_hold(states: np.ndarray) -> np.ndarray:
 def swing_up_and_balance(states: np.ndarray) -> np.ndarray:
     """Furuta: pump energy while the arm is kept near its middle (Astrom and Furuta 2000), then balance by an LQR.
 
-    The rod's energy over the top is 6.66e-5 speed^2 + 0.0152 (cos(angle) - 1) J. The LQR's gains are those at 20 ms of
-    weights 1, 1, 0.01, 0.01 of the state and 1/0.02^2 of the torque.
+    The rod's energy over the top is 6.66e-5 speed^2 + 0.0152 (cos(angle) - 1) J. The LQR's gains
+    are those at 20 ms of weights 1, 1, 0.01, 0.01 of the state and 1/0.02^2 of the torque.
     """
     arm, rod, arm_speed, rod_speed = states.T
     rod = (rod + np.pi) % (2 * np.pi) - np.pi
@@ -68,7 +68,9 @@ class Scripted:
             "cartpole": ("scripted balancing", balance),
             "furuta": ("scripted swing-up and balance", swing_up_and_balance),
         }
-        self.description, self._law = laws.get(task.name, ("scripted energy pumping", pumping(task)))
+        self.description, self._law = laws.get(
+            task.name, ("scripted energy pumping", pumping(task))
+        )
         self._task = task
 
     def predict(

@@ -42,22 +42,25 @@ class Swing(NamedTuple):
     def push(self, speed: Any, drive: Drive) -> Any:
         """The most torque [N*m] in the direction of motion, friction taken off.
 
-        min(tau_max, N eta kT min((V - N kE omega)/R, i_max)): negative beyond the no-load speed, where nothing but a
-        higher voltage keeps the current from braking. R: with the supply's.
+        min(tau_max, N eta kT min((V - N kE omega)/R, i_max)): negative beyond the no-load speed,
+        where nothing but a higher voltage keeps the current from braking. R: with the supply's.
         """
         motor, ratio, added = drive.motor, 1.0 / drive.arm_radius, drive.additions
         back_emf = ratio * motor.back_emf_constant * np.asarray(speed)
         current = highest_current(motor.resistance, drive.voltage_limit, drive.sag, back_emf)
         current = np.minimum(current, drive.controller.max_current)
-        torque = np.minimum(self.largest, ratio * motor.torque_constant * motor.gear_efficiency * current)
+        torque = np.minimum(
+            self.largest, ratio * motor.torque_constant * motor.gear_efficiency * current
+        )
         return torque - self.friction - added.friction - (self.damping + added.damping) * speed
 
 
 def least_pumped(swing: Swing, drive: Drive) -> float:
     """The energy [J] that full force brings in during a swing, where that is least on the way up: an estimate.
 
-    min over E of the integral of push(omega) over theta, with omega = sqrt(2 (E - potential(theta)) / I): the energy
-    of the swing is taken as constant. Infinite where the torque lifts the pendulum without a swing.
+    min over E of the integral of push(omega) over theta, with omega = sqrt(2 (E - potential(theta))
+    / I): the energy of the swing is taken as constant. Infinite where the torque lifts the pendulum
+    without a swing.
     """
     if swing.push(0.0, drive) >= swing.gravity:
         return math.inf
@@ -69,26 +72,33 @@ def least_pumped(swing: Swing, drive: Drive) -> float:
 def least_gain(swing: Swing, drive: Drive) -> float:
     """The energy [J] that a pendulum gains from rest to rest in a swing, where that is least: the most that there is.
 
-    dE/dtheta = push(omega(E - potential(theta))) from each turning point. Whatever else a controller does, E grows
-    less everywhere, and so ends lower: where this is not positive, no controller passes that amplitude. That leaves
-    out inductance, which only delays, and the hold of the speed over a step. A swing that goes over the top, or comes
-    to rest where the torque at standstill lifts it on, is through: infinite.
+    dE/dtheta = push(omega(E - potential(theta))) from each turning point. Whatever else a
+    controller does, E grows less everywhere, and so ends lower: where this is not positive, no
+    controller passes that amplitude. That leaves out inductance, which only delays, and the hold of
+    the speed over a step. A swing that goes over the top, or comes to rest where the torque at
+    standstill lifts it on, is through: infinite.
     """
     still = swing.push(0.0, drive)
     if still >= swing.gravity:
         return math.inf
     starts = np.arccos(1.0 - 2.0 * _LEVELS)
-    carried = np.pi - math.asin(max(still, 0.0) / swing.gravity)  # from there on the torque lifts without a swing
+    carried = np.pi - math.asin(
+        max(still, 0.0) / swing.gravity
+    )  # from there on the torque lifts without a swing
     starts = starts[starts < carried]
     energy, furthest, moving = swing.potential(starts), -starts, np.ones(len(starts), bool)
     for angle in _ANGLES[:-1]:
         begun = moving & (angle >= -starts)
-        gained = energy + _STEP * swing.push(swing.speed(energy - swing.potential(angle), drive), drive)
+        gained = energy + _STEP * swing.push(
+            swing.speed(energy - swing.potential(angle), drive), drive
+        )
         energy = np.where(begun, gained, energy)
         moving &= ~begun | (energy > swing.potential(angle + _STEP))
         furthest = np.where(begun & moving, angle + _STEP, furthest)
     through = furthest >= carried
-    return float(np.where(through, np.inf, swing.potential(furthest) - swing.potential(starts)).min())
+    return float(
+        np.where(through, np.inf, swing.potential(furthest) - swing.potential(starts)).min()
+    )
 
 
 def least_voltage(swing: Swing, drive: Drive, energy: Callable[[Swing, Drive], float]) -> float:

@@ -1,7 +1,8 @@
 """MuJoCo's control and bias callbacks for our actuators, compiled to C functions by numba: the door of tasks.
 
-They are pure functions of (mjModel, mjData): which actuators are ours, and their parameters, is read from the model;
-all state is in `data.act`. The structures' offsets are compiled in: code kept on disk has them in its key.
+They are pure functions of (mjModel, mjData): which actuators are ours, and their parameters, is
+read from the model; all state is in `data.act`. The structures' offsets are compiled in: code kept
+on disk has them in its key.
 """
 
 import ctypes
@@ -41,7 +42,10 @@ def _slot_of(model: int, data: int, actuator: int) -> int:
 
 @internal(inline="always")
 def _is_ours(model: int, actuator: int) -> bool:
-    if MODEL.actuator_dyntype(model)[actuator] != _USER_DYNAMICS or MODEL.nuser_actuator(model) < HEAD:
+    if (
+        MODEL.actuator_dyntype(model)[actuator] != _USER_DYNAMICS
+        or MODEL.nuser_actuator(model) < HEAD
+    ):
         return False
     user = f64(user_of(model, actuator))
     return (
@@ -94,7 +98,10 @@ def compiled_motors() -> dict[str, Any]:
             return 0.0  # as the engine does when there is no callback
         return f64(_slot_of(model, data, actuator))[2]
 
-    return {"control": callback(control), "act_bias": callback(act_bias, ctypes.c_double, ctypes.c_int)}
+    return {
+        "control": callback(control),
+        "act_bias": callback(act_bias, ctypes.c_double, ctypes.c_int),
+    }
 
 
 # -- installing them, and that of hills, without trampling on anybody else's -----------------------------------
@@ -103,8 +110,9 @@ _PARTS: dict[str, tuple[tuple[str, ...], Callable[[], dict[str, Any]], str]] = {
     "motor": (("control", "act_bias"), compiled_motors, "actuator='ideal' or physics='analytic'"),
     "hill": (("passive",), compiled_hill, "physics='analytic'"),
 }
-"""Callbacks that are installed together: MuJoCo's names, as in `mujoco.set_mjcb_...`; what compiles them, by these
-names; and what else a user could do than to install them."""
+"""Callbacks that are installed together: MuJoCo's names, as in `mujoco.set_mjcb_...`; what compiles
+them, by these names; and what else a user could do than to install them.
+"""
 
 
 class CallbackInUseError(RuntimeError):
@@ -133,12 +141,14 @@ def installed(*parts: str) -> bool:
 def install(*parts: str) -> None:
     """Install the callbacks that run our motors, or our hills; harmless when they are installed already.
 
-    The callbacks are process-wide, as all of MuJoCo's are. They act on actuators and joints that carry our signature in
-    their user data and on nothing else: other models, and foreign actuators and joints of the same model, behave as
-    without them. A process in which no model has a hill need not pay for the hill's callback.
+    The callbacks are process-wide, as all of MuJoCo's are. They act on actuators and joints that
+    carry our signature in their user data and on nothing else: other models, and foreign actuators
+    and joints of the same model, behave as without them. A process in which no model has a hill
+    need not pay for the hill's callback.
 
     Args:
-        *parts: `motor` (`mjcb_control` and `mjcb_act_bias`), `hill` (`mjcb_passive`), or both; none means `motor`.
+        *parts: `motor` (`mjcb_control` and `mjcb_act_bias`), `hill` (`mjcb_passive`), or both; none
+            means `motor`.
 
     Raises:
         ValueError: no such part.
@@ -150,9 +160,9 @@ def install(*parts: str) -> None:
         ours, present = _whose(name)
         if present is not None and not ours:
             raise CallbackInUseError(
-                f"mujoco.mjcb_{name} is already set, to {present!r}: refusing to replace it. Remove it with "
-                f"mujoco.set_mjcb_{name}(None) first, or build the environment with {_PARTS[part][2]}, which "
-                "needs no such callback"
+                f"mujoco.mjcb_{name} is already set, to {present!r}: refusing to replace it. Remove"
+                f" it with mujoco.set_mjcb_{name}(None) first, or build the environment with"
+                f" {_PARTS[part][2]}, which needs no such callback"
             )
         if not ours:
             missing.append((part, name))

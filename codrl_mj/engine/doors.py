@@ -15,7 +15,11 @@ from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import at, call, internal, on_stack, symbol, u64
 from codrl_mj.kept import cfunc
 
-_NO_CLAMP, _GROUPS, _LARGEST = int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL), mujoco.mjNGROUP, mujoco.mjMAXVAL
+_NO_CLAMP, _GROUPS, _LARGEST = (
+    int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL),
+    mujoco.mjNGROUP,
+    mujoco.mjMAXVAL,
+)
 MOST_ON_STACK = 1024
 """Degrees of freedom up to which the work is done on the stack, which is quicker."""
 _ADDRESS = np.zeros(1, dtype=np.uintp)
@@ -85,7 +89,9 @@ def _eliminated(model: int, data: int, output: int, gear: float, turned: Any) ->
             continue
         total += turned[row] * turned[row] * DATA.qLDiagInv(data)[row]
         start = MODEL.M_rowadr(model)[row]
-        for entry in range(start, start + MODEL.M_rownnz(model)[row] - 1):  # its ancestors; then itself
+        for entry in range(
+            start, start + MODEL.M_rownnz(model)[row] - 1
+        ):  # its ancestors; then itself
             turned[MODEL.M_colind(model)[entry]] -= DATA.qLD(data)[entry] * turned[row]
     return 1.0 / total if total > 0.0 else math.inf
 
@@ -94,12 +100,16 @@ def _eliminated(model: int, data: int, output: int, gear: float, turned: Any) ->
 def load_inertia() -> Any:
     """Compile what `inertia_at` calls, once a process; returns what owns the machine code.
 
-    With its moment m, the gear times a row of `actuator_moment`, and the inertia matrix M = L^T*D*L that
-    `mj_fwdPosition` has factorised, it is 1/(m*M^-1*m): how hard it is to turn with all other joints free. Infinite
-    where nothing moves.
+    With its moment m, the gear times a row of `actuator_moment`, and the inertia matrix M = L^T*D*L
+    that `mj_fwdPosition` has factorised, it is 1/(m*M^-1*m): how hard it is to turn with all other
+    joints free. Infinite where nothing moves.
     """
 
-    @cfunc(types.float64(types.uintp, types.uintp, types.int32, types.float64), nogil=True, error_model="numpy")
+    @cfunc(
+        types.float64(types.uintp, types.uintp, types.int32, types.float64),
+        nogil=True,
+        error_model="numpy",
+    )
     def through_gear(model: int, data: int, output: int, gear: float) -> float:
         count = MODEL.nv(model)
         if count > MOST_ON_STACK:

@@ -1,7 +1,7 @@
 """Families of actuators, compiled: one table of C functions that both doors into MuJoCo call by a family's number.
 
-A family's number is in the model's `user` data, so a callback or plugin that was compiled once runs families that were
-written later. Compiling one takes a fraction of a second, once a process.
+A family's number is in the model's `user` data, so a callback or plugin that was compiled once runs
+families that were written later. Compiling one takes a fraction of a second, once a process.
 """
 
 import contextlib
@@ -24,15 +24,17 @@ from codrl_mj.kept import Note, cfunc
 from codrl_mj.own_code import Form, check_form, not_compiled
 
 SIGNATURE = (250700.0, 268401.0)
-"""First two numbers of the `user` data of every actuator and joint that is ours: the paper's arXiv identifier, in two,
-because a number keeps six digits in an XML file."""
+"""First two numbers of the `user` data of every actuator and joint that is ours: the paper's arXiv
+identifier, in two, because a number keeps six digits in an XML file.
+"""
 
 
 class Slot(NamedTuple):
     """What the state of an actuator of ours begins with, in `data.act` or `data.plugin_state`.
 
-    The family's committed state follows (at time `tick`), then its candidate one step later, then its signals, then a
-    0: the engine multiplies the last activation by the actuator's gain, 0, which makes NaN of infinity.
+    The family's committed state follows (at time `tick`), then its candidate one step later, then
+    its signals, then a 0: the engine multiplies the last activation by the actuator's gain, 0,
+    which makes NaN of infinity.
     """
 
     tick: float
@@ -47,11 +49,13 @@ HEAD, SLOT = 3, len(Slot._fields)
 """Numbers of what an actuator's `user` data, and its state, begin with."""
 
 _ADDRESSES = np.zeros(10**6, dtype=np.uintp)
-"""Address of a family's compiled function by its number; 0 where it has not been compiled. 8 MB that the system hands
-out page by page."""
+"""Address of a family's compiled function by its number; 0 where it has not been compiled. 8 MB
+that the system hands out page by page.
+"""
 STATES, SIGNALS, PARAMETERS, INERTIA, MOTION, WHOLE = range(6)
-"""Columns of the table of sizes: a family's numbers of states, signals and parameters, whether it asks for the inertia
-and is asked for motions, and its `slot_size`."""
+"""Columns of the table of sizes: a family's numbers of states, signals and parameters, whether it
+asks for the inertia and is asked for motions, and its `slot_size`.
+"""
 _SIZES = np.zeros((10**6, 6), dtype=np.int32)
 """The sizes of a family, by its number."""
 _REFERENCES = np.zeros(10**6, dtype=np.uintp)
@@ -93,9 +97,9 @@ def load_family(family: Family) -> None:
     A class that was defined anew, as in a notebook, takes the place of the one before.
 
     Raises:
-        ValueError: another family has the same number: rename one of the two. Or the one before had other numbers of
-            states, signals or parameters, which models that exist rely on. Or `advance` is not what numba compiles, or
-            does not return what the family declares.
+        ValueError: another family has the same number: rename one of the two. Or the one before had
+            other numbers of states, signals or parameters, which models that exist rely on. Or
+            `advance` is not what numba compiles, or does not return what the family declares.
     """
     check_family(family)
     number, sizes = family_number(family), family_sizes(family)
@@ -104,12 +108,14 @@ def load_family(family: Family) -> None:
         return
     if other is not None and reference(other) != reference(family):
         raise ValueError(
-            f"families {reference(family)} and {reference(other)} have the same number {number}: rename one"
+            f"families {reference(family)} and {reference(other)} have the same number {number}:"
+            " rename one"
         )
     if other is not None and family_sizes(other) != sizes:
         raise ValueError(
-            f"family {reference(family)} has {sizes[:3]} states, signals and parameters, and {family_sizes(other)[:3]} "
-            "when it was loaded before: give it another name, or start Python anew"
+            f"family {reference(family)} has {sizes[:3]} states, signals and parameters, and"
+            f" {family_sizes(other)[:3]} when it was loaded before: give it another name, or start"
+            " Python anew"
         )
     if family.INERTIA:
         load_inertia()
@@ -229,8 +235,15 @@ def compiled_advance(family: Family) -> Callable[..., Any]:
     load_family(family)
     function, (states, signals, _) = _compile(family).ctypes, family_sizes(family)[:3]
 
-    def advance(parameters: Any, timestep: float, state: Any, inputs: Inputs) -> tuple[Any, float, Any]:
-        numbers, before, after, seen = np.array(parameters), np.array(state), np.empty(states), np.empty(signals)
+    def advance(
+        parameters: Any, timestep: float, state: Any, inputs: Inputs
+    ) -> tuple[Any, float, Any]:
+        numbers, before, after, seen = (
+            np.array(parameters),
+            np.array(state),
+            np.empty(states),
+            np.empty(signals),
+        )
         addresses = [one.ctypes.data for one in (numbers, before, after, seen)]
         torque = function(addresses[0], timestep, *addresses[1:], *inputs)
         return after, torque, seen
@@ -246,10 +259,14 @@ def compiled_observe(family: Family) -> Any:
     """
     kind, signals_of = parameters_type(family), family.Signals
     kinds = tuple_of(kind), types.float64, tuple_of(signals_of), tuple_of(Inputs)
-    observe = compiled_function(family.observe, family.OBSERVED, f"{family.__name__}.OBSERVED", *kinds)
+    observe = compiled_function(
+        family.observe, family.OBSERVED, f"{family.__name__}.OBSERVED", *kinds
+    )
 
     @internal
-    def fill(parameters: int, shown: int, timestep: float, time: float, key: float, seen: int) -> None:
+    def fill(
+        parameters: int, shown: int, timestep: float, time: float, key: float, seen: int
+    ) -> None:
         inputs = Inputs(0.0, 0.0, 0.0, time, key)
         write(observe(read(parameters, kind), timestep, read(shown, signals_of), inputs), seen)
 
@@ -302,14 +319,26 @@ def advance_slot(
 ) -> float:
     """Compute an actuator's candidate and signals from its committed state; the torque [N*m], which its slot keeps too.
 
-    By address are the parameters and the slot; torque asked for [N*m], position [rad], speed [rad/s] and inertia
-    [kg*m^2] are the shaft's.
+    By address are the parameters and the slot; torque asked for [N*m], position [rad], speed
+    [rad/s] and inertia [kg*m^2] are the shaft's.
     """
     own, size = f64(slot), 8 * size_of(number, STATES)
     before = slot + 8 * SLOT
     after = before + size
     own[2] = call(
         u64(addresses_at())[number],
-        *(parameters, timestep, before, after, after + size, desired, position, speed, time, own[1], inertia),
+        *(
+            parameters,
+            timestep,
+            before,
+            after,
+            after + size,
+            desired,
+            position,
+            speed,
+            time,
+            own[1],
+            inertia,
+        ),
     )
     return own[2]

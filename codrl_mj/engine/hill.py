@@ -8,12 +8,14 @@ The callback does two things, both pure functions of (mjModel, mjData):
 
 - it adds the hill's force, -mass * gravity * cos(wavenumber * x), to the joint's `qfrc_passive`;
 - it moves the body's geoms, in `data.geom_xpos` and `data.geom_xmat`, up to the hill and tilts them along it. The
-  engine computes geom poses before the passive forces, so whatever draws after `mj_forward` or `mj_step` (a viewer, a
-  renderer) shows the body on the hill, while the dynamics keep the one coordinate x that the task's equations have. The
-  alternatives are worse: more joints need constraints that only approximate the curve, mocap bodies need Python in
-  every viewer. Poses are computed from the body's, not from the geoms' last ones: a second call changes nothing.
+  engine computes geom poses before the passive forces, so whatever draws after `mj_forward` or
+  `mj_step` (a viewer, a renderer) shows the body on the hill, while the dynamics keep the one
+  coordinate x that the task's equations have. The alternatives are worse: more joints need
+  constraints that only approximate the curve, mocap bodies need Python in every viewer. Poses are
+  computed from the body's, not from the geoms' last ones: a second call changes nothing.
 
-The body's frame has x along the joint and z up; bodies attached to it stay at the height of the joint.
+The body's frame has x along the joint and z up; bodies attached to it stay at the height of the
+joint.
 """
 
 import functools
@@ -29,9 +31,10 @@ from codrl_mj.engine.memory import at, callback, f64, internal
 from codrl_mj.kept import cfunc
 
 HILL_NAMES = ("signature_1", "signature_2", "gravity", "wavenumber", "height")
-"""What the `user` entries of one of our slide joints hold, in order: the signature (two numbers), the largest
-acceleration along the hill [m/s^2], 1/(its length/2 pi) [1/m], and the height of crests over the middle [m], which is
-for the eye."""
+"""What the `user` entries of one of our slide joints hold, in order: the signature (two numbers),
+the largest acceleration along the hill [m/s^2], 1/(its length/2 pi) [1/m], and the height of crests
+over the middle [m], which is for the eye.
+"""
 _, _, GRAVITY, WAVENUMBER, HEIGHT = range(len(HILL_NAMES))
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _FIRST, _SECOND = SIGNATURE
@@ -59,10 +62,14 @@ def _place(model: int, data: int, body: int, height: float, slope: float) -> Non
         for row in range(3):
             ahead, left, up = frame[3 * row], frame[3 * row + 1], frame[3 * row + 2]
             along, normal = cosine * ahead + sine * up, cosine * up - sine * ahead
-            position[row] = origin[row] + height * up + along * local[0] + left * local[1] + normal * local[2]
+            position[row] = (
+                origin[row] + height * up + along * local[0] + left * local[1] + normal * local[2]
+            )
             for column in range(3):
                 matrix[3 * row + column] = (
-                    along * rotation[0][column] + left * rotation[1][column] + normal * rotation[2][column]
+                    along * rotation[0][column]
+                    + left * rotation[1][column]
+                    + normal * rotation[2][column]
                 )
 
 

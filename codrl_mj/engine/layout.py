@@ -1,12 +1,14 @@
 """MuJoCo's structures and functions in functions that numba compiles: `MODEL.actuator_user(model)`, `DATA.time(data)`.
 
-Compiled code knows a simulation by two integers, the addresses of its `mjModel` and `mjData`, which must outlive the
-call. A fault that the engine itself finds (an unknown integrator, memory run out) ends the process there, where
-`mujoco.mj_step` would raise `mujoco.FatalError`; our models cause none.
+Compiled code knows a simulation by two integers, the addresses of its `mjModel` and `mjData`, which
+must outlive the call. A fault that the engine itself finds (an unknown integrator, memory run out)
+ends the process there, where `mujoco.mj_step` would raise `mujoco.FatalError`; our models cause
+none.
 
-The offsets differ between MuJoCo versions, so none is written down: `mujoco.introspect` describes the structures as
-the C headers declare them, ctypes lays them out by the platform's ABI, and a field is compared with a live object
-before anything relies on it. Compiled code has the offsets as constants.
+The offsets differ between MuJoCo versions, so none is written down: `mujoco.introspect` describes
+the structures as the C headers declare them, ctypes lays them out by the platform's ABI, and a
+field is compared with a live object before anything relies on it. Compiled code has the offsets as
+constants.
 """
 
 import ctypes
@@ -65,7 +67,8 @@ def _ctype(node: Any) -> Any:
     if node.name.startswith("mjt"):  # the remaining mjt* types are enumerations
         return ctypes.c_int
     raise LayoutError(
-        f"MuJoCo {mujoco.__version__} declares a type that this version of codrl_mj does not know: {node.name!r}"
+        f"MuJoCo {mujoco.__version__} declares a type that this version of codrl_mj does not know:"
+        f" {node.name!r}"
     )
 
 
@@ -122,7 +125,9 @@ _PROBE = """
 @functools.cache
 def _live() -> dict[str, Any]:
     """A model and its data, of which every count has another value, by the names of their structures."""
-    model = mujoco.MjSpec.from_string(_PROBE).compile()  # within `motorised`, which this is no model for
+    model = mujoco.MjSpec.from_string(
+        _PROBE
+    ).compile()  # within `motorised`, which this is no model for
     data = mujoco.MjData(model)
     data.time = 4.56
     mujoco.mj_fwdPosition(model, data)  # uses the stack: `maxuse_stack` is no longer zero
@@ -132,10 +137,13 @@ def _live() -> dict[str, Any]:
 def check_field(struct_name: str, field: str) -> None:
     """Compare the layout of a field of `mjModel` or `mjData` with a live object.
 
-    An array must lie where the layout says, anything else must have its value there. A field that the public bindings
-    do not show (`pbase`), or of which there is nothing, is checked through its neighbours on both sides.
+    An array must lie where the layout says, anything else must have its value there. A field that
+    the public bindings do not show (`pbase`), or of which there is nothing, is checked through its
+    neighbours on both sides.
     """
-    with ThreadPoolExecutor(1) as thread:  # the compiler of a model, which may be running, is not reentrant in its own
+    with ThreadPoolExecutor(
+        1
+    ) as thread:  # the compiler of a model, which may be running, is not reentrant in its own
         owner = thread.submit(_live).result()[struct_name]
     raw: Any = struct(struct_name).from_address(owner._address)
     names = [field]
@@ -151,8 +159,9 @@ def check_field(struct_name: str, field: str) -> None:
         expected = live.ctypes.data if hasattr(live, "ctypes") else live
         if found != expected:
             raise LayoutError(
-                f"MuJoCo {mujoco.__version__}: {struct_name}.{name} reads {found!r} where its layout says, expected "
-                f"{expected!r}. Install a MuJoCo that this version of codrl_mj was tested with (see pyproject.toml)"
+                f"MuJoCo {mujoco.__version__}: {struct_name}.{name} reads {found!r} where its"
+                f" layout says, expected {expected!r}. Install a MuJoCo that this version of"
+                " codrl_mj was tested with (see pyproject.toml)"
             )
 
 
@@ -165,8 +174,8 @@ def _is_shown(owner: Any, field: str) -> bool:
 class Fields(ModuleType):
     """The fields of a structure, each a function of the structure's address for compiled code.
 
-    That of an array is a typed pointer to its entries, any other its value. A module, because numba looks up what these
-    have while it compiles.
+    That of an array is a typed pointer to its entries, any other its value. A module, because numba
+    looks up what these have while it compiles.
     """
 
     def __init__(self, struct_name: str, within: str = "") -> None:
@@ -203,7 +212,8 @@ def _function(struct_name: str, path: str, node: Any) -> Any:
         place = builder.add(arguments[0], context.get_constant(types.uintp, at))
         return builder.load(pointed(builder, place, context.get_value_type(kind)))
 
-    cpu_target.typing_context.refresh()  # numba has to know it at once: it may be compiling what names it
+    # numba has to know it at once: it may be compiling what names it
+    cpu_target.typing_context.refresh()
     return field
 
 
@@ -221,10 +231,14 @@ def address_of(owner: Any, name: str) -> int:
     live = functools.reduce(getattr, name.split("."), owner)
     if isinstance(live, np.ndarray):
         return live.ctypes.data
-    return int(owner._address) + offset("mjModel" if isinstance(owner, mujoco.MjModel) else "mjData", name)
+    return int(owner._address) + offset(
+        "mjModel" if isinstance(owner, mujoco.MjModel) else "mjData", name
+    )
 
 
 @functools.cache
 def engine_function(name: str) -> Any:
     """A function of MuJoCo's of (model, data), such as `mj_step`, by their addresses, for compiled code."""
-    return external(f"codrl_mj_{name}", getattr(library(), name), types.void(types.uintp, types.uintp))
+    return external(
+        f"codrl_mj_{name}", getattr(library(), name), types.void(types.uintp, types.uintp)
+    )

@@ -17,11 +17,16 @@ from numba.extending import intrinsic
 from codrl_mj.kept import linked
 
 internal = functools.partial(
-    numba.njit, forceinline=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
+    numba.njit,
+    forceinline=True,
+    error_model="numpy",
+    no_cpython_wrapper=True,
+    no_cfunc_wrapper=True,
 )
 """`numba.njit` for what only compiled code calls: the ways in from Python, left out, take their time to compile.
 
-Inlined, because numba hands over each number of a tuple by itself: to call with a drive's parameters costs 31 copies.
+Inlined, because numba hands over each number of a tuple by itself: to call with a drive's
+parameters costs 31 copies.
 """
 
 
@@ -35,7 +40,10 @@ def emitted(signature: Callable[..., Any]) -> Callable[[Any], Any]:
         def typed(typing_context: Any, *given: Any) -> Any:
             return signature(*given), emit
 
-        named, own = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.signature(signature).parameters.values()
+        named, own = (
+            inspect.Parameter.POSITIONAL_OR_KEYWORD,
+            inspect.signature(signature).parameters.values(),
+        )
         typed.__signature__ = inspect.Signature([inspect.Parameter("context", named), *own])  # type: ignore[attr-defined]
         typed.__name__, typed.__doc__ = emit.__name__, emit.__doc__
         return intrinsic(typed)
@@ -81,14 +89,20 @@ def symbol(name: str, address: int) -> Any:
 def call(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     """Call a compiled C function by its address, with arguments of just its types; it returns a float64."""
     kinds = [context.get_value_type(kind) for kind in signature.args[1]]
-    function = pointed(builder, arguments[0], ir.FunctionType(context.get_value_type(types.float64), kinds))
-    return builder.call(function, [builder.extract_value(arguments[1], at) for at in range(len(kinds))])
+    function = pointed(
+        builder, arguments[0], ir.FunctionType(context.get_value_type(types.float64), kinds)
+    )
+    return builder.call(
+        function, [builder.extract_value(arguments[1], at) for at in range(len(kinds))]
+    )
 
 
 @emitted(lambda pointer, entry: types.uintp(pointer, types.int64))
 def at(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     """Address of an entry of what a typed pointer points to."""
-    return builder.ptrtoint(builder.gep(arguments[0], [arguments[1]]), context.get_value_type(types.uintp))
+    return builder.ptrtoint(
+        builder.gep(arguments[0], [arguments[1]]), context.get_value_type(types.uintp)
+    )
 
 
 @emitted(lambda count: types.CPointer(types.float64)(types.int64))
@@ -110,7 +124,9 @@ def copy_bytes(context: Any, builder: Any, signature: Any, arguments: Any) -> An
 @emitted(lambda address, number: types.int64(types.uintp, types.int64))
 def count_on(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     """Add a number to the int64 at an address, in one piece among threads; returns what was there before."""
-    return builder.atomic_rmw("add", pointed(builder, arguments[0], ir.IntType(64)), arguments[1], "seq_cst")
+    return builder.atomic_rmw(
+        "add", pointed(builder, arguments[0], ir.IntType(64)), arguments[1], "seq_cst"
+    )
 
 
 @emitted(lambda address: types.int64(types.uintp))
@@ -124,7 +140,9 @@ def read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     """The named tuple of class `kind` whose entries are the float64 numbers from an address on."""
     made = signature.return_type
     pointer = pointed(builder, arguments[0], context.get_value_type(types.float64))
-    places = (builder.gep(pointer, [context.get_constant(types.intp, at)]) for at in range(len(made)))
+    places = (
+        builder.gep(pointer, [context.get_constant(types.intp, at)]) for at in range(len(made))
+    )
     return context.make_tuple(builder, made, [builder.load(place) for place in places])
 
 
@@ -148,7 +166,9 @@ def entries_type(size: int) -> Any:
 @emitted(lambda values: types.UniTuple(types.float64, len(values))(values))
 def floats(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     """A tuple of numbers, of whatever types, as float64."""
-    return context.make_tuple(builder, signature.return_type, _as_floats(context, builder, signature, arguments))
+    return context.make_tuple(
+        builder, signature.return_type, _as_floats(context, builder, signature, arguments)
+    )
 
 
 @emitted(lambda values, address: types.void(values, types.uintp))
@@ -170,6 +190,8 @@ def _as_floats(context: Any, builder: Any, signature: Any, arguments: Any) -> li
 
 def callback(function: Any, returned: Any = None, *more: Any) -> Any:
     """What MuJoCo's setters take for a compiled function of (mjModel, mjData) and `more`; it keeps that alive."""
-    made: Any = ctypes.CFUNCTYPE(returned, ctypes.c_void_p, ctypes.c_void_p, *more)(function.address)
+    made: Any = ctypes.CFUNCTYPE(returned, ctypes.c_void_p, ctypes.c_void_p, *more)(
+        function.address
+    )
     made.owner = function
     return made

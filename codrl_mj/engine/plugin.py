@@ -1,10 +1,11 @@
 """What MuJoCo's actuator plugin of ours runs, compiled to C functions by numba: the door for models of anybody's.
 
-The actuator keeps whatever it has (gear, gain, bias, dynamics, ranges): the force that the engine would have produced
-by them is the desired one. Several actuators of one joint may share an instance of the plugin: the motor is asked for
-the sum of their forces, the actuator with its parameters delivers it, and the others deliver none. As at the other door
-all parameters are the model's and all state is the data's, here in `plugin_state`. The plugin is registered, and these
-functions get into it, by `codrl_mj.plugin`.
+The actuator keeps whatever it has (gear, gain, bias, dynamics, ranges): the force that the engine
+would have produced by them is the desired one. Several actuators of one joint may share an instance
+of the plugin: the motor is asked for the sum of their forces, the actuator with its parameters
+delivers it, and the others deliver none. As at the other door all parameters are the model's and
+all state is the data's, here in `plugin_state`. The plugin is registered, and these functions get
+into it, by `codrl_mj.plugin`.
 """
 
 import ctypes
@@ -41,8 +42,9 @@ from codrl_mj.plugin import FAMILY, NAME, complain, library, registered
 PLUGIN_HEAD = HEAD + 1
 """The `user` data begin with `user_head` and the actuator's arm [m]."""
 EXTRA_STATES = 2
-"""After the actuator's slot: the desired force [N], at the joint's side of the arm; and 1 between a step's first call
-and its end, where further calls within it are stages of RK4."""
+"""After the actuator's slot: the desired force [N], at the joint's side of the arm; and 1 between a
+step's first call and its end, where further calls within it are stages of RK4.
+"""
 
 REASONS = (
     "",
@@ -114,7 +116,10 @@ def _asked_force(model: int, data: int, motor: int, length: float, velocity: flo
     """Return the sum of the forces of all actuators that share a motor: they have one shaft and one gear."""
     force = _engine_force(model, data, motor, length, velocity)
     for other in range(MODEL.nactuator(model)):
-        if other != motor and MODEL.actuator_plugin(model)[other] == MODEL.actuator_plugin(model)[motor]:
+        if (
+            other != motor
+            and MODEL.actuator_plugin(model)[other] == MODEL.actuator_plugin(model)[motor]
+        ):
             force += _engine_force(model, data, other, length, velocity)
     return force
 
@@ -127,14 +132,19 @@ _configuration_of.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
 _configuration_of.restype = ctypes.c_void_p
 
 
-_configured = external("mj_plugin_configuration", _configuration_of, types.uintp(types.uintp, types.int32, types.uintp))
+_configured = external(
+    "mj_plugin_configuration", _configuration_of, types.uintp(types.uintp, types.int32, types.uintp)
+)
 """The same for compiled code."""
 
 
 @internal(inline="always")
 def _is_motor(model: int, actuator: int, instance: int) -> bool:
     """Return True if an actuator of an instance has the motor's parameters."""
-    if MODEL.actuator_plugin(model)[actuator] != instance or MODEL.nuser_actuator(model) < PLUGIN_HEAD:
+    if (
+        MODEL.actuator_plugin(model)[actuator] != instance
+        or MODEL.nuser_actuator(model) < PLUGIN_HEAD
+    ):
         return False
     user = f64(user_of(model, actuator))
     return user[0] == _FIRST and user[1] == _SECOND
@@ -167,7 +177,11 @@ def _verdict(model: int, instance: int) -> int:
 def compiled_entries() -> dict[str, Any]:
     """The functions by their names in `mjpPlugin`, compiled on first use and kept for the life of the process."""
 
-    @cfunc(types.void(types.uintp, types.uintp, types.int32, types.int32), nogil=True, error_model="numpy")
+    @cfunc(
+        types.void(types.uintp, types.uintp, types.int32, types.int32),
+        nogil=True,
+        error_model="numpy",
+    )
     def compute(model: int, data: int, instance: int, capability: int) -> None:  # noqa: ARG001
         time, timestep = DATA.time(data), MODEL.opt.timestep(model)
         slot = _slot_of(model, data, instance)
@@ -204,11 +218,18 @@ def compiled_entries() -> dict[str, Any]:
     def advance(model: int, data: int, instance: int) -> None:
         for actuator in range(MODEL.nactuator(model)):
             if _is_motor(model, actuator, instance):
-                number, slot = int(f64(user_of(model, actuator))[2]), _slot_of(model, data, instance)
+                number, slot = (
+                    int(f64(user_of(model, actuator))[2]),
+                    _slot_of(model, data, instance),
+                )
                 commit_slot(number, slot, DATA.time(data))
                 f64(slot)[size_of(number, WHOLE) + 1] = 0.0
 
-    @cfunc(types.void(types.uintp, types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
+    @cfunc(
+        types.void(types.uintp, types.uintp, types.uintp, types.int32),
+        nogil=True,
+        error_model="numpy",
+    )
     def reset(model: int, state: int, data: int, instance: int) -> None:  # noqa: ARG001
         for entry in range(MODEL.plugin_statenum(model)[instance]):
             f64(state)[entry] = 0.0
@@ -246,8 +267,8 @@ def _family(model: int, instance: int) -> Any:
         if reference(family) == name:
             return family
     raise ValueError(
-        f"its family {name!r} is not loaded, and is not imported because a model says so: import its module and call "
-        "codrl_mj.engine.load_family with it before the model is loaded"
+        f"its family {name!r} is not loaded, and is not imported because a model says so: import"
+        " its module and call codrl_mj.engine.load_family with it before the model is loaded"
     )
 
 

@@ -1,9 +1,9 @@
 """Attributes of environments, as Gymnasium's have them: `env.unwrapped.gravity = 3.7`.
 
-`Task.attributes` says where each of them lives; on the analytic physics numbers of the model are those of Gymnasium's
-own environment. One that is written takes effect at once; state and motor stay as they are. What is written outlasts
-resets, and is not in a `snapshot`. What the task's compiled functions contain can be read only; writing the value that
-an attribute has is allowed everywhere.
+`Task.attributes` says where each of them lives; on the analytic physics numbers of the model are
+those of Gymnasium's own environment. One that is written takes effect at once; state and motor stay
+as they are. What is written outlasts resets, and is not in a `snapshot`. What the task's compiled
+functions contain can be read only; writing the value that an attribute has is allowed everywhere.
 """
 
 import dataclasses
@@ -35,7 +35,9 @@ def read(name: str, setup: Setup, model: Any) -> Any:
     if isinstance(attribute, Follows):
         return attribute.of(*(read(each, setup, model) for each in attribute.names))
     if isinstance(attribute, Setting):
-        value = getattr(setup.plant if attribute is Setting.INTEGRATOR else setup.task, attribute.value)
+        value = getattr(
+            setup.plant if attribute is Setting.INTEGRATOR else setup.task, attribute.value
+        )
         return list(value) if attribute is Setting.FORCES else value
     if not isinstance(model, mujoco.MjModel):
         return getattr(_gymnasiums(model), name)
@@ -60,7 +62,9 @@ def written(name: str, value: Any, setup: Setup, model: Any) -> Setup:
             known = " or ".join(f"integrator={name!r}" for name in setup.task.integrators)
             raise AttributeError(f"it is compiled into the step: make an environment with {known}")
         if setup.randomization.distributions:
-            raise AttributeError("actuator and model are drawn at every reset: give `randomize` a distribution of it")
+            raise AttributeError(
+                "actuator and model are drawn at every reset: give `randomize` a distribution of it"
+            )
         if isinstance(attribute, ModelNumber):
             _write_number(name, attribute, value, setup, model)
             return setup
@@ -70,7 +74,9 @@ def written(name: str, value: Any, setup: Setup, model: Any) -> Setup:
     except ValueError as error:
         raise ValueError(f"{name} = {value!r}: {error}") from None
     except AttributeError as error:
-        raise AttributeError(f"{name} = {value!r}: it can only be {present!r} here; {error}") from None
+        raise AttributeError(
+            f"{name} = {value!r}: it can only be {present!r} here; {error}"
+        ) from None
 
 
 def checked_states(states: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -97,14 +103,18 @@ def _gymnasiums(physics: Any) -> Any:
     """The Gymnasium environment that a physics without a MuJoCo model drives."""
     if not isinstance(physics, AnalyticPhysics) or not hasattr(physics.twin, "env"):
         raise AttributeError(
-            f"{type(physics).__name__} has no MuJoCo model or data, and no environment of Gymnasium's, whose number it "
-            "is; use physics='mujoco'"
+            f"{type(physics).__name__} has no MuJoCo model or data, and no environment of"
+            " Gymnasium's, whose number it is; use physics='mujoco'"
         )
     return physics.twin.env
 
 
 def _number(value: Any, positive: bool) -> float:
-    if isinstance(value, numbers.Real | np.ndarray) and np.size(value) == 1 and math.isfinite(value):  # type: ignore[arg-type]
+    if (
+        isinstance(value, numbers.Real | np.ndarray)
+        and np.size(value) == 1  # type: ignore[arg-type]
+        and math.isfinite(value)
+    ):
         number = float(value)  # type: ignore[arg-type]
         if number > 0.0 or not positive:
             return number
@@ -117,7 +127,9 @@ def _write_number(name: str, attribute: ModelNumber, value: Any, setup: Setup, m
     if not isinstance(model, mujoco.MjModel):
         setattr(env := _gymnasiums(model), name, number)
         for other, follows in setup.task.attributes.items():
-            if isinstance(follows, Follows) and name in follows.names:  # attributes of their own in Gymnasium
+            if (
+                isinstance(follows, Follows) and name in follows.names
+            ):  # attributes of their own in Gymnasium
                 setattr(env, other, read(other, setup, model))
         return
     if varies:
@@ -133,8 +145,9 @@ def _write_forces(value: Any, setup: Setup, model: Any, each: bool) -> Setup:
     task = setup.task
     if setup.config.action != "force" or setup.config.disturbances != OFF or len(task.motors) > 1:
         raise AttributeError(
-            "the forces are known to the current loop's table, to the drive's disturbances or to several motors: make "
-            "an environment of one motor with action='force' and no disturbances"
+            "the forces are known to the current loop's table, to the drive's disturbances or to"
+            " several motors: make an environment of one motor with action='force' and no"
+            " disturbances"
         )
     table = task.forces
     if each:
@@ -147,13 +160,17 @@ def _write_forces(value: Any, setup: Setup, model: Any, each: bool) -> Setup:
         table = tuple(largest * (force / task.max_force) for force in table)
     if isinstance(model, mujoco.MjModel):
         model.actuator(task.motors[0]).ctrlrange[:] *= largest / task.max_force
-    return dataclasses.replace(setup, task=dataclasses.replace(task, max_force=largest, forces=table))
+    return dataclasses.replace(
+        setup, task=dataclasses.replace(task, max_force=largest, forces=table)
+    )
 
 
 def _write_step(value: Any, setup: Setup, model: Any) -> Setup:
     duration = _number(value, positive=True)
     if setup.plant.motorised or setup.config.disturbances != OFF:
-        raise AttributeError("motor and disturbances were checked for this step: make an environment without them")
+        raise AttributeError(
+            "motor and disturbances were checked for this step: make an environment without them"
+        )
     if isinstance(model, mujoco.MjModel):
         model.opt.timestep = duration / setup.inner_steps
     else:
@@ -176,7 +193,9 @@ class _Access:
             return env._read_attribute(self._name)
         if self._name in vars(env):
             return vars(env)[self._name]
-        raise AttributeError(f"{type(env).__name__} of {env.task.name!r} has no attribute {self._name!r}")
+        raise AttributeError(
+            f"{type(env).__name__} of {env.task.name!r} has no attribute {self._name!r}"
+        )
 
     def __set__(self, env: Any, value: Any) -> None:
         attribute = env.task.attributes.get(self._name)
@@ -200,5 +219,7 @@ class GymnasiumAttributes:
             if isinstance(vars(GymnasiumAttributes).get(name), _Access):
                 continue
             if name in vars(self) or hasattr(type(self), name):
-                raise ValueError(f"attributes of task {task.name!r}: environments have a {name!r} of their own")
+                raise ValueError(
+                    f"attributes of task {task.name!r}: environments have a {name!r} of their own"
+                )
             setattr(GymnasiumAttributes, name, _Access(name))

@@ -15,11 +15,12 @@
         return total
 
     env.reset(seed=0)  # seeds the generator, and makes sure that our callbacks are installed
-    episode(parts.step, parts.reset, parts.forces, env.unwrapped.np_random, parts.low, parts.high, parts.observation,
+    episode(parts.step, parts.reset, parts.forces, env.unwrapped.np_random, parts.low, parts.high,
+    parts.observation,
             parts.where)
 
-What it does is what `env.unwrapped` would do, bit for bit, and it leaves the environment where it ends. The time limit
-is a wrapper's, and the loop's to keep. The environment must outlive the calls.
+What it does is what `env.unwrapped` would do, bit for bit, and it leaves the environment where it
+ends. The time limit is a wrapper's, and the loop's to keep. The environment must outlive the calls.
 """
 
 import functools
@@ -70,12 +71,15 @@ class Kernels(NamedTuple):
     """Compiled functions; `where` is that of `codrl_mj.physics.stepping`."""
 
     step: Compiled
-    """(force, where) -> (reward, terminated, fine): takes one environment step under a desired force [N or N*m], or
-    several, an array (n,), and fills the observation. `fine` says whether the simulation is still one of numbers; if
-    not, the environment must be reset. What the actuators did is in the trace."""
+    """(force, where) -> (reward, terminated, fine): takes one environment step under a desired
+    force [N or N*m], or several, an array (n,), and fills the observation. `fine` says whether the
+    simulation is still one of numbers; if not, the environment must be reset. What the actuators
+    did is in the trace.
+    """
     reset: Compiled
-    """(generator, low, high, where) -> nothing: starts an episode from a state that the numpy `Generator` draws between
-    `low` and `high` (see `Task.bounds`), and fills the observation."""
+    """(generator, low, high, where) -> nothing: starts an episode from a state that the numpy
+    `Generator` draws between `low` and `high` (see `Task.bounds`), and fills the observation.
+    """
     step_rows: Compiled
     """`step` for every row, by threads that share them; its arguments are (rows, `VectorStep`)."""
     observe_rows: Compiled
@@ -107,8 +111,8 @@ def compiled_env(env: Any) -> CompiledEnv | None:
     """An environment's compiled parts.
 
     Returns:
-        None where they would not be the whole of it: on physics that are Python, such as the analytic one, and where
-        actuator or model are drawn at resets, which is Python too.
+        None where they would not be the whole of it: on physics that are Python, such as the
+        analytic one, and where actuator or model are drawn at resets, which is Python too.
     """
     setup, physics = env.setup, env.physics
     if physics.stepping is None or setup.randomization.distributions:
@@ -134,7 +138,9 @@ def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
     sensors = len(setup.plant.family.OBSERVED) if setup.sensors else 0
     single, size = len(task.motors) == 1, len(task.state_names)
     sizes = size, len(setup.observation_names), len(setup.config.options)
-    return _kernels(physics.stepping, compiled_outcomes(task), task.initial_state, single, sensors, *sizes)
+    return _kernels(
+        physics.stepping, compiled_outcomes(task), task.initial_state, single, sensors, *sizes
+    )
 
 
 @functools.cache
@@ -180,21 +186,30 @@ def _kernels(
         return rewarded(before, last[:, 1], after, own), ended(after), fine
 
     @compiled
-    def reset(generator: np.random.Generator, low: np.ndarray, high: np.ndarray, where: int) -> None:
+    def reset(
+        generator: np.random.Generator, low: np.ndarray, high: np.ndarray, where: int
+    ) -> None:
         draws, state = np.empty(len(low)), np.empty(size)
         for entry in range(len(low)):
             draws[entry] = low[entry] + (high[entry] - low[entry]) * generator.random()
         entries = floats(initial_entries(draws))
         for entry in range(size):
             state[entry] = entries[entry]
-        key = generator.random() * LARGEST_KEY if f64(i64(where)[OPTIONS])[NEEDS_KEY] != 0.0 else 0.0
+        key = (
+            generator.random() * LARGEST_KEY if f64(i64(where)[OPTIONS])[NEEDS_KEY] != 0.0 else 0.0
+        )
         start(state, key, where)
         look(np.zeros(simulation_at(where)[4].shape[1:]), state, where)
 
     @internal
     def step_some(first: int, end: int, lane: Any, rows: Any, steps: Any) -> int:
         steps, lane, rows, broken = VectorStep(*steps), Lane(*lane), Rows(*rows), 0
-        stepping, observations, signals, elapsed = steps.stepping, steps.observations, steps.signals, steps.elapsed
+        stepping, observations, signals, elapsed = (
+            steps.stepping,
+            steps.observations,
+            steps.signals,
+            steps.elapsed,
+        )
         where, last = lane.places.ctypes.data, lane.trace[len(lane.trace) - 1]
         lane.places[OPTIONS] = steps.options.ctypes.data
         for row in range(first, end):

@@ -1,8 +1,9 @@
 """What can be drawn, and from what: a mapping of paths to distributions, in the order in which they are drawn.
 
-A path is `[PATTERN:]FIELD` of actuators (without a pattern, of all) or `model.FIELD`. A distribution is a pure function
-of draws in [0, 1): a draw gives the same value wherever it is made. `str` writes it as `parse` reads it, exactly:
-`uniform(0.05, 0.2)`, `loguniform(0.1, 10.0)`, `choice(1, 2)`.
+A path is `[PATTERN:]FIELD` of actuators (without a pattern, of all) or `model.FIELD`. A
+distribution is a pure function of draws in [0, 1): a draw gives the same value wherever it is made.
+`str` writes it as `parse` reads it, exactly: `uniform(0.05, 0.2)`, `loguniform(0.1, 10.0)`,
+`choice(1, 2)`.
 """
 
 import dataclasses
@@ -37,7 +38,11 @@ class _Range:
         kind, least = type(self).__name__, self._LEAST
         for field in ("low", "high"):
             value = getattr(self, field)
-            fine = isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+            fine = (
+                isinstance(value, numbers.Real)
+                and not isinstance(value, bool)
+                and math.isfinite(value)
+            )
             if not fine or (least is not None and not value > least):
                 bound = "" if least is None else f" > {least:g}"
                 raise ValueError(f"{kind}.{field} = {value!r}: must be a finite number{bound}")
@@ -106,8 +111,14 @@ class Choice:
     def __post_init__(self) -> None:
         """Validate."""
         given = self.values
-        if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str) or len(given) == 0:
-            raise ValueError(f"Choice.values = {given!r}: must be a sequence of one or more numbers")
+        if (
+            not isinstance(given, Sequence | np.ndarray)
+            or isinstance(given, str)
+            or len(given) == 0
+        ):
+            raise ValueError(
+                f"Choice.values = {given!r}: must be a sequence of one or more numbers"
+            )
         for value in given:
             if not isinstance(value, numbers.Real | np.bool_) or math.isnan(value):
                 raise ValueError(f"Choice.values = {given!r}: {value!r} must be a number")
@@ -137,15 +148,19 @@ class Choice:
 Distribution = Uniform | LogUniform | Choice
 """What a field can be drawn from."""
 
-_FORMS = {"uniform": "uniform(LOW, HIGH)", "loguniform": "loguniform(LOW, HIGH)", "choice": "choice(VALUE, ...)"}
+_FORMS = {
+    "uniform": "uniform(LOW, HIGH)",
+    "loguniform": "loguniform(LOW, HIGH)",
+    "choice": "choice(VALUE, ...)",
+}
 
 
 def parse(text: str) -> Distribution:
     """Read a distribution as `str` writes it; nothing is evaluated.
 
     Args:
-        text: `uniform(LOW, HIGH)`, `loguniform(LOW, HIGH)` or `choice(VALUE, ...)`. A value is a number, `inf`, `True`
-            or `False`; one without point and exponent is an integer.
+        text: `uniform(LOW, HIGH)`, `loguniform(LOW, HIGH)` or `choice(VALUE, ...)`. A value is a
+            number, `inf`, `True` or `False`; one without point and exponent is an integer.
     """
     match = re.fullmatch(r"\s*(\w+)\s*\(([^()]*)\)\s*", text) if isinstance(text, str) else None
     *others, last = _FORMS.values()
@@ -154,7 +169,9 @@ def parse(text: str) -> Distribution:
         raise ValueError(f"{text!r} is no distribution: must be {expected}")
     kind, inside = match.groups()
     if kind not in _FORMS:
-        raise ValueError(f"{text!r} is no distribution: {did_you_mean(kind, _FORMS)}it must be {expected}")
+        raise ValueError(
+            f"{text!r} is no distribution: {did_you_mean(kind, _FORMS)}it must be {expected}"
+        )
     values = [_number(text, word.strip()) for word in inside.split(",")] if inside.strip() else []
     if len(values) != 2 and kind != "choice":
         raise ValueError(f"{text!r} has {len(values)} values: must be {_FORMS[kind]}")
@@ -185,14 +202,20 @@ def paths_of(randomize: Any) -> dict[str, Distribution]:
     """Path -> distribution, in the order in which they are drawn.
 
     Args:
-        randomize: a mapping of paths to distributions or their text, of patterns to such mappings, or a sequence of
-            'PATH=DISTRIBUTION'; a path is FIELD, PATTERN:FIELD or model.FIELD. None is for nothing.
+        randomize: a mapping of paths to distributions or their text, of patterns to such mappings,
+            or a sequence of 'PATH=DISTRIBUTION'; a path is FIELD, PATTERN:FIELD or model.FIELD.
+            None is for nothing.
     """
     if randomize is None:
         return {}
-    if isinstance(randomize, str) or not isinstance(randomize, Mapping | list | tuple) or not randomize:
+    if (
+        isinstance(randomize, str)
+        or not isinstance(randomize, Mapping | list | tuple)
+        or not randomize
+    ):
         raise ValueError(
-            f"randomize = {randomize!r}: must be one or more of FIELD=DISTRIBUTION, or a mapping of fields to these"
+            f"randomize = {randomize!r}: must be one or more of FIELD=DISTRIBUTION, or a mapping of"
+            " fields to these"
         )
     found: dict[str, Distribution] = {}
     for path, one in _flat(randomize) if isinstance(randomize, Mapping) else map(_split, randomize):
@@ -212,7 +235,11 @@ def paths_of(randomize: Any) -> dict[str, Distribution]:
 def _flat(randomize: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Path and distribution of each, of mappings of patterns the pattern before the field."""
     for name, one in randomize.items():
-        if isinstance(one, Mapping) and one and all(isinstance(text, str | Distribution) for text in one.values()):
+        if (
+            isinstance(one, Mapping)
+            and one
+            and all(isinstance(text, str | Distribution) for text in one.values())
+        ):
             yield from ((f"{name}:{field}", text) for field, text in one.items())
         else:
             yield str(name), one
@@ -223,6 +250,7 @@ def _split(item: Any) -> tuple[str, str]:
     match = re.fullmatch(r"\s*((?:.*:)?[^:=]+?)\s*=(.*)", item) if isinstance(item, str) else None
     if match is None:
         raise ValueError(
-            f"randomize: {item!r}: must be FIELD=DISTRIBUTION, such as 'motor.inductance=uniform(0.05, 0.2)'"
+            f"randomize: {item!r}: must be FIELD=DISTRIBUTION, such as"
+            " 'motor.inductance=uniform(0.05, 0.2)'"
         )
     return match[1], match[2]

@@ -21,7 +21,9 @@ from codrl_mj.envs.randomization import Draws, Randomization, check_extremes, pu
 from codrl_mj.physics.base import diverged, namer
 from codrl_mj.physics.variation import without_motors, write_fields
 
-_POSITION = int(mujoco.mjtWarning.mjWARN_BADQPOS)  # followed by those of speeds, accelerations and controls
+_POSITION = int(
+    mujoco.mjtWarning.mjWARN_BADQPOS
+)  # followed by those of speeds, accelerations and controls
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +48,10 @@ class MotorSettings:
     @functools.cached_property
     def commands(self) -> dict[str, Command]:
         """Pattern -> what an action means to its motors."""
-        return {pattern: command_of(one, self.action, pattern) for pattern, one in self.actuators.items()}
+        return {
+            pattern: command_of(one, self.action, pattern)
+            for pattern, one in self.actuators.items()
+        }
 
     @property
     def simulated(self) -> dict[str, ActuatorModel]:
@@ -58,7 +63,11 @@ class Motors:
     """The motors in one simulation, of a model that was built with them; every face of others' environments has one."""
 
     def __init__(
-        self, data: mujoco.MjData, settings: MotorSettings, actions: spaces.Space, step_duration: float | None
+        self,
+        data: mujoco.MjData,
+        settings: MotorSettings,
+        actions: spaces.Space,
+        step_duration: float | None,
     ) -> None:
         """Find the motors of a simulation, of an environment with these `actions` of its own, and steps so long [s]."""
         self.data, model = data, data.model
@@ -66,8 +75,15 @@ class Motors:
         self.present = dict(self.readout.motors)
         """Those of the present episode, by the index of the actuator in the model."""
         names, forced = names_of(model), settings.action == "force"
-        meant = {index: one for pattern, one in settings.commands.items() for index in matched_by(pattern, names)}
-        nominal = {index: meant[index].actuator if index in meant else one for index, one in self.present.items()}
+        meant = {
+            index: one
+            for pattern, one in settings.commands.items()
+            for index in matched_by(pattern, names)
+        }
+        nominal = {
+            index: meant[index].actuator if index in meant else one
+            for index, one in self.present.items()
+        }
         self._slots = list(slots(data, self.present).values())
         self._warnings = data.warning.number[_POSITION:]  # live
         asked = {index: None if forced else meant.get(index) for index in self.present}
@@ -83,13 +99,19 @@ class Motors:
         )
         if not settings.allow_unstable:
             check_extremes(randomization, nominal, model)
-        self.draws = Draws(randomization, [list(nominal.values())], functools.partial(put_into, self))
+        self.draws = Draws(
+            randomization, [list(nominal.values())], functools.partial(put_into, self)
+        )
         drawn = settings.disturbances.random or randomization.random
         self._random = drawn or any(one.random for one in nominal.values())
         self.names = motor_names(model, self.present)
         """What the motors are called."""
         families: list[Family] = list(map(type, self.present.values()))
-        self.sensors = sensor_names(dict(zip(self.names, families, strict=True))) if settings.observe_actuator else ()
+        self.sensors = (
+            sensor_names(dict(zip(self.names, families, strict=True)))
+            if settings.observe_actuator
+            else ()
+        )
         """Names of what `seen` returns, which an observation ends with."""
         self._parameters = list(map(_parameters, self.present.values()))
 
@@ -122,7 +144,9 @@ class Motors:
     def seen(self) -> np.ndarray:
         """What the sensors say now, shape (k,), float64, entries as in `sensors`."""
         values: list[float] = []
-        for motor, parameters, slot in zip(self.present.values(), self._parameters, self._slots, strict=True):
+        for motor, parameters, slot in zip(
+            self.present.values(), self._parameters, self._slots, strict=True
+        ):
             if motor.OBSERVED:
                 family: Family = type(motor)
                 start, count = signals_at(family), len(family.Signals._fields)
@@ -141,11 +165,15 @@ class Motors:
             what = f"control {place}"
         else:
             joint = (
-                np.searchsorted(model.jnt_qposadr, place, "right") - 1 if kind == _POSITION else model.dof_jntid[place]
+                np.searchsorted(model.jnt_qposadr, place, "right") - 1
+                if kind == _POSITION
+                else model.dof_jntid[place]
             )
             of = {_POSITION: "position", _POSITION + 1: "speed"}.get(kind, "acceleration")
             what = f"the {of} of {model.joint(joint).name or f'joint {joint}'}"
-        raise diverged(who, time, f"{what} is no number, or too large", f"the model's {model.opt.timestep:g} s")
+        raise diverged(
+            who, time, f"{what} is no number, or too large", f"the model's {model.opt.timestep:g} s"
+        )
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What it remembers besides the simulation's state: commands on their way, and draws."""
@@ -162,17 +190,24 @@ class Motors:
 def motor_names(model: mujoco.MjModel, motors: Iterable[int]) -> tuple[str, ...]:
     """What motors are called: as their actuators, or else as what these drive; or else by their indices."""
     every = [own[0] if own else "" for own in names_of(model)]
-    own = [name if name and every.count(name) == 1 else str(index) for index, name in enumerate(every)]
+    own = [
+        name if name and every.count(name) == 1 else str(index) for index, name in enumerate(every)
+    ]
     return tuple(" & ".join(own[each] for each in sharing(model, index)) for index in motors)
 
 
 def sensor_names(motors: Mapping[str, Family]) -> tuple[str, ...]:
     """Names of what the sensors of motors, by theirs, say; a motor without a name needs none. Refused if nothing."""
-    sensors = tuple(f"{motor}.{name}" if motor else name for motor, one in motors.items() for name in one.OBSERVED)
+    sensors = tuple(
+        f"{motor}.{name}" if motor else name
+        for motor, one in motors.items()
+        for name in one.OBSERVED
+    )
     if not sensors:
         kinds = ", ".join(sorted({one.family or one.__name__ for one in motors.values()}))
         raise ValueError(
-            f"observe_actuator=True: the {kinds} actuator has no current to observe, and nothing else; choose another"
+            f"observe_actuator=True: the {kinds} actuator has no current to observe, and nothing"
+            " else; choose another"
         )
     return sensors
 
@@ -180,9 +215,12 @@ def sensor_names(motors: Mapping[str, Family]) -> tuple[str, ...]:
 def longer(space: spaces.Space, count: int) -> spaces.Box:
     """An observation space, which must be of vectors, with some unbounded entries more."""
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        raise ValueError(f"observe_actuator=True: observations are {space}, and only to vectors can be appended")
+        raise ValueError(
+            f"observe_actuator=True: observations are {space}, and only to vectors can be appended"
+        )
     low, high = (
-        np.append(bound, np.full(count, value)) for bound, value in ((space.low, -np.inf), (space.high, np.inf))
+        np.append(bound, np.full(count, value))
+        for bound, value in ((space.low, -np.inf), (space.high, np.inf))
     )
     return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
 

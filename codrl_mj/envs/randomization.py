@@ -51,29 +51,51 @@ class Randomization:
     ) -> None:
         """Check the distributions, drawn in their order, against the fields that they are for.
 
-        The `model` is without what its `motors`, by the indices of their actuators, add; `fixed` are the fields of
-        each that cannot be drawn, with the reason; motors must be stable at the `timestep` [s] unless `allow_unstable`;
-        messages call the model `whose`.
+        The `model` is without what its `motors`, by the indices of their actuators, add; `fixed`
+        are the fields of each that cannot be drawn, with the reason; motors must be stable at the
+        `timestep` [s] unless `allow_unstable`; messages call the model `whose`.
         """
-        self.distributions, self.timestep, self.allow_unstable = distributions, timestep, allow_unstable
-        matched, simulated = _matched(distributions, model, motors, fixed, whose), list(motors.values())
+        self.distributions, self.timestep, self.allow_unstable = (
+            distributions,
+            timestep,
+            allow_unstable,
+        )
+        matched, simulated = (
+            _matched(distributions, model, motors, fixed, whose),
+            list(motors.values()),
+        )
         turned, added = (
-            [path for path, own in matched.items() if any(_follows(of, simulated[at], path) for at in own)]
+            [
+                path
+                for path, own in matched.items()
+                if any(_follows(of, simulated[at], path) for at in own)
+            ]
             for of in (lambda one: one.arm_radius, lambda one: one.additions)
         )
         of_model = [path for path, own in matched.items() if not own]
-        self.types = {path: _kind(type(simulated[own[0]]), path) if own else float for path, own in matched.items()}
+        self.types = {
+            path: _kind(type(simulated[own[0]]), path) if own else float
+            for path, own in matched.items()
+        }
         """Path -> float, int or bool."""
         self.families: list[Family] = list(map(type, simulated))
         """Of each motor of a simulation."""
         self.columns = [
-            {column: split_path(path)[1] for column, (path, own) in enumerate(matched.items()) if at in own}
+            {
+                column: split_path(path)[1]
+                for column, (path, own) in enumerate(matched.items())
+                if at in own
+            }
             for at in range(len(simulated))
         ]
         """Of each motor: column of the drawn values -> the field that it is."""
         self.in_model = (*of_model, *added)
         """The paths that the model, besides its motors' parameters, depends on."""
-        self.variation = Variation(model, of_model, list(motors), mounting=bool(added)) if self.in_model else None
+        self.variation = (
+            Variation(model, of_model, list(motors), mounting=bool(added))
+            if self.in_model
+            else None
+        )
         """What drawn fields do to the model; None if they do nothing."""
         self.mounting = bool(turned or added)
         """Whether motors' arms, or what they add to the model, depend on what is drawn."""
@@ -98,11 +120,14 @@ class Draws:
     ) -> None:
         """Begin with nothing drawn for simulations with these nominal motors.
 
-        `put` gives some simulations (m,) what they were drawn with, before they are reset or restored.
+        `put` gives some simulations (m,) what they were drawn with, before they are reset or
+        restored.
         """
         self.randomization, self._put = randomization, put
         self._motors = motors
-        self._nominal = [np.array(list(map(field_values, each))) for each in zip(*motors, strict=True)]
+        self._nominal = [
+            np.array(list(map(field_values, each))) for each in zip(*motors, strict=True)
+        ]
         """Fields of each motor, shape (N, f), columns as in `field_paths`."""
         self._mounting = mounting_of(motors)
         self._values = np.full((len(motors), len(randomization.distributions)), np.nan)
@@ -120,7 +145,10 @@ class Draws:
         drawn = self.randomization
         if not drawn.distributions:
             return
-        values, rejected = np.empty((len(rows), len(drawn.distributions))), np.zeros(len(rows), dtype=np.int64)
+        values, rejected = (
+            np.empty((len(rows), len(drawn.distributions))),
+            np.zeros(len(rows), dtype=np.int64),
+        )
         pending = np.arange(len(rows))
         while len(pending):
             draws = random(rows[pending], len(drawn.distributions))
@@ -128,17 +156,23 @@ class Draws:
                 values[pending, column] = distribution.transform(draws[:, column].copy())
             if drawn.allow_unstable or not drawn.draws_actuator:
                 break
-            unstable, fields = np.zeros(len(pending), dtype=bool), self._fields(rows[pending], values[pending])
+            unstable, fields = (
+                np.zeros(len(pending), dtype=bool),
+                self._fields(rows[pending], values[pending]),
+            )
             for family, columns, each in zip(drawn.families, drawn.columns, fields, strict=True):
                 if columns:
-                    unstable |= ~(family.instability(numbers_of(family, each), drawn.timestep) < 1.0)
+                    unstable |= ~(
+                        family.instability(numbers_of(family, each), drawn.timestep) < 1.0
+                    )
             pending = pending[unstable]
             rejected[pending] += 1
             if len(pending) and rejected[pending[0]] == LIMIT:
                 raise ValueError(
-                    f"randomize: {LIMIT} draws in a row have an unstable current loop at a step of "
-                    f"{drawn.timestep:g} s; the last was {self._last(rows[pending[:1]], values[pending[:1]])}. Narrow "
-                    "the bounds, shorten the step, or pass allow_unstable=True"
+                    f"randomize: {LIMIT} draws in a row have an unstable current loop at a step of"
+                    f" {drawn.timestep:g} s; the last was"
+                    f" {self._last(rows[pending[:1]], values[pending[:1]])}. Narrow the bounds,"
+                    " shorten the step, or pass allow_unstable=True"
                 )
         self._values[rows], self._rejected[rows] = values, rejected
         self._put(self, rows)
@@ -163,7 +197,9 @@ class Draws:
                 each[:, place] = np.where(np.isnan(new), each[:, place], new)
         return fields
 
-    def motors(self, row: int = 0, nominal: Sequence[ActuatorModel] | None = None) -> tuple[ActuatorModel, ...]:
+    def motors(
+        self, row: int = 0, nominal: Sequence[ActuatorModel] | None = None
+    ) -> tuple[ActuatorModel, ...]:
         """What is drawn of a simulation's motors, or of others in their place."""
         nominal, values = self._motors[row] if nominal is None else nominal, self._values[row]
         if not len(values) or np.isnan(values).any():
@@ -180,7 +216,9 @@ class Draws:
         arms, additions = (each[rows] for each in self._mounting)
         if self.randomization.mounting:
             each = zip(*(one.tolist() for one in fields), strict=True)
-            arms, additions = mounting_of([list(map(unchecked, families, values)) for values in each])
+            arms, additions = mounting_of(
+                [list(map(unchecked, families, values)) for values in each]
+            )
         return list(map(numbers_of, families, fields)), arms, additions
 
     def model_fields(
@@ -198,9 +236,13 @@ class Draws:
     def report(self, row: int = 0) -> dict[str, Any]:
         """What `info` says of a simulation's draw: values by field, those of a pattern together; NaN before one."""
         found: dict[str, Any] = {}
-        for (path, kind), value in zip(self.randomization.types.items(), self._values[row], strict=True):
+        for (path, kind), value in zip(
+            self.randomization.types.items(), self._values[row], strict=True
+        ):
             pattern, field = split_path(path)
-            (found.setdefault(pattern, {}) if pattern else found)[field] = np.nan if np.isnan(value) else kind(value)
+            (found.setdefault(pattern, {}) if pattern else found)[field] = (
+                np.nan if np.isnan(value) else kind(value)
+            )
         return found | {"rejected": int(self._rejected[row])} if found else {}
 
     def infos(self, rows: np.ndarray) -> dict[str, Any]:
@@ -253,12 +295,19 @@ def check_extremes(
     Raises:
         ValueError: with the values that were tried, and a remedy.
     """
-    if not randomization.distributions or not any(one.MOTION or type(one) not in BUILT_IN for one in motors.values()):
+    if not randomization.distributions or not any(
+        one.MOTION or type(one) not in BUILT_IN for one in motors.values()
+    ):
         return
     draws, model = Draws(randomization, [list(motors.values())], lambda *_: None), copy.copy(model)
-    data, bounds = mujoco.MjData(model), [sorted(one.extremes) for one in randomization.distributions.values()]
+    data, bounds = (
+        mujoco.MjData(model),
+        [sorted(one.extremes) for one in randomization.distributions.values()],
+    )
     count = 2 ** len(bounds)
-    for corner in range(count) if count <= MAX_CORNERS else random.Random(0).sample(range(count), MAX_CORNERS):
+    for corner in (
+        range(count) if count <= MAX_CORNERS else random.Random(0).sample(range(count), MAX_CORNERS)
+    ):
         values = [each[-(corner >> column & 1)] for column, each in enumerate(bounds)]
         draws._values[0] = values
         try:
@@ -276,7 +325,10 @@ def check_extremes(
                 warnings.simplefilter("ignore")
                 check_shafts(model, held=held, actuators=present, explicit=explicit)
         except UnstableError as error:
-            drawn = ", ".join(f"{path} = {value:g}" for path, value in zip(randomization.types, values, strict=True))
+            drawn = ", ".join(
+                f"{path} = {value:g}"
+                for path, value in zip(randomization.types, values, strict=True)
+            )
             raise ValueError(f"randomize: {drawn}: {error}; or narrow the bounds") from None
 
 
@@ -311,7 +363,11 @@ def _matched(
     whose: str,
 ) -> dict[str, list[int]]:
     """Path -> which of the motors, in their order, it is drawn of, checked; none if it is the model's."""
-    indices, simulated, varied = list(motors), list(motors.values()), variable(model) if distributions else ()
+    indices, simulated, varied = (
+        list(motors),
+        list(motors.values()),
+        variable(model) if distributions else (),
+    )
     names, rubbing = names_of(model), [mounts_of(model, index)[2] is not None for index in motors]
     called = [[name for one in sharing(model, index) for name in names[one]] for index in indices]
     matched: dict[str, list[int]] = {}
@@ -319,18 +375,26 @@ def _matched(
         pattern, field = split_path(path)
         try:
             every = list(range(len(indices)))
-            own = [] if field.startswith(MODEL) else matched_by(pattern, called) if pattern else every
+            own = (
+                [] if field.startswith(MODEL) else matched_by(pattern, called) if pattern else every
+            )
             _check_known(field, [simulated[at] for at in own], varied, whose)
-            if any(split_path(other)[1] == field and {*own} & {*those} for other, those in matched.items()):
+            if any(
+                split_path(other)[1] == field and {*own} & {*those}
+                for other, those in matched.items()
+            ):
                 raise ValueError("it is drawn by another pattern, too")
             if not own:
                 _check_factor(field, distribution)
             for at in own:
                 _check(field, distribution, simulated[at], fixed[at])
-                if not rubbing[at] and _follows(lambda one: one.additions.friction, simulated[at], field):
+                if not rubbing[at] and _follows(
+                    lambda one: one.additions.friction, simulated[at], field
+                ):
                     raise ValueError(
-                        f"{model.actuator(indices[at]).name or f'actuator {indices[at]}'} drives neither a joint "
-                        "nor a tendon, which the friction that is drawn for its motor would need; draw other fields"
+                        f"{model.actuator(indices[at]).name or f'actuator {indices[at]}'} drives"
+                        " neither a joint nor a tendon, which the friction that is drawn for its"
+                        " motor would need; draw other fields"
                     )
         except ValueError as error:
             label = f"[{pattern!r}]" * bool(pattern) + f"[{field!r}]"
@@ -339,37 +403,57 @@ def _matched(
     return matched
 
 
-def _check_known(field: str, motors: Sequence[ActuatorModel], varied: Sequence[str], whose: str) -> None:
+def _check_known(
+    field: str, motors: Sequence[ActuatorModel], varied: Sequence[str], whose: str
+) -> None:
     """Refuse a name that is no field of all these motors, nor of the model."""
     families: list[Family] = [Actuator if isinstance(one, Ideal) else type(one) for one in motors]
     of_each = [field_paths(family) for family in families]
-    known = [path for path in (of_each[0] if of_each else ()) if all(path in paths for paths in of_each)]
+    known = [
+        path for path in (of_each[0] if of_each else ()) if all(path in paths for paths in of_each)
+    ]
     known += varied
     if field not in known:
-        raise ValueError(f"unknown field {field!r}: {did_you_mean(field, known)}{whose} has {', '.join(known)}")
+        raise ValueError(
+            f"unknown field {field!r}: {did_you_mean(field, known)}{whose} has {', '.join(known)}"
+        )
 
 
 def _check_factor(field: str, distribution: Distribution) -> None:
     """Refuse what the model cannot be multiplied by, or have added to it."""
     low, kind = min(distribution.extremes), field.split(".")[1]
     allowed_zero = kind in ("gravity", "damping")
-    if not np.isfinite(distribution.extremes).all() or low < 0.0 or (low == 0.0 and not allowed_zero):
-        raise ValueError(f"{field} = {low:g}: must be a finite number {'>=' if allowed_zero else '>'} 0")
+    if (
+        not np.isfinite(distribution.extremes).all()
+        or low < 0.0
+        or (low == 0.0 and not allowed_zero)
+    ):
+        raise ValueError(
+            f"{field} = {low:g}: must be a finite number {'>=' if allowed_zero else '>'} 0"
+        )
 
 
-def _check(field: str, distribution: Distribution, motor: ActuatorModel, fixed: Mapping[str, str]) -> None:
+def _check(
+    field: str, distribution: Distribution, motor: ActuatorModel, fixed: Mapping[str, str]
+) -> None:
     """Refuse what cannot be drawn of a motor."""
     if isinstance(motor, Ideal):
-        raise ValueError("the ideal actuator has no motor and no controller to draw; choose another actuator")
+        raise ValueError(
+            "the ideal actuator has no motor and no controller to draw; choose another actuator"
+        )
     if field in fixed:
         raise ValueError(f"{fixed[field]}; draw it with action='force'")
     kind, words = _kind(type(motor), field), choices_of(type(motor), field)
     if words:
-        if not isinstance(distribution, Choice) or any(value not in range(len(words)) for value in distribution.values):
+        if not isinstance(distribution, Choice) or any(
+            value not in range(len(words)) for value in distribution.values
+        ):
             numbered = ", ".join(f"{place} for {word}" for place, word in enumerate(words))
             raise ValueError(f"{field} is a word: draw it from a Choice of {numbered}")
     elif kind is not float:
-        if not isinstance(distribution, Choice) or any(type(value) is not kind for value in distribution.values):
+        if not isinstance(distribution, Choice) or any(
+            type(value) is not kind for value in distribution.values
+        ):
             raise ValueError(f"{field} must be drawn from a Choice of {kind.__name__} values")
     elif any(isinstance(value, bool) for value in distribution.extremes):
         raise ValueError(f"{field} must be a number")

@@ -23,7 +23,10 @@ class StepWatch:
         self._moments = np.empty((model.nout, model.nv))
         self.step_duration = float(step_duration or model.opt.timestep)
         """Duration of the last environment step [s]; before the first the environment's `dt`, or else the model's."""
-        self.signal_names, self.trace_names = tuple(motors.signals()), (*motors.readout.names, "speed")
+        self.signal_names, self.trace_names = (
+            tuple(motors.signals()),
+            (*motors.readout.names, "speed"),
+        )
         self.command, self.motor_names = command, motors.names
 
     @property
@@ -46,7 +49,11 @@ class StepWatch:
         """Speeds of the shafts [m/s or rad/s]; the engine's own are those at the beginning of a step."""
         data = self._data
         mujoco.mju_sparse2dense(
-            self._moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+            self._moments,
+            data.actuator_moment,
+            data.moment_rownnz,
+            data.moment_rowadr,
+            data.moment_colind,
         )
         return self._moments[self._outputs] @ data.qvel
 

@@ -22,8 +22,8 @@ _BOOKKEEPING = ("elapsed", "observations", "ended")
 class SerialVectorEnv(SyncVectorEnv[Array, Array]):
     """Gymnasium's `SyncVectorEnv`, by default in `SAME_STEP` mode, with what Stable-Baselines3's face needs.
 
-    Of each it asks for `motors`, `signal_names`, `randomization`, `snapshot` and `restore`, as an `ActuatedEnv` and
-    what `codrl_mj.make` makes have them.
+    Of each it asks for `motors`, `signal_names`, `randomization`, `snapshot` and `restore`, as an
+    `ActuatedEnv` and what `codrl_mj.make` makes have them.
     """
 
     def __init__(
@@ -40,23 +40,26 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
 
         Args:
             num_envs: how many, >= 1.
-            task: the task's name; or a function that makes an environment which has its actuators, a picklable one
-                for processes.
+            task: the task's name; or a function that makes an environment which has its actuators,
+                a picklable one for processes.
             actuator: as for `ActuatedEnv`; or a sequence of N actuators, one for each environment.
             max_episode_steps: time limit of each environment [steps]; None for none.
-            autoreset_mode: when an environment whose episode ended is reset, as for `ActuatedVectorEnv`.
+            autoreset_mode: when an environment whose episode ended is reset, as for
+                `ActuatedVectorEnv`.
             num_threads: 0 or 1: there is one thread.
-            **arguments: the other arguments of `ActuatedEnv`, `physics` among them; or the function's.
+            **arguments: the other arguments of `ActuatedEnv`, `physics` among them; or the
+                function's.
 
         Raises:
-            ValueError: an argument is unknown or out of bounds, or a current loop is unstable; the message names it.
+            ValueError: an argument is unknown or out of bounds, or a current loop is unstable; the
+                message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
         check_counts(num_envs, max_episode_steps, 20_000 if isinstance(task, str) else 200_000)
         if num_threads not in (0, 1):
             raise ValueError(
-                f"num_threads = {num_threads!r}: must be 0 or 1 here: these environments are stepped one by one, only "
-                "tasks on physics='mujoco' as a batch: leave it out"
+                f"num_threads = {num_threads!r}: must be 0 or 1 here: these environments are"
+                " stepped one by one, only tasks on physics='mujoco' as a batch: leave it out"
             )
         make: Any = task
         each = [{} if actuator == "default" else {"actuator": actuator}] * num_envs
@@ -65,10 +68,18 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
             if one_for_each(actuator, task):
                 each = [{"actuator": one} for one in actuator]
         if len(each) != num_envs:
-            raise ValueError(f"actuator: {len(each)} actuators for {num_envs} environments: there must be one for each")
-        makers = [functools.partial(_limited, max_episode_steps, make, {**arguments, **one}) for one in each]
+            raise ValueError(
+                f"actuator: {len(each)} actuators for {num_envs} environments: there must be one"
+                " for each"
+            )
+        makers = [
+            functools.partial(_limited, max_episode_steps, make, {**arguments, **one})
+            for one in each
+        ]
         super().__init__(makers, autoreset_mode=AutoresetMode(autoreset_mode))
-        self.signals: Signals | None = None  # of the last step, each an array of shape (N,) or (N, motors)
+        self.signals: Signals | None = (
+            None  # of the last step, each an array of shape (N,) or (N, motors)
+        )
         self._signal_names = self.get_attr("signal_names")[0]
         self.arm_radii = np.array([one.arm_radius for one in self.get_attr("motors")[0].values()])
 
@@ -85,9 +96,16 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         """
         drawn = []
         for one in self.get_attr("randomization"):
-            nested = {name: each if isinstance(each, Mapping) else {"": each} for name, each in one.items()}
+            nested = {
+                name: each if isinstance(each, Mapping) else {"": each}
+                for name, each in one.items()
+            }
             drawn.append(
-                {f"{of}:{name}".rstrip(":"): value for of, each in nested.items() for name, value in each.items()}
+                {
+                    f"{of}:{name}".rstrip(":"): value
+                    for of, each in nested.items()
+                    for name, value in each.items()
+                }
             )
         kinds = {name: np.int64 if name == "rejected" else np.float64 for name in drawn[0]}
         return {name: np.array([one[name] for one in drawn], kind) for name, kind in kinds.items()}
@@ -100,7 +118,9 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         others = last if ended.all() else infos
         # In NEXT_STEP mode a step may have reset all of them, and tells nothing of motors.
         self.signals = {
-            name: np.where(ended.reshape(-1, *[1] * (last[name].ndim - 1)), last[name], others[name])
+            name: np.where(
+                ended.reshape(-1, *[1] * (last[name].ndim - 1)), last[name], others[name]
+            )
             for name in self._signal_names
             if name in others
         }
@@ -126,10 +146,12 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         """Continue from what `snapshot` returned, bit for bit, in environments made with the same arguments.
 
         Returns:
-            None; or the first observations (N, k), where the environments could only start an episode anew.
+            None; or the first observations (N, k), where the environments could only start an
+            episode anew.
 
         Raises:
-            ValueError: the snapshot is of another number of environments, another task or other arguments.
+            ValueError: the snapshot is of another number of environments, another task or other
+                arguments.
         """
         if self._env_obs[0] is None:  # Gymnasium's wrappers insist on a reset
             self.reset()

@@ -32,8 +32,8 @@ NEEDS_KEY, FIRST_OPTION = 0, 1
 class Setup:
     """An environment of a task as its configuration says; made by `build`.
 
-    It holds nothing twice: what follows from the fields is computed where it is first asked for. With another task, of
-    which attributes were written, all of it is that task's.
+    It holds nothing twice: what follows from the fields is computed where it is first asked for.
+    With another task, of which attributes were written, all of it is that task's.
     """
 
     config: EnvConfig
@@ -47,7 +47,11 @@ class Setup:
     def build(cls, config: EnvConfig) -> "Setup":
         """The set-up of a configuration, checked for what its fields do not show one by one."""
         task = find_task(config.task)
-        made = cls(config, task, task.steps_within(config.actuators[0], config.inner_steps, config.timestep))
+        made = cls(
+            config,
+            task,
+            task.steps_within(config.actuators[0], config.inner_steps, config.timestep),
+        )
         made._check()
         return made
 
@@ -60,8 +64,15 @@ class Setup:
             for one in plant.actuators:
                 one.check_at(plant.timestep, unstable)
         if any(one.closes_loops for one in plant.actuators):
-            model, held, explicit = task_model(plant), self.config.physics == "analytic", plant.integrator == "euler"
-            motors = {model.actuator(name).id: one for name, one in zip(self.task.motors, plant.actuators, strict=True)}
+            model, held, explicit = (
+                task_model(plant),
+                self.config.physics == "analytic",
+                plant.integrator == "euler",
+            )
+            motors = {
+                model.actuator(name).id: one
+                for name, one in zip(self.task.motors, plant.actuators, strict=True)
+            }
             check_shafts(model, unstable, held, motors, explicit)
             if not unstable:
                 check_extremes(self.randomization, motors, model, held, explicit)
@@ -69,7 +80,9 @@ class Setup:
     @functools.cached_property
     def commands(self) -> TaskCommands:
         """What actions stand for."""
-        return TaskCommands(self.task, self.config.actuators, self.config.action, self.config.levels)
+        return TaskCommands(
+            self.task, self.config.actuators, self.config.action, self.config.levels
+        )
 
     @functools.cached_property
     def plant(self) -> Plant:
@@ -83,10 +96,19 @@ class Setup:
         """What is drawn at every reset."""
         plant, config = self.plant, self.config
         bare = bare_model(self.task.name, config.joint)
-        motors = {bare.actuator(name).id: one for name, one in zip(self.task.motors, plant.actuators, strict=True)}
+        motors = {
+            bare.actuator(name).id: one
+            for name, one in zip(self.task.motors, plant.actuators, strict=True)
+        }
         fixed = [self.commands.fixed] * len(motors)
         return Randomization(
-            config.distributions, bare, motors, fixed, plant.timestep, config.allow_unstable, self.task.name
+            config.distributions,
+            bare,
+            motors,
+            fixed,
+            plant.timestep,
+            config.allow_unstable,
+            self.task.name,
         )
 
     # -- simulations -----------------------------------------------------------------------------------------
@@ -98,8 +120,9 @@ class Setup:
         if made.scene is None and self.randomization.variation is not None:
             names = ", ".join(self.randomization.in_model)
             raise ValueError(
-                f"physics = {physics!r}: cannot draw {names}: Gymnasium's environments share no names for masses, "
-                "lengths and gravity, and have no damping, friction and rotors; use physics='mujoco'"
+                f"physics = {physics!r}: cannot draw {names}: Gymnasium's environments share no"
+                " names for masses, lengths and gravity, and have no damping, friction and rotors;"
+                " use physics='mujoco'"
             )
         return made
 
@@ -126,7 +149,9 @@ class Setup:
         """
         if not self.random:
             return np.zeros(1)
-        return random(1)[:, 0] * LARGEST_KEY  # a multiple of 2**-53 times 2**53: a whole number, exactly
+        return (
+            random(1)[:, 0] * LARGEST_KEY
+        )  # a multiple of 2**-53 times 2**53: a whole number, exactly
 
     # -- what the agent gets of them -------------------------------------------------------------------------
 
@@ -134,7 +159,11 @@ class Setup:
     def sensors(self) -> tuple[str, ...]:
         """Names of what the actuators' sensors add to an observation; none if they are not observed."""
         names = self.task.motors if len(self.task.motors) > 1 else ("",)
-        return sensor_names(dict.fromkeys(names, self.plant.family)) if self.config.observe_actuator else ()
+        return (
+            sensor_names(dict.fromkeys(names, self.plant.family))
+            if self.config.observe_actuator
+            else ()
+        )
 
     @property
     def observation_space(self) -> spaces.Box:
@@ -175,7 +204,9 @@ class Setup:
         return namer(trace_names(self.plant.family)[:-1])
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_named"}  # which nothing pickles
+        return {
+            name: value for name, value in self.__dict__.items() if name != "_named"
+        }  # which nothing pickles
 
     def signals(self, columns: Sequence[Any] | np.ndarray, desired: Any) -> Signals:
         """A trace's columns, numbers or arrays, as signals: the force [N or N*m] that the agent `desired` is theirs.
@@ -195,7 +226,9 @@ def alone(several: Sequence[Any]) -> Any:
 def one_for_each(actuator: Any, task: str) -> bool:
     """Whether it is a sequence of what each environment gets, and not what all get: such as one for each motor."""
     listed = isinstance(actuator, Sequence) and not isinstance(actuator, str)
-    return listed and (len(find_task(task).motors) == 1 or all(isinstance(one, list | tuple) for one in actuator))
+    return listed and (
+        len(find_task(task).motors) == 1 or all(isinstance(one, list | tuple) for one in actuator)
+    )
 
 
 def set_up_many(
@@ -206,9 +239,14 @@ def set_up_many(
         setup = Setup.build(EnvConfig.of(task, actuator, arguments))
         return setup, [setup.commands.simulated] * num_envs
     if len(actuator) != num_envs:
-        raise ValueError(f"actuator: {len(actuator)} actuators for {num_envs} environments: there must be one for each")
+        raise ValueError(
+            f"actuator: {len(actuator)} actuators for {num_envs} environments: there must be one"
+            " for each"
+        )
     if arguments.get("action", "force") != "force":
-        raise ValueError(f"action = {arguments['action']!r}: with an actuator for each environment only 'force'")
+        raise ValueError(
+            f"action = {arguments['action']!r}: with an actuator for each environment only 'force'"
+        )
     setups: dict[Any, Setup] = {}
     every: list[tuple[ActuatorModel, ...]] = []
     for index, one in enumerate(actuator):
@@ -220,6 +258,9 @@ def set_up_many(
         except ValueError as error:
             raise ValueError(f"actuator[{index}]: {error}") from None
         if isinstance(every[-1][0], Ideal):
-            raise ValueError(f"actuator[{index}] = {one!r}: must be an Actuator; the ideal one cannot be among others")
+            raise ValueError(
+                f"actuator[{index}] = {one!r}: must be an Actuator; the ideal one cannot be among"
+                " others"
+            )
     check_same_family([each[0] for each in setups])
     return setups[every[0]], every

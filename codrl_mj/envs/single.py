@@ -23,14 +23,15 @@ from codrl_mj.tasks import Task
 class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     """A classic-control task whose actions go through an actuator.
 
-    Observation, action, reward, start and end are Gymnasium's for the task; what differs is the force: the action
-    chooses the desired one, the actuator delivers the actual one. With `actuator="ideal"` they are equal and the
-    environment is a drop-in for Gymnasium's.
+    Observation, action, reward, start and end are Gymnasium's for the task; what differs is the
+    force: the action chooses the desired one, the actuator delivers the actual one. With
+    `actuator="ideal"` they are equal and the environment is a drop-in for Gymnasium's.
 
-    Every step's `info` has `desired_force`, `actual_force` [N or N*m], the signals of the actuator's family and
-    `saturated` (bool), each at the end of the step: of a current loop `current`, `reference_current` [A] and `voltage`
-    [V], which are 0 where the actuator is ideal; a drive also says which limit it met (`codrl_mj.actuators.drive`).
-    Where the agent commands the voltage, what is delivered is what is desired. Of several motors each is an array (n,).
+    Every step's `info` has `desired_force`, `actual_force` [N or N*m], the signals of the
+    actuator's family and `saturated` (bool), each at the end of the step: of a current loop
+    `current`, `reference_current` [A] and `voltage` [V], which are 0 where the actuator is ideal; a
+    drive also says which limit it met (`codrl_mj.actuators.drive`). Where the agent commands the
+    voltage, what is delivered is what is desired. Of several motors each is an array (n,).
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium has it
@@ -55,19 +56,23 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         Args:
             task: the task's name, such as `cartpole`.
             actuator: what the force goes through, as `EnvConfig.actuator` says.
-            physics: `mujoco`, `analytic` (Gymnasium's own equations, or a closed form), or one's own.
-            render_mode: None; `rgb_array`: `render` returns images; `human`: pygame shows every step in a window.
-                Others, of which `gymnasium.make` warns, are refused when they are rendered.
+            physics: `mujoco`, `analytic` (Gymnasium's own equations, or a closed form), or one's
+                own.
+            render_mode: None; `rgb_array`: `render` returns images; `human`: pygame shows every
+                step in a window. Others, of which `gymnasium.make` warns, are refused when they are
+                rendered.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model: `fixed` or `close`.
             pretty: shadows, reflections and multisampling.
-            **arguments: the other fields of `codrl_mj.envs.config.EnvConfig`: `integrator`, `inner_steps`, `timestep`,
-                `allow_unstable`, `action`, `levels`, `observe_actuator`, `disturbances`, `joint`, `randomize`; and the
-                task's own options (CartPole: `center_radius`, `sutton_barto_reward`).
+            **arguments: the other fields of `codrl_mj.envs.config.EnvConfig`: `integrator`,
+                `inner_steps`, `timestep`, `allow_unstable`, `action`, `levels`, `observe_actuator`,
+                `disturbances`, `joint`, `randomize`; and the task's own options (CartPole:
+                `center_radius`, `sutton_barto_reward`).
 
         Raises:
-            ValueError: an argument is unknown or out of bounds, or the current loop is unstable; the message names it.
+            ValueError: an argument is unknown or out of bounds, or the current loop is unstable;
+                the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
         config = EnvConfig.of(task, actuator, {"physics": physics, **arguments})
@@ -88,7 +93,10 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self.observation_names, self.motor_names = self.setup.observation_names, self.task.motors
         self.command = config.action
         """What the agent commands."""
-        self.signal_names, self.trace_names = signal_names(family := self.setup.plant.family), trace_names(family)
+        self.signal_names, self.trace_names = (
+            signal_names(family := self.setup.plant.family),
+            trace_names(family),
+        )
         """Of the actuators' signals in `info`; of the columns of `trace`."""
         self._compiled: tuple[Any, ...] | None = None
         self._offer_attributes(self.task)
@@ -153,7 +161,9 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     def _engine(self) -> tuple[Any, Any]:
         if self.physics.scene is None:
-            raise AttributeError(f"{type(self.physics).__name__} has no MuJoCo model or data; use physics='mujoco'")
+            raise AttributeError(
+                f"{type(self.physics).__name__} has no MuJoCo model or data; use physics='mujoco'"
+            )
         return self.physics.scene
 
     def _model(self) -> Any:
@@ -176,14 +186,17 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """Start an episode; the motor is at rest.
 
         Args:
-            seed: seed of the initial state; the same seed draws the state that Gymnasium's environment draws.
+            seed: seed of the initial state; the same seed draws the state that Gymnasium's
+                environment draws.
             options: Gymnasium's reset options for the task (CartPole: the bounds `low` and `high`).
         """
         super().reset(seed=seed)
         generator, setup = self.np_random, self.setup
         initial = setup.task.initial(generator, options)
         self._draws.draw_one(generator)
-        self.physics.reset(initial, float(setup.keys(lambda count: generator.random((1, count)))[0]))
+        self.physics.reset(
+            initial, float(setup.keys(lambda count: generator.random((1, count)))[0])
+        )
         if self.render_mode == "human":
             self.render()
         drawn = self.randomization
@@ -193,8 +206,8 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """Advance by one environment step.
 
         Args:
-            action: an element of the action space; a continuous one may lie outside its bounds, where the desired
-                force saturates.
+            action: an element of the action space; a continuous one may lie outside its bounds,
+                where the desired force saturates.
 
         Raises:
             ValueError: the action is not in the action space, or not a number.
@@ -249,14 +262,16 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         }
         if self.physics.memory.size:
             everything["disturbances"] = self.physics.memory.copy()
-        return everything | {name: np.array(rows[0]) for name, rows in self._draws.snapshot().items()}
+        return everything | {
+            name: np.array(rows[0]) for name, rows in self._draws.snapshot().items()
+        }
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
 
         Raises:
-            ValueError: the snapshot is of another task, or of arguments that need other entries or shapes; nothing was
-                changed.
+            ValueError: the snapshot is of another task, or of arguments that need other entries or
+                shapes; nothing was changed.
         """
         check_snapshot(snapshot, self.snapshot(), "task")
         self._draws.restore(snapshot)
@@ -270,13 +285,18 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         Raises:
             ValueError: unknown render mode.
             DependencyNotInstalled: a window needs pygame.
-            RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
+            RenderingUnavailableError: no OpenGL context can be made here; the message has the
+                remedy.
         """
         if self.render_mode is None:
-            gymnasium.logger.warn("render() without a render mode: pass render_mode='rgb_array' when making it")
+            gymnasium.logger.warn(
+                "render() without a render mode: pass render_mode='rgb_array' when making it"
+            )
             return None
         if self.render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode = {self.render_mode!r}: must be None, 'human' or 'rgb_array'")
+            raise ValueError(
+                f"render_mode = {self.render_mode!r}: must be None, 'human' or 'rgb_array'"
+            )
         scene = self._scene()
         model, data = scene.scene
         if self._renderer is None:
@@ -307,4 +327,9 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the renderer, the window and the compiled step, which a copy makes anew."""
-        return self.__dict__ | {"_renderer": None, "_window": None, "_shown": None, "_compiled": None}
+        return self.__dict__ | {
+            "_renderer": None,
+            "_window": None,
+            "_shown": None,
+            "_compiled": None,
+        }

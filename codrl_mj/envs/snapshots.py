@@ -49,29 +49,39 @@ def generator_of(words: np.ndarray) -> np.random.Generator:
     return generator
 
 
-def check_snapshot(snapshot: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray], name: str = "") -> None:
+def check_snapshot(
+    snapshot: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray], name: str = ""
+) -> None:
     """Refuse a snapshot of other entries, shapes or types than those of the environment's own, `expected`.
 
     The entry of a `name`, if there is one, has the `letters` of what it is of.
     """
     for entry in [*expected, *(one for one in snapshot if one not in expected)]:
         found, wanted = (
-            f"of shape {arrays[entry].shape} and type {arrays[entry].dtype}" if entry in arrays else "missing"
+            (
+                f"of shape {arrays[entry].shape} and type {arrays[entry].dtype}"
+                if entry in arrays
+                else "missing"
+            )
             for arrays in (snapshot, expected)
         )
         if found != wanted:
             raise ValueError(
-                f"snapshot[{entry!r}] is {found}: must be {wanted}; it is of another task, other arguments or another "
-                "number of environments"
+                f"snapshot[{entry!r}] is {found}: must be {wanted}; it is of another task, other"
+                " arguments or another number of environments"
             )
     if name and not np.array_equal(snapshot[name], expected[name]):
         whose = bytes(expected[name]).decode()
-        raise ValueError(f"snapshot[{name!r}] is of {bytes(snapshot[name])!r}: must be of {whose!r}")
+        raise ValueError(
+            f"snapshot[{name!r}] is of {bytes(snapshot[name])!r}: must be of {whose!r}"
+        )
 
 
 _COMPUTED = tuple(
     field.name
-    for field in itertools.takewhile(lambda field: field.name != "contact", STRUCTS["mjData"].fields)
+    for field in itertools.takewhile(
+        lambda field: field.name != "contact", STRUCTS["mjData"].fields
+    )
     if getattr(getattr(field.type, "inner_type", None), "name", "") == "mjtNum"
 )
 """The arrays of numbers in `MjData` whose sizes do not depend on contacts; in MuJoCo's order they come first."""
@@ -80,12 +90,15 @@ _COMPUTED = tuple(
 def state_of(data: mujoco.MjData) -> dict[str, np.ndarray]:
     """MuJoCo's state vector (`mjSTATE_INTEGRATION`), motors included, and what was computed from it, by name.
 
-    A step leaves poses and forces where its last integration step began, and environments take observations and rewards
-    from them: the state alone would not continue bit for bit.
+    A step leaves poses and forces where its last integration step began, and environments take
+    observations and rewards from them: the state alone would not continue bit for bit.
     """
     state = np.empty(mujoco.mj_stateSize(data.model, _STATE))
     mujoco.mj_getState(data.model, data, state, _STATE)
-    return {"state": state, "computed": np.concatenate([getattr(data, name).ravel() for name in _COMPUTED])}
+    return {
+        "state": state,
+        "computed": np.concatenate([getattr(data, name).ravel() for name in _COMPUTED]),
+    }
 
 
 def set_state_of(data: mujoco.MjData, state: np.ndarray, computed: np.ndarray) -> None:

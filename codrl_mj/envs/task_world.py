@@ -39,7 +39,9 @@ class TaskWorld(World):
 
     def make(self, config: Any, **view: Any) -> Any:
         """An environment, made by Gymnasium; `view` as for `codrl_mj.envs.ActuatedEnv`."""
-        return gymnasium.make(self.env_id, disable_env_checker=True, **config.as_arguments(), **view)
+        return gymnasium.make(
+            self.env_id, disable_env_checker=True, **config.as_arguments(), **view
+        )
 
     def vector(self, config: Any, num_envs: int, **arguments: Any) -> Any:
         """Some environments as one: stepped together by the engine, or one by one where another physics steps them."""
@@ -49,11 +51,13 @@ class TaskWorld(World):
         arguments = {"max_episode_steps": config.time_limit} | config.as_arguments() | arguments
         human = arguments.get("render_mode") == "human"
         if arguments["physics"] == "mujoco" and not human:
-            return ActuatedVectorEnv(num_envs, config.task, **{"autoreset_mode": AutoresetMode.SAME_STEP, **arguments})
+            return ActuatedVectorEnv(
+                num_envs, config.task, **{"autoreset_mode": AutoresetMode.SAME_STEP, **arguments}
+            )
         if arguments["physics"] == "mujoco":
             gymnasium.logger.warn(
-                f"render_mode = 'human': {num_envs} environments of {self.name} are stepped one by one, which is slow; "
-                "batches render with 'rgb_array'"
+                f"render_mode = 'human': {num_envs} environments of {self.name} are stepped one by"
+                " one, which is slow; batches render with 'rgb_array'"
             )
         return SerialVectorEnv(num_envs, config.task, **arguments)
 
@@ -75,20 +79,34 @@ class TaskWorld(World):
                 has = ", ".join(known._fields) or "none"
                 hint = did_you_mean(name, [*known._fields, *self.fields])
                 raise UnknownOptionError(
-                    f"unknown option {name!r} of {self.name}: {hint}it has {has} (unexpected keyword argument {name!r})"
+                    f"unknown option {name!r} of {self.name}: {hint}it has {has} (unexpected"
+                    f" keyword argument {name!r})"
                 )
             plain[name] = value = value.item() if isinstance(value, np.generic) else value
             default = known._field_defaults[name]
             flag, positive = isinstance(default, bool), default > 0
-            allowed = isinstance(value, int | float) and (flag or (value > 0 if positive else math.isfinite(value)))
+            allowed = isinstance(value, int | float) and (
+                flag or (value > 0 if positive else math.isfinite(value))
+            )
             if isinstance(value, bool) != flag or not allowed:
-                kind = "True or False" if flag else "a number > 0" if positive else "a finite number"
+                kind = (
+                    "True or False" if flag else "a number > 0" if positive else "a finite number"
+                )
                 raise ValueError(f"{name} = {value!r}: must be {kind}")
-        return known(**{name: value if isinstance(value, bool) else float(value) for name, value in plain.items()})
+        return known(
+            **{
+                name: value if isinstance(value, bool) else float(value)
+                for name, value in plain.items()
+            }
+        )
 
     def changed(self, options: Any) -> dict[str, Any]:
         """Those of the options that are not at their defaults."""
-        return {name: value for name, value in options._asdict().items() if value != options._field_defaults[name]}
+        return {
+            name: value
+            for name, value in options._asdict().items()
+            if value != options._field_defaults[name]
+        }
 
     def option_flags(self, config: Any) -> list[tuple[str, Any, str, Any]]:
         """Those of all tasks: another's is refused by its name."""
@@ -121,7 +139,10 @@ class TaskWorld(World):
         for pattern, given in patterns.items():
             check_pattern(pattern)
             if len(parts_of(pattern)) > 1:
-                raise ValueError(f"{pattern!r}: {self.task.name} has a motor at each of its joints: give each its own")
+                raise ValueError(
+                    f"{pattern!r}: {self.task.name} has a motor at each of its joints: give each"
+                    " its own"
+                )
             for index in matched_by(pattern, names):
                 motor = names[index][0]
                 if motor in found:
@@ -131,7 +152,9 @@ class TaskWorld(World):
 
     def driven(self, kept: Any) -> dict[str, ActuatorModel]:
         """Motor -> actuator."""
-        return dict(zip(self.task.motors, kept if isinstance(kept, tuple) else (kept,), strict=True))
+        return dict(
+            zip(self.task.motors, kept if isinstance(kept, tuple) else (kept,), strict=True)
+        )
 
     def overlaid(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
         """Motor -> what drives it: `patterns`, and what a configuration has for others."""
@@ -142,14 +165,19 @@ class TaskWorld(World):
         """The task, if it has one motor."""
         if len(self.task.motors) > 1:
             raise ValueError(
-                f"task {self.name!r} has {len(self.task.motors)} motors: there is no scripted controller; train it "
-                "with --actuator ideal and name the run, or give time, torque and speed of each joint as .npz files"
+                f"task {self.name!r} has {len(self.task.motors)} motors: there is no scripted"
+                " controller; train it with --actuator ideal and name the run, or give time,"
+                " torque and speed of each joint as .npz files"
             )
         return self.task
 
     def as_with_motors(self, config: Any) -> Any:
         """In the engine, with the integration steps that a motor would have."""
-        steps = {} if config.inner_steps or config.timestep else {"inner_steps": self.task.motor_inner_steps}
+        steps = (
+            {}
+            if config.inner_steps or config.timestep
+            else {"inner_steps": self.task.motor_inner_steps}
+        )
         return dataclasses.replace(config, physics="mujoco", **steps)
 
     def action_space(self, config: Any) -> Any:  # noqa: ARG002 - the task's own, whatever it goes through
@@ -192,8 +220,15 @@ class TaskWorld(World):
 
         setup, motors = Setup.build(config), config.actuators
         of_sensors = [motors[0].SIGNAL_UNITS.get(name.rpartition(".")[2]) for name in setup.sensors]
-        seen = described(setup.observation_names, setup.observation_space, [*self.task.observation_units, *of_sensors])
-        driven = [self.task.state_names[self.task.qpos[self.task.qvel.index(at)]] for at in self.task.speeds]
+        seen = described(
+            setup.observation_names,
+            setup.observation_space,
+            [*self.task.observation_units, *of_sensors],
+        )
+        driven = [
+            self.task.state_names[self.task.qpos[self.task.qvel.index(at)]]
+            for at in self.task.speeds
+        ]
         at_joint = ["N*m" if name.endswith("[rad]") else "N" for name in driven]
         forced = config.action == "force"
         units = at_joint if forced else [command_of(one, config.action).unit for one in motors]
@@ -201,7 +236,9 @@ class TaskWorld(World):
         if isinstance(commands.action_space, spaces.Box):
             return seen, described(self.task.motors, commands.action_space, units)
         table: Any = commands.action_forces if forced else config.levels
-        names = [{"name": name, "unit": unit} for name, unit in zip(self.task.motors, units, strict=True)]
+        names = [
+            {"name": name, "unit": unit} for name, unit in zip(self.task.motors, units, strict=True)
+        ]
         columns = np.reshape(table, (len(table), -1)).T.tolist()
         return seen, [{**one, "levels": levels} for one, levels in zip(names, columns, strict=True)]
 

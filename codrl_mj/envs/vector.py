@@ -28,11 +28,12 @@ Array = np.ndarray
 class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
     """N environments that step together, each bit for bit an `ActuatedEnv` with a time limit.
 
-    Made by `gymnasium.make_vec(id, num_envs=N, vectorization_mode="vector_entry_point")`. No Python runs for a single
-    environment: states, motors, generators and bookkeeping are arrays.
+    Made by `gymnasium.make_vec(id, num_envs=N, vectorization_mode="vector_entry_point")`. No Python
+    runs for a single environment: states, motors, generators and bookkeeping are arrays.
 
-    Infos are arrays of shape (N,) with Gymnasium's masks (`_current` says which rows have a `current`). After a step in
-    `SAME_STEP` mode, `final_obs` and `final_info` hold what the episodes that ended saw last.
+    Infos are arrays of shape (N,) with Gymnasium's masks (`_current` says which rows have a
+    `current`). After a step in `SAME_STEP` mode, `final_obs` and `final_info` hold what the
+    episodes that ended saw last.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium has it
@@ -61,15 +62,17 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         Args:
             num_envs: how many, >= 1.
             task: the task's name.
-            actuator: as for `ActuatedEnv`; or a sequence of N of these (with several motors, of tuples of them), one
-                for each environment: all of one family, and not ideal.
+            actuator: as for `ActuatedEnv`; or a sequence of N of these (with several motors, of
+                tuples of them), one for each environment: all of one family, and not ideal.
             max_episode_steps: time limit of each environment [steps]; None for none.
-            autoreset_mode: when an environment whose episode ended is reset: in the `NEXT_STEP`, in the `SAME_STEP`, or
-                by the caller (`DISABLED`), with `reset(options={"reset_mask": ...})`.
+            autoreset_mode: when an environment whose episode ended is reset: in the `NEXT_STEP`, in
+                the `SAME_STEP`, or by the caller (`DISABLED`), with `reset(options={"reset_mask":
+                ...})`.
             num_threads: threads of the engine; 0 uses every CPU. Results do not depend on it.
-            physics: `mujoco`; the analytic physics steps one Gymnasium environment at a time and cannot be batched.
-            render_mode: None or `rgb_array`: `render` then draws every environment, `image` one of them. So it does in
-                `rgb_array_list`, as Gymnasium's vector wrappers expect.
+            physics: `mujoco`; the analytic physics steps one Gymnasium environment at a time and
+                cannot be batched.
+            render_mode: None or `rgb_array`: `render` then draws every environment, `image` one of
+                them. So it does in `rgb_array_list`, as Gymnasium's vector wrappers expect.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model.
@@ -77,16 +80,23 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             **arguments: the other arguments of `ActuatedEnv`.
 
         Raises:
-            ValueError: an argument is unknown or out of bounds, or a current loop is unstable; the message names it.
+            ValueError: an argument is unknown or out of bounds, or a current loop is unstable; the
+                message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
         check_counts(num_envs, max_episode_steps)
-        if isinstance(num_threads, bool) or not isinstance(num_threads, int | np.integer) or num_threads < 0:
-            raise ValueError(f"num_threads = {num_threads!r}: must be an integer >= 0 (0: every CPU)")
+        if (
+            isinstance(num_threads, bool)
+            or not isinstance(num_threads, int | np.integer)
+            or num_threads < 0
+        ):
+            raise ValueError(
+                f"num_threads = {num_threads!r}: must be an integer >= 0 (0: every CPU)"
+            )
         if physics != "mujoco":
             raise ValueError(
-                f"physics = {physics!r}: a vector environment needs 'mujoco'; the analytic physics steps one Gymnasium "
-                "environment at a time: use vectorization_mode='sync' for it"
+                f"physics = {physics!r}: a vector environment needs 'mujoco'; the analytic physics"
+                " steps one Gymnasium environment at a time: use vectorization_mode='sync' for it"
             )
         if render_mode not in (None, *self.metadata["render_modes"]):
             modes = ", ".join(self.metadata["render_modes"])
@@ -109,7 +119,9 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self.arm_radii = np.array([one.arm_radius for one in self.setup.config.actuators])
         """Of the motors of an environment [m], shape (motors,)."""
         self._streams = Streams(self.num_envs)
-        self._draws = Draws(self.setup.randomization, actuators, functools.partial(put_into_batch, self.physics))
+        self._draws = Draws(
+            self.setup.randomization, actuators, functools.partial(put_into_batch, self.physics)
+        )
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)
         self._observations: Array = np.zeros(self.observation_space.shape or (), dtype=np.float32)
@@ -140,7 +152,11 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         """An attribute, once for each environment, as Gymnasium's `SyncVectorEnv` has it."""
         value = getattr(self, name)
         each = isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,)
-        return tuple(value.tolist() if value.ndim == 1 else value) if each else (value,) * self.num_envs
+        return (
+            tuple(value.tolist() if value.ndim == 1 else value)
+            if each
+            else (value,) * self.num_envs
+        )
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute of all environments: a list or tuple has a value for each of them."""
@@ -161,13 +177,20 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         if shared(self.task.attributes[name]):
             if not np.array_equal(value, present := self._read_attribute(name)):
                 raise AttributeError(
-                    f"{name} = {value!r}: the environments share it, as {present!r}; use vectorization_mode='sync'"
+                    f"{name} = {value!r}: the environments share it, as {present!r}; use"
+                    " vectorization_mode='sync'"
                 )
             return
         if np.shape(value) not in ((), (self.num_envs,)):
-            raise ValueError(f"{name} = {value!r}: must be one number, or {self.num_envs}, one for each environment")
+            raise ValueError(
+                f"{name} = {value!r}: must be one number, or {self.num_envs}, one for each"
+                " environment"
+            )
         fields = {field: self.physics.field(field).copy() for field in VARIED}
-        looks = {field: np.array([field_of(self.physics.model, field)] * self.num_envs) for field in SHOWN}
+        looks = {
+            field: np.array([field_of(self.physics.model, field)] * self.num_envs)
+            for field in SHOWN
+        }
         looks |= {field: rows.copy() for field, rows in self.looks.items() if field in SHOWN}
         numbers = np.broadcast_to(value, self.num_envs).tolist()
         for row, (model, number) in enumerate(zip(self.physics.models(), numbers, strict=True)):
@@ -191,22 +214,33 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         return tuple(self._streams.generators)
 
     def reset(  # type: ignore[override]
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Array, dict[str, Any]]:
         """Start episodes, in every environment or in those of `options["reset_mask"]`.
 
         Args:
-            seed: of the first environment, the others counting up from it; or one for each (None leaves a generator).
-            options: Gymnasium's reset options for the task, and `reset_mask`: shape (N,), bool, with a True in it.
+            seed: of the first environment, the others counting up from it; or one for each (None
+                leaves a generator).
+            options: Gymnasium's reset options for the task, and `reset_mask`: shape (N,), bool,
+                with a True in it.
 
         Raises:
             ValueError: wrong number of seeds, or a mask of wrong shape or type.
         """
         options = dict(options or {})
         mask = options.pop("reset_mask", np.ones(self.num_envs, dtype=bool))
-        if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+        if (
+            not isinstance(mask, np.ndarray)
+            or mask.shape != (self.num_envs,)
+            or mask.dtype != bool
+            or not mask.any()
+        ):
             raise ValueError(
-                f"reset_mask = {mask!r}: must be a bool array of shape ({self.num_envs},) with a True in it"
+                f"reset_mask = {mask!r}: must be a bool array of shape ({self.num_envs},) with a"
+                " True in it"
             )
         seeds: Sequence[int | None]
         if seed is None or isinstance(seed, int | np.integer):
@@ -214,7 +248,10 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         else:
             seeds = seed
         if len(seeds) != self.num_envs:
-            raise ValueError(f"seed: {len(seeds)} seeds for {self.num_envs} environments: there must be one for each")
+            raise ValueError(
+                f"seed: {len(seeds)} seeds for {self.num_envs} environments: there must be one for"
+                " each"
+            )
         rows = np.flatnonzero(mask)
         chosen = [seeds[row] for row in rows.tolist()]
         if any(one is not None for one in chosen):
@@ -232,7 +269,9 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         draws = low + (high - low) * self._streams.random(rows, len(low))
         states = self.setup.task.initial_states(draws)
         self._draws.draw(self._streams.random, rows)
-        self.physics.reset(rows, states, self.setup.keys(lambda count: self._streams.random(rows, count)))
+        self.physics.reset(
+            rows, states, self.setup.keys(lambda count: self._streams.random(rows, count))
+        )
         self.physics.observe(self._compiled()[0].observe_rows, rows, self._observations)
         self._elapsed[rows] = 0
         self._ended[rows] = False
@@ -245,19 +284,22 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             actions: shape (N, ...).
 
         Returns:
-            Observations (N, k) float32, rewards (N,) float64, terminations and truncations (N,) bool, infos.
+            Observations (N, k) float32, rewards (N,) float64, terminations and truncations (N,)
+            bool, infos.
 
         Raises:
-            ValueError: actions of wrong shape or type, or one that is not in the action space: the message names the
-                environment, and none was stepped.
-            SimulationDivergedError: a simulation left the finite numbers; the message names the environment. All were
-                stepped; once it is reset, by `reset(options={"reset_mask": ...})`, they can go on.
+            ValueError: actions of wrong shape or type, or one that is not in the action space: the
+                message names the environment, and none was stepped.
+            SimulationDivergedError: a simulation left the finite numbers; the message names the
+                environment. All were stepped; once it is reset, by `reset(options={"reset_mask":
+                ...})`, they can go on.
             RuntimeError: in `DISABLED` mode, an environment whose episode ended was not reset.
         """
         forces = self.setup.commands.forces(actions)
         if len(forces) != self.num_envs:
             raise ValueError(
-                f"actions: {len(forces)} rows for {self.num_envs} environments: there must be one for each"
+                f"actions: {len(forces)} rows for {self.num_envs} environments: there must be one"
+                " for each"
             )
         if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
             row = int(np.argmax(self._ended))
@@ -270,7 +312,11 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         steps.forces[:], steps.stepping[:] = forces, stepping
         steps.limit[0] = np.inf if self.max_episode_steps is None else self.max_episode_steps
         broken = self.physics.step(kernels.step_rows, steps)
-        rewards, terminated, truncated = steps.rewards.copy(), steps.terminated.copy(), steps.truncated.copy()
+        rewards, terminated, truncated = (
+            steps.rewards.copy(),
+            steps.terminated.copy(),
+            steps.truncated.copy(),
+        )
         columns = steps.signals.reshape(-1, *forces.shape).copy()
         self.signals = signals = self.setup.signals([forces, *columns], forces)
         if broken:
@@ -369,7 +415,9 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
     def image(self, row: int = 0) -> Array | None:
         """One environment as an image, shape (height, width, 3), uint8; None if there is no render mode."""
         if self.render_mode is None:
-            gymnasium.logger.warn("render() without a render mode: pass render_mode='rgb_array' when making it")
+            gymnasium.logger.warn(
+                "render() without a render mode: pass render_mode='rgb_array' when making it"
+            )
             return None
         if self._renderer is None:
             self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
@@ -394,8 +442,8 @@ def check_counts(num_envs: int, max_episode_steps: int | None, each: int = 3_000
             raise ValueError(f"{name} = {count!r}: must be an integer >= 1")
     if (room := free_memory()) is not None and num_envs * each > room:
         raise ValueError(
-            f"num_envs = {num_envs}: takes about {num_envs * each / 1e9:.3g} GB of memory, of which {room / 1e9:.3g} "
-            f"are free: must be <= {room // each}"
+            f"num_envs = {num_envs}: takes about {num_envs * each / 1e9:.3g} GB of memory, of which"
+            f" {room / 1e9:.3g} are free: must be <= {room // each}"
         )
 
 

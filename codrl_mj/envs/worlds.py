@@ -1,7 +1,7 @@
 """Worlds: what environments are of, before motors are in them. Tasks of ours, anybody's environments, and one's own.
 
-An `EnvConfig` names its world and asks it for everything in which worlds differ. One's own is an instance of a subclass
-of `World`, found as `module:NAME`; no file of ours needs to know of it.
+An `EnvConfig` names its world and asks it for everything in which worlds differ. One's own is an
+instance of a subclass of `World`, found as `module:NAME`; no file of ours needs to know of it.
 """
 
 import abc
@@ -46,8 +46,8 @@ _UNITS = (
 class World(abc.ABC):
     """What environments are of. One's own has a name, makes environments, and overrides what it knows better.
 
-    What it makes are environments of Gymnasium's whose motors can be read, as `codrl_mj.make` makes them of any
-    function that returns an environment with MuJoCo's `model` and `data`.
+    What it makes are environments of Gymnasium's whose motors can be read, as `codrl_mj.make` makes
+    them of any function that returns an environment with MuJoCo's `model` and `data`.
     """
 
     name: str
@@ -128,8 +128,8 @@ class World(abc.ABC):
                 raise ValueError(f"{wrong.pop()!r} is no argument of the environment's")
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f"options = {given!r}: must be a mapping that JSON can hold ({error}); register an environment "
-                "of your own with whatever else it takes"
+                f"options = {given!r}: must be a mapping that JSON can hold ({error}); register an"
+                " environment of your own with whatever else it takes"
             ) from None
         return kept
 
@@ -140,7 +140,10 @@ class World(abc.ABC):
     def option_flags(self, config: Any) -> list[tuple[str, Any, str, Any]]:
         """Name, type, description and default of the flags for its options."""
         written = tuple(f"{name}={json.dumps(value)}" for name, value in config.options.items())
-        about = "Keyword arguments of the environment, such as frame_skip=2: their values as JSON, or else as text."
+        about = (
+            "Keyword arguments of the environment, such as frame_skip=2: their values as JSON, or"
+            " else as text."
+        )
         return [("options", tuple[str, ...], about, written)]
 
     def options_of(self, flags: Mapping[str, Any]) -> dict[str, Any]:
@@ -168,7 +171,9 @@ class World(abc.ABC):
         """
         from codrl_mj.engine.specs import resolve_patterns
 
-        return resolve_patterns(by_pattern(given, self.default_actuator), f"the environment {self.name}")
+        return resolve_patterns(
+            by_pattern(given, self.default_actuator), f"the environment {self.name}"
+        )
 
     def driven(self, kept: Any) -> dict[str, ActuatorModel]:
         """Pattern -> actuator, of what `actuators` returned."""
@@ -186,7 +191,9 @@ class World(abc.ABC):
             names = names_of(model)
         taken = {index for pattern in patterns for index in matched_by(pattern, names)}
         left = {
-            " & ".join(re.escape(names[one][0]) for one in sharing(model, index) if one not in taken): actuator
+            " & ".join(
+                re.escape(names[one][0]) for one in sharing(model, index) if one not in taken
+            ): actuator
             for pattern, actuator in config.driven.items()
             for index in matched_by(pattern, names)
             if index not in taken
@@ -201,7 +208,8 @@ class World(abc.ABC):
             ValueError: there is none.
         """
         raise ValueError(
-            f"{self.name}: there is no scripted controller for it; train it with --actuator ideal and name the run"
+            f"{self.name}: there is no scripted controller for it; train it with --actuator ideal"
+            " and name the run"
         )
 
     def as_with_motors(self, config: Any) -> Any:
@@ -218,14 +226,22 @@ class World(abc.ABC):
         """Who is trained in it unless another is named."""
         return "sac" if isinstance(self.action_space(config), spaces.Box) else "ppo"
 
-    def view(self, config: Any, width: int, height: int, camera: str | None) -> dict[str, Any] | None:  # noqa: ARG002
+    def view(
+        self,
+        config: Any,  # noqa: ARG002
+        width: int,  # noqa: ARG002
+        height: int,  # noqa: ARG002
+        camera: str | None,
+    ) -> dict[str, Any] | None:
         """What `make` takes for images of that size [px]; None where they are drawn from an episode's states.
 
         Raises:
             ValueError: it has not this camera, or none that can be chosen.
         """
         if camera is not None:
-            raise ValueError(f"camera = {camera!r}: {self.name} draws itself, by its own camera: leave it out")
+            raise ValueError(
+                f"camera = {camera!r}: {self.name} draws itself, by its own camera: leave it out"
+            )
         return {"render_mode": "rgb_array"}
 
     def scene(self, config: Any) -> tuple[Any, Any, str | None]:
@@ -241,16 +257,20 @@ class World(abc.ABC):
         for index, kind in enumerate(model.jnt_type.tolist()):
             joint = model.joint(index).name or f"joint {index}"
             for made, units in zip((positions, speeds), _UNITS[kind], strict=True):
-                made += [f"{joint}{f' {k}' if len(units) > 1 else ''} [{one}]" for k, one in enumerate(units)]
+                made += [
+                    f"{joint}{f' {k}' if len(units) > 1 else ''} [{one}]"
+                    for k, one in enumerate(units)
+                ]
         return (*positions, *speeds)
 
     def interface(self, config: Any) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """What passes between a policy and its environment, for whoever builds the other side of it.
 
         Returns:
-            Entries of the observation, and of the action, in their order: `name`, `unit` (None where nobody knows) and
-            the bounds `least` and `most`, None where there are none. A discrete action is one entry, with the `levels`
-            that its indices stand for, if they are known.
+            Entries of the observation, and of the action, in their order: `name`, `unit` (None
+            where nobody knows) and the bounds `least` and `most`, None where there are none. A
+            discrete action is one entry, with the `levels` that its indices stand for, if they are
+            known.
         """
         with contextlib.closing(config.make()) as env:
             seen, acts = env.observation_space, env.action_space
@@ -258,20 +278,35 @@ class World(abc.ABC):
         if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
             raise ValueError(f"{self.name}: observations are {seen}: must be vectors")
         if isinstance(acts, spaces.Discrete):
-            return described([f"observation {k}" for k in range(seen.shape[0])], seen), [{"name": "action"}]
-        names = motors if len(motors) == acts.shape[0] else [f"action {k}" for k in range(acts.shape[0])]
-        return described([f"observation {k}" for k in range(seen.shape[0])], seen), described(names, acts)
+            return described([f"observation {k}" for k in range(seen.shape[0])], seen), [
+                {"name": "action"}
+            ]
+        names = (
+            motors
+            if len(motors) == acts.shape[0]
+            else [f"action {k}" for k in range(acts.shape[0])]
+        )
+        return described([f"observation {k}" for k in range(seen.shape[0])], seen), described(
+            names, acts
+        )
 
     def at_goal(self, episode: Any) -> np.ndarray | None:
         """Whether an episode is at the goal, before its first step and after each, (T+1,); None where nobody knows."""
         return None if episode.succeeded is None else np.full(len(episode.state), episode.succeeded)
 
 
-def described(names: Sequence[str], box: spaces.Box, units: Sequence[str | None] | None = None) -> list[dict[str, Any]]:
+def described(
+    names: Sequence[str], box: spaces.Box, units: Sequence[str | None] | None = None
+) -> list[dict[str, Any]]:
     """Entries of a box of vectors, as `World.interface` has them."""
-    ends = ([float(end) if np.isfinite(end) else None for end in side] for side in (box.low, box.high))
+    ends = (
+        [float(end) if np.isfinite(end) else None for end in side] for side in (box.low, box.high)
+    )
     columns = zip(names, units or [None] * len(names), *ends, strict=True)
-    return [{"name": name, "unit": unit, "least": least, "most": most} for name, unit, least, most in columns]
+    return [
+        {"name": name, "unit": unit, "least": least, "most": most}
+        for name, unit, least, most in columns
+    ]
 
 
 def options_mapping(options: Any) -> dict[str, Any]:
@@ -279,12 +314,16 @@ def options_mapping(options: Any) -> dict[str, Any]:
     try:
         return options._asdict() if hasattr(options, "_asdict") else dict(options or {})
     except (TypeError, ValueError):
-        raise ValueError(f"options = {options!r}: must be a mapping of option names to values") from None
+        raise ValueError(
+            f"options = {options!r}: must be a mapping of option names to values"
+        ) from None
 
 
 @functools.cache
 def _own_actions(world: World, options: str) -> "spaces.Space[Any]":
-    config = importlib.import_module("codrl_mj.envs.config").EnvConfig(world.reference, options=json.loads(options))
+    config = importlib.import_module("codrl_mj.envs.config").EnvConfig(
+        world.reference, options=json.loads(options)
+    )
     with contextlib.closing(world.make(config)) as env:
         return env.action_space
 
@@ -292,7 +331,10 @@ def _own_actions(world: World, options: str) -> "spaces.Space[Any]":
 def by_pattern(given: Any, default: str = "ideal") -> Mapping[str, Any]:
     """What a user wrote for the actuators of an environment, as pattern of motors -> what drives them."""
     if given in ({}, []) or isinstance(given, list | tuple):
-        raise ValueError(f"actuator = {given!r}: must be one for all, or what drives what, such as {{'.*': 'lag'}}")
+        raise ValueError(
+            f"actuator = {given!r}: must be one for all, or what drives what, such as {{'.*':"
+            " 'lag'}"
+        )
     return patterns_of(given) or {EVERY: default if given == "default" else given}
 
 
@@ -303,10 +345,17 @@ def patterns_of(given: Any) -> Mapping[str, Any] | None:
     for one in given.values():
         fields = one.items() if isinstance(one, Mapping) else ()
         of_actuator = any(
-            name in ("family", "name") or dataclasses.is_dataclass(value) or isinstance(value, Mapping)
+            name in ("family", "name")
+            or dataclasses.is_dataclass(value)
+            or isinstance(value, Mapping)
             for name, value in fields
         )
-        if not (one is None or of_actuator or isinstance(one, str | Path | ActuatorModel) or is_family(one)):
+        if not (
+            one is None
+            or of_actuator
+            or isinstance(one, str | Path | ActuatorModel)
+            or is_family(one)
+        ):
             return None
     return given or None
 
@@ -318,7 +367,10 @@ def is_world(word: str) -> bool:
     """
     if word in TASKS or re.fullmatch(r"[\w.]+:[\w.]+", word) is not None:
         return True
-    return any(kind.claims(word) for kind in map(importlib.import_module, _KINDS)) and not Path(word).is_dir()
+    return (
+        any(kind.claims(word) for kind in map(importlib.import_module, _KINDS))
+        and not Path(word).is_dir()
+    )
 
 
 def find_world(name: Any) -> World:
@@ -336,12 +388,16 @@ def find_world(name: Any) -> World:
 def world_of(thing: Any) -> World:
     """The world of what stands at `module:NAME`."""
     if isinstance(thing, type):
-        raise ValueError(f"{thing.__qualname__}: must be an instance of it: {thing.__qualname__}(...)")
+        raise ValueError(
+            f"{thing.__qualname__}: must be an instance of it: {thing.__qualname__}(...)"
+        )
     raise ValueError(f"{thing!r}: must be a codrl_mj.Task or a codrl_mj.World")
 
 
 @world_of.register
 def _(world: World) -> World:
     if not isinstance(getattr(world, "name", None), str):
-        raise ValueError(f"{type(world).__qualname__}: must have a `name`, a text, which messages call it by")
+        raise ValueError(
+            f"{type(world).__qualname__}: must have a `name`, a text, which messages call it by"
+        )
     return world

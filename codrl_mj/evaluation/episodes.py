@@ -40,8 +40,9 @@ class Episode:
     first_speeds: np.ndarray
     """Velocities at the motors' side of the model's gears before the first step [m/s or rad/s], shape (motors,)."""
     trace: dict[str, np.ndarray]
-    """What the actuators did in each integration step, by the names of `codrl_mj.physics.trace_names`, each of shape
-    (T*n,); with several motors (T*n, motors)."""
+    """What the actuators did in each integration step, by the names of
+    `codrl_mj.physics.trace_names`, each of shape (T*n,); with several motors (T*n, motors).
+    """
     signals: dict[str, np.ndarray]
     """The actuators' signals at the end of each step, by their names in `info`, each of shape (T,) or (T, motors)."""
     terminated: bool
@@ -63,7 +64,10 @@ class Episode:
     @property
     def tracks(self) -> tuple[bool, ...]:
         """For each motor True if a torque was asked of it; a voltage, a position or a speed is none."""
-        asked = (one if self.command == "force" else one.commands()[self.command].actuator for one in self.actuators)
+        asked = (
+            one if self.command == "force" else one.commands()[self.command].actuator
+            for one in self.actuators
+        )
         return tuple(one.tracks for one in asked)
 
     @property
@@ -97,7 +101,9 @@ class RandomPolicy:
         """
         if seed < 0:
             raise ValueError(f"seed = {seed}: must be >= 0")
-        self._space = copy.deepcopy(EnvConfig(actions).action_space if isinstance(actions, str) else actions)
+        self._space = copy.deepcopy(
+            EnvConfig(actions).action_space if isinstance(actions, str) else actions
+        )
         self._space.seed(seed)
 
     def predict(
@@ -118,15 +124,18 @@ def save_episode(episode: Episode, path: Path) -> None:
 
     Args:
         episode: the episode.
-        path: `.npz` file; its arrays are named as the fields of `Episode`, what is in `trace` and `signals` as
-            `trace/NAME` and `signals/NAME`. `actuator` is text: its fields as JSON, a list for several motors.
+        path: `.npz` file; its arrays are named as the fields of `Episode`, what is in `trace` and
+            `signals` as `trace/NAME` and `signals/NAME`. `actuator` is text: its fields as JSON, a
+            list for several motors.
 
     Raises:
         ValueError: another suffix.
     """
     if path.suffix != ".npz":
         raise ValueError(f"trajectory {path}: the suffix must be .npz")
-    arrays: dict[str, Any] = {field: getattr(episode, field) for field in (*_ARRAYS, "terminated", "command")}
+    arrays: dict[str, Any] = {
+        field: getattr(episode, field) for field in (*_ARRAYS, "terminated", "command")
+    }
     for field in ("trace", "signals"):
         arrays |= {f"{field}/{name}": values for name, values in getattr(episode, field).items()}
     if episode.motors:
@@ -134,7 +143,9 @@ def save_episode(episode: Episode, path: Path) -> None:
     if episode.succeeded is not None:
         arrays["succeeded"] = episode.succeeded
     several = isinstance(episode.actuator, tuple)
-    described = [mapping_of(one) for one in episode.actuator] if several else mapping_of(episode.actuator)
+    described = (
+        [mapping_of(one) for one in episode.actuator] if several else mapping_of(episode.actuator)
+    )
     with writing(path) as temporary:
         np.savez_compressed(temporary, actuator=json.dumps(described), **arrays)
 
@@ -157,7 +168,8 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
         several = isinstance(described, list)
         with trusting(trust):
             actuators = [
-                IDEAL if one is None else actuator_from_mapping(one) for one in (described if several else [described])
+                IDEAL if one is None else actuator_from_mapping(one)
+                for one in (described if several else [described])
             ]
         return Episode(
             **{field: arrays[field] for field in _ARRAYS},
@@ -169,11 +181,20 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
             motors=tuple(arrays["motors"].tolist()) if "motors" in arrays else (),
             succeeded=bool(arrays["succeeded"]) if "succeeded" in arrays else None,
         )
-    except (KeyError, TypeError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        EOFError,
+        NotImplementedError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         raise ValueError(f"{path} is not the trajectory of an episode: {error}") from None
 
 
-_EPISODE_SIZE = 100_000  # memory [bytes] of an environment that stands still; the tasks' have three to seven times that
+# memory [bytes] of an environment that stands still; the tasks' have three to seven times that
+_EPISODE_SIZE = 100_000
 _STEPS_BETWEEN_CHECKS = 10_000
 
 
@@ -181,7 +202,9 @@ def check_episodes(episodes: int, name: str = "episodes") -> None:
     """Refuse a number of episodes that is below 1, or whose environments memory does not hold."""
     if episodes < 1:
         raise ValueError(f"{name} = {episodes}: must be >= 1")
-    check_memory(_EPISODE_SIZE * episodes, f"{name} = {episodes:,}, which run side by side", "run fewer")
+    check_memory(
+        _EPISODE_SIZE * episodes, f"{name} = {episodes:,}, which run side by side", "run fewer"
+    )
 
 
 class _Recording:
@@ -209,7 +232,9 @@ class _Recording:
         self._rewards.append(float(reward))
         self._traces.append(self._recorder.trace)
         self._signals.append(info)
-        if (steps := len(self._traces)) % _STEPS_BETWEEN_CHECKS == 0:  # what is recorded is copied in the end
+        if (
+            steps := len(self._traces)
+        ) % _STEPS_BETWEEN_CHECKS == 0:  # what is recorded is copied in the end
             what = f"an episode of {steps:,} steps, which does not end"
             check_memory(steps * self._traces[-1].nbytes, what, "lower max_episode_steps")
         return self._terminated or truncated
@@ -227,7 +252,10 @@ class _Recording:
             action=np.array(self._actions),
             reward=np.array(self._rewards),
             trace=dict(zip(recorder.trace_names, columns.copy(), strict=True)),
-            signals={name: np.array([info[name] for info in self._signals]) for name in recorder.signal_names},
+            signals={
+                name: np.array([info[name] for info in self._signals])
+                for name in recorder.signal_names
+            },
             terminated=self._terminated,
             actuator=recorder.actuator,
             command=recorder.command,
@@ -268,7 +296,9 @@ def run_episodes(
     recordings = [_Recording(make(), seed + index) for index in range(episodes)]
     running = recordings
     with contextlib.ExitStack() as stack:
-        if not deterministic:  # the generator that torch's policies sample from is left as it was found
+        if (
+            not deterministic
+        ):  # the generator that torch's policies sample from is left as it was found
             import torch
 
             stack.enter_context(torch.random.fork_rng(devices=[]))
@@ -276,9 +306,13 @@ def run_episodes(
         while running:
             observations = np.stack([recording.observations[-1] for recording in running])
             actions, _ = policy.predict(observations, deterministic=deterministic)
-            ended = [recording.step(action) for recording, action in zip(running, actions, strict=True)]
+            ended = [
+                recording.step(action) for recording, action in zip(running, actions, strict=True)
+            ]
             if any(ended):
-                running = [recording for recording, over in zip(running, ended, strict=True) if not over]
+                running = [
+                    recording for recording, over in zip(running, ended, strict=True) if not over
+                ]
             if on_step is not None:
                 on_step(len(running), episodes - len(running))
     for recording in recordings:

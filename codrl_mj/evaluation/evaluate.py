@@ -36,8 +36,8 @@ def _measure(label: str, unit: str) -> Any:
 class Evaluation:
     """What a policy achieved on an actuator, over all integration steps of all episodes.
 
-    Torques, speeds and currents are the motor's own, at its shaft. Electrical measures are None for the ideal actuator,
-    which has no motor.
+    Torques, speeds and currents are the motor's own, at its shaft. Electrical measures are None for
+    the ideal actuator, which has no motor.
     """
 
     task: str
@@ -55,16 +55,20 @@ class Evaluation:
     length: Interval = _measure("length", "steps")
     """Environment steps per episode."""
     success: Interval | None = _measure("success", "share")
-    """Share of episodes that succeed, as the task defines it, or as an environment of others says in its `info`; None
-    where it says nothing. Wilson's interval."""
+    """Share of episodes that succeed, as the task defines it, or as an environment of others says
+    in its `info`; None where it says nothing. Wilson's interval.
+    """
     failure: Interval | None = _measure("failure", "share")
     """Share of episodes that do not."""
     time_to_goal: Quartiles | None = _measure("time to goal, median", "s")
-    """Time from which the goal was held until the end, in successful episodes; None if there are none, or if the goal
-    is to last until the time limit."""
+    """Time from which the goal was held until the end, in successful episodes; None if there are
+    none, or if the goal is to last until the time limit.
+    """
     tracking_rms: float | None = _measure("shaft torque error, rms", "N*m")
-    """Root mean square of desired less delivered torque, of the motors of which a torque is asked; None where there is
-    none, as where the agent commands the voltage or a position, and none of the tracking measures exists."""
+    """Root mean square of desired less delivered torque, of the motors of which a torque is asked;
+    None where there is none, as where the agent commands the voltage or a position, and none of the
+    tracking measures exists.
+    """
     tracking_percent: float | None = _measure("shaft torque error / desired", "%")
     """The same, relative to the root mean square of the desired torque."""
     tracking_max: float | None = _measure("shaft torque error, largest", "N*m")
@@ -115,15 +119,17 @@ class Evaluation:
     def as_mapping(self) -> dict[str, Any]:
         """The evaluation as JSON-serialisable values.
 
-        Intervals are mappings of `mean`, `low` and `high`, quartiles of `median`, `low` and `high`; `units` has the
-        unit of every measure.
+        Intervals are mappings of `mean`, `low` and `high`, quartiles of `median`, `low` and `high`;
+        `units` has the unit of every measure.
         """
         named = {
-            name: value._asdict()
-            if isinstance(value, Interval | Quartiles)
-            else [*value]
-            if type(value) is tuple
-            else value
+            name: (
+                value._asdict()
+                if isinstance(value, Interval | Quartiles)
+                else [*value]
+                if type(value) is tuple
+                else value
+            )
             for name, value in vars(self).items()
         }
         return named | {"units": {name: field.metadata["unit"] for name, field in MEASURES.items()}}
@@ -150,7 +156,8 @@ def evaluate(
         env: an `EnvConfig`: task, actuator and all else; what it randomises is drawn for every
             episode.
         episodes: their number, >= 1.
-        seed: of the first episode, the others counting up from it; and of the actions that are sampled.
+        seed: of the first episode, the others counting up from it; and of the actions that are
+            sampled.
         deterministic: whether the policy takes its most likely action or samples.
         on_step: called with (episodes running, episodes finished) after every step.
 
@@ -181,7 +188,10 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     if any(world.at_goal(episode) is not None for episode in episodes):
         success = wilson_rate(len(reached), len(episodes))
     driven = [driven_in(episode) for episode in episodes]
-    each_motor = (_measures(episodes, [[each[place]] for each in driven]) for place, _ in enumerate(episodes[0].motors))
+    each_motor = (
+        _measures(episodes, [[each[place]] for each in driven])
+        for place, _ in enumerate(episodes[0].motors)
+    )
     return Evaluation(
         task=world.name,
         episodes=len(episodes),
@@ -191,12 +201,19 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
         returns_interquartile_mean=interquartile_mean(returns),
         length=bootstrap_mean(np.array([float(len(episode.reward)) for episode in episodes])),
         success=success,
-        failure=None if success is None else Interval(1 - success.mean, 1 - success.high, 1 - success.low),
+        failure=(
+            None
+            if success is None
+            else Interval(1 - success.mean, 1 - success.high, 1 - success.low)
+        ),
         time_to_goal=quartiles(reached) if world.timed and len(reached) else None,
         episode_returns=tuple(returns.tolist()),
         episode_times_to_goal=() if success is None else tuple(goals),
         motors={  # of energies the mean
-            name: {key: value.mean if isinstance(value, Interval) else value for key, value in measures.items()}
+            name: {
+                key: value.mean if isinstance(value, Interval) else value
+                for key, value in measures.items()
+            }
             for name, measures in zip(episodes[0].motors, each_motor, strict=True)
         },
         **_measures(episodes, driven),
@@ -254,10 +271,18 @@ def driven_in(episode: Episode) -> list[Driven]:
     several = isinstance(episode.actuator, tuple)
     made = []
     for number, actuator in enumerate(episode.actuators):
-        own = {name: values[:, number] if several else values for name, values in episode.trace.items()}
-        asked = episode.signals["desired_force"][:, number] if several else episode.signals["desired_force"]
+        own = {
+            name: values[:, number] if several else values for name, values in episode.trace.items()
+        }
+        asked = (
+            episode.signals["desired_force"][:, number]
+            if several
+            else episode.signals["desired_force"]
+        )
         arm, force, speed = actuator.arm_radius, own.pop("actual_force"), own.pop("speed")
-        shown = {name: own[name] for name in actuator.Signals._fields if name in own}  # others are of other families
+        shown = {
+            name: own[name] for name in actuator.Signals._fields if name in own
+        }  # others are of other families
         made.append(
             Driven(
                 actuator,
@@ -276,15 +301,20 @@ def driven_in(episode: Episode) -> list[Driven]:
 def _measures(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]]) -> dict[str, Any]:
     """What motors were asked for and did, of each episode the same ones, on the mean of them.
 
-    How well the torque follows the desired one, which is held over an environment step; what the delivered one does to
-    gears and bearings; what that asks of the supply; the work done.
+    How well the torque follows the desired one, which is held over an environment step; what the
+    delivered one does to gears and bearings; what that asks of the supply; the work done.
     """
     actual = [one.actual for each in driven for one in each]
     delivered = np.concatenate(actual)
     tracked = [[one for one in each if one.tracks] for each in driven]
-    found: dict[str, Any] = dict.fromkeys(("tracking_rms", "tracking_percent", "tracking_max", "tracking_lag"))
+    found: dict[str, Any] = dict.fromkeys(
+        ("tracking_rms", "tracking_percent", "tracking_max", "tracking_lag")
+    )
     if all(tracked):
-        desired, followed = ([getattr(one, name) for each in tracked for one in each] for name in ("desired", "actual"))
+        desired, followed = (
+            [getattr(one, name) for each in tracked for one in each]
+            for name in ("desired", "actual")
+        )
         asked = np.concatenate(desired)
         error = asked - np.concatenate(followed)
         rms, scale = _root_mean_square(error), _root_mean_square(asked)
@@ -300,7 +330,9 @@ def _measures(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]]) -
         "torque_rms": _root_mean_square(delivered),
         "reversals": sum(map(sign_changes, actual)) / duration,
         **_electrical(episodes, driven),
-        "mechanical_work": bootstrap_mean(np.array([sum(one.work for one in each) for each in driven])),
+        "mechanical_work": bootstrap_mean(
+            np.array([sum(one.work for one in each) for each in driven])
+        ),
     }
 
 
@@ -312,28 +344,47 @@ def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]])
     """What was asked of the actuators: of any but the ideal one, and of windings, as far as the family shows it."""
     each = (f"{limit}_saturated" for limit in ("voltage", "current", "temperature"))
     limits = {f"{name}_percent": name for name in ("saturated", *each)}
-    names = ("peak_voltage", "peak_current", "rms_current", "peak_speed", "peak_temperature", "energy_drawn")
-    found: dict[str, Any] = dict.fromkeys((*limits, *names, "energy_returned", "copper_loss", "magnetic_energy"))
+    names = (
+        "peak_voltage",
+        "peak_current",
+        "rms_current",
+        "peak_speed",
+        "peak_temperature",
+        "energy_drawn",
+    )
+    found: dict[str, Any] = dict.fromkeys(
+        (*limits, *names, "energy_returned", "copper_loss", "magnetic_energy")
+    )
     every = [one for each in driven for one in each if not isinstance(one.actuator, Ideal)]
     if not every:
         return found
-    found["peak_speed"] = max(float(np.abs(one.speed).max()) / one.actuator.arm_radius for one in every)
+    found["peak_speed"] = max(
+        float(np.abs(one.speed).max()) / one.actuator.arm_radius for one in every
+    )
     for measure, name in limits.items():
         if limited := [one.signals[name] for one in every if name in one.signals]:
             found[measure] = float(100 * np.concatenate(limited).mean())
     warmed = [one.signals["temperature"] for one in every if "temperature" in one.signals]
-    if warmed and any(np.ptp(values) > 0.0 for values in warmed):  # constant where nothing is known of it
+    if warmed and any(
+        np.ptp(values) > 0.0 for values in warmed
+    ):  # constant where nothing is known of it
         found["peak_temperature"] = float(np.concatenate(warmed).max())
     wound = [[one for one in each if one.wound] for each in driven]
     every = [one for each in wound for one in each]
     if not every:
         return found
     energies = [[_energies(one) for one in each] for each in wound]
-    drawn, returned, copper, magnetic, squares = np.array([np.sum(each, axis=0) for each in energies]).T
+    drawn, returned, copper, magnetic, squares = np.array(
+        [np.sum(each, axis=0) for each in energies]
+    ).T
     duration = math.fsum(episode.time[-1] for episode in episodes) * len(wound[0])
     return found | {
-        "peak_voltage": float(np.abs(np.concatenate([one.signals["voltage"] for one in every])).max()),
-        "peak_current": float(np.abs(np.concatenate([one.signals["current"] for one in every])).max()),
+        "peak_voltage": float(
+            np.abs(np.concatenate([one.signals["voltage"] for one in every])).max()
+        ),
+        "peak_current": float(
+            np.abs(np.concatenate([one.signals["current"] for one in every])).max()
+        ),
         "rms_current": math.sqrt(squares.sum() / duration),
         "energy_drawn": bootstrap_mean(drawn),
         "energy_returned": bootstrap_mean(returned),

@@ -1,7 +1,7 @@
 """Films of episodes: as a file, with a strip of torque and voltage under the scene; as a clip, the scene alone.
 
-Episodes of tasks are recorded first and drawn afterwards from their states, so that drawing never disturbs a
-simulation; an environment of somebody else's draws itself while it runs.
+Episodes of tasks are recorded first and drawn afterwards from their states, so that drawing never
+disturbs a simulation; an environment of somebody else's draws itself while it runs.
 """
 
 import contextlib
@@ -20,7 +20,14 @@ import numpy as np
 
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.evaluation.episodes import Episode, run_episodes
-from codrl_mj.films.strip import AXIS_WIDTH, HEADER_HEIGHT, MARGIN, PLOT_HEIGHT, draw_strip, draw_text
+from codrl_mj.films.strip import (
+    AXIS_WIDTH,
+    HEADER_HEIGHT,
+    MARGIN,
+    PLOT_HEIGHT,
+    draw_strip,
+    draw_text,
+)
 from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.runs.files import writing, writing_folder
 
@@ -88,12 +95,18 @@ class Panel:
 
 
 def record(
-    policy: Any, env: Any, seed: int, width: int, height: int, camera: str = "fixed", pretty: bool = False
+    policy: Any,
+    env: Any,
+    seed: int,
+    width: int,
+    height: int,
+    camera: str = "fixed",
+    pretty: bool = False,
 ) -> Panel:
     """Run an episode, in an `EnvConfig`, to be filmed in images of a size [px].
 
-    In environments of others the camera `fixed` is their own, and what is seen is kept; our tasks are drawn from their
-    states.
+    In environments of others the camera `fixed` is their own, and what is seen is kept; our tasks
+    are drawn from their states.
     """
     view, made = env.world.view(env, width, height, None if camera == "fixed" else camera), []
     if view is None:
@@ -147,9 +160,10 @@ def film(
     """Write a video of episodes side by side, at the task's frame rate (CartPole: the time of the simulation).
 
     Args:
-        panels: one or more episodes of the same task, side by side; a shorter one stands still at its end.
-        out: the file to make; its suffix chooses the format (`.mp4`: H.264; `.gif`). Without a suffix, a folder of PNG
-            frames.
+        panels: one or more episodes of the same task, side by side; a shorter one stands still at
+            its end.
+        out: the file to make; its suffix chooses the format (`.mp4`: H.264; `.gif`). Without a
+            suffix, a folder of PNG frames.
         width: width of one panel [px], even, >= 160.
         height: height of one panel's scene [px], even, >= 80.
         camera: a camera of the model.
@@ -169,8 +183,13 @@ def film(
         raise ValueError("panels: there must be at least one episode to show")
     end = max(float(panel.episode.time[-1]) for panel in panels)
     with contextlib.ExitStack() as stack:
-        scenes = [stack.enter_context(_scene(one, (width, height), camera, pretty)) for one in panels]
-        drawn = [_drawn(one, image, width, height, end) for one, (_, image) in zip(panels, scenes, strict=True)]
+        scenes = [
+            stack.enter_context(_scene(one, (width, height), camera, pretty)) for one in panels
+        ]
+        drawn = [
+            _drawn(one, image, width, height, end)
+            for one, (_, image) in zip(panels, scenes, strict=True)
+        ]
         rate, last = scenes[0][0], max(len(panel.episode.reward) for panel in panels)
         stride = max(1, round(rate / _MAX_FPS))
         instants = [*range(0, last, stride), last]
@@ -195,8 +214,8 @@ def check_film(out: Path, width: int, height: int) -> None:
     """
     if out.suffix not in _FORMATS:
         raise ValueError(
-            f"film {out}: unknown format {out.suffix!r}: the suffix must be one of {', '.join(_FORMATS[:-1])}, or none "
-            "for a folder of PNG frames"
+            f"film {out}: unknown format {out.suffix!r}: the suffix must be one of"
+            f" {', '.join(_FORMATS[:-1])}, or none for a folder of PNG frames"
         )
     if out.suffix == "" and out.exists():
         raise FileExistsError(f"folder {out} exists already: choose another --out, or delete it")
@@ -205,7 +224,9 @@ def check_film(out: Path, width: int, height: int) -> None:
             raise ValueError(f"{name} = {size}: must be even, as video encoders need it [px]")
     for name, size, least in (("width", width, _MIN_WIDTH), ("height", height, _MIN_HEIGHT)):
         if size < least:
-            raise ValueError(f"{name} = {size}: must be >= {least} [px], for the title and the strip")
+            raise ValueError(
+                f"{name} = {size}: must be >= {least} [px], for the title and the strip"
+            )
 
 
 class Clip(NamedTuple):
@@ -242,13 +263,21 @@ def clip(panel: Panel, width: int, height: int) -> Clip:
 
 
 @contextlib.contextmanager
-def _encoding(out: Path, fps: float, h264: Sequence[str] = _FINE) -> Iterator[Callable[[np.ndarray], None]]:
+def _encoding(
+    out: Path, fps: float, h264: Sequence[str] = _FINE
+) -> Iterator[Callable[[np.ndarray], None]]:
     """A function that appends a frame, encoded while the next one is drawn, to a film that appears when all is well."""
     import imageio
 
     options: dict[str, Any] = {"duration": 1000 / fps, "loop": 0}  # ms
     if out.suffix == ".mp4":
-        options = {"fps": fps, "codec": "libx264", "quality": None, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        options = {
+            "fps": fps,
+            "codec": "libx264",
+            "quality": None,
+            "macro_block_size": 2,
+            "ffmpeg_log_level": "error",
+        }
         options["output_params"] = [*h264]
     with contextlib.ExitStack() as stack:
         if out.suffix == "":
@@ -256,6 +285,7 @@ def _encoding(out: Path, fps: float, h264: Sequence[str] = _FINE) -> Iterator[Ca
 
             def write(frame: np.ndarray) -> None:
                 imageio.imwrite(folder / f"frame_{next(counter):05d}.png", frame)
+
         else:
             temporary = stack.enter_context(writing(out))
             write = stack.enter_context(imageio.get_writer(temporary, **options)).append_data
@@ -277,8 +307,8 @@ def _drawn(
 ) -> tuple[np.ndarray, Callable[[int, np.ndarray], None]]:
     """A panel without its scene, and what draws it after so many steps over a copy of that: (height, width, 3), uint8.
 
-    Title and strip are drawn once, a window slides over the strip. `image` draws the scene, and `end` [s] is where the
-    longest episode ends.
+    Title and strip are drawn once, a window slides over the strip. `image` draws the scene, and
+    `end` [s] is where the longest episode ends.
     """
     episode, top, bottom = panel.episode, _TITLE_HEIGHT, _TITLE_HEIGHT + height
     window = min(end, _WINDOW_STEPS * float(episode.time[0]))
@@ -301,7 +331,14 @@ def _drawn(
         shown = strip[:, begin : begin + size + MARGIN]
         below = frame[bottom + HEADER_HEIGHT :, AXIS_WIDTH : AXIS_WIDTH + shown.shape[1]]
         below[PLOT_HEIGHT:] = shown[PLOT_HEIGHT:]
-        below[:PLOT_HEIGHT, :cursor] = shown[:PLOT_HEIGHT, :cursor]  # and nothing of what has not happened yet
+        below[:PLOT_HEIGHT, :cursor] = shown[
+            :PLOT_HEIGHT, :cursor
+        ]  # and nothing of what has not happened yet
         below[:PLOT_HEIGHT, cursor] = 120
 
-    return np.vstack([draw_text(panel.title, width, top), np.zeros((height, width, 3), np.uint8), axis]), draw
+    return (
+        np.vstack(
+            [draw_text(panel.title, width, top), np.zeros((height, width, 3), np.uint8), axis]
+        ),
+        draw,
+    )

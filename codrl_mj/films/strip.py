@@ -10,18 +10,45 @@ from codrl_mj.evaluation.episodes import Episode
 from codrl_mj.tasks import TASKS
 
 _DPI = 100
-HEADER_HEIGHT, TORQUE_HEIGHT, GAP, VOLTAGE_HEIGHT, TIME_HEIGHT = 24, 120, 8, 60, 26  # px, from top to bottom
+HEADER_HEIGHT, TORQUE_HEIGHT, GAP, VOLTAGE_HEIGHT, TIME_HEIGHT = (
+    24,
+    120,
+    8,
+    60,
+    26,
+)  # px, from top to bottom
 PLOT_HEIGHT = TORQUE_HEIGHT + GAP + VOLTAGE_HEIGHT
-AXIS_WIDTH, MARGIN = 62, 16  # px, left and right of the plots; half a label of the last time has room
-DESIRED, ACTUAL, VOLTAGE, SATURATED = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # colour-blind safe (Okabe and Ito)
-_LIMITS = {"voltage_saturated": SATURATED, "current_saturated": "#E69F00", "temperature_saturated": "#56B4E9"}
+AXIS_WIDTH, MARGIN = (
+    62,
+    16,
+)  # px, left and right of the plots; half a label of the last time has room
+DESIRED, ACTUAL, VOLTAGE, SATURATED = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+)  # colour-blind safe (Okabe and Ito)
+_LIMITS = {
+    "voltage_saturated": SATURATED,
+    "current_saturated": "#E69F00",
+    "temperature_saturated": "#56B4E9",
+}
 """Signals of families with several limits, and their colours."""
 
 
 def draw_text(text: str, width: int, height: int, colour: str = "#22313F") -> np.ndarray:
     """One line of bold text, centred: an image, shape (height, width, 3), uint8."""
     figure = _figure(width, height)
-    figure.text(0.5, 0.5, text.replace("$", r"\$"), ha="center", va="center", fontsize=12, color=colour, weight="bold")
+    figure.text(
+        0.5,
+        0.5,
+        text.replace("$", r"\$"),
+        ha="center",
+        va="center",
+        fontsize=12,
+        color=colour,
+        weight="bold",
+    )
     return _pixels(figure)
 
 
@@ -30,8 +57,9 @@ def draw_strip(
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Draw the signals of a motor once, so that frames `width` px wide that show `window` seconds can be cut from them.
 
-    The whole strip ends at the time `end` [s]. Found are the scale of the time axis [px/s], the strip's frame (legend
-    and vertical axes), and its whole content below the legend, which is `MARGIN` px wider than the time that it shows.
+    The whole strip ends at the time `end` [s]. Found are the scale of the time axis [px/s], the
+    strip's frame (legend and vertical axes), and its whole content below the legend, which is
+    `MARGIN` px wider than the time that it shows.
     """
     body, scale = PLOT_HEIGHT + TIME_HEIGHT, (width - AXIS_WIDTH - MARGIN) / window
     frame = _figure(width, HEADER_HEIGHT + body)
@@ -42,7 +70,12 @@ def draw_strip(
         episode = dataclasses.replace(episode, signals=own, actuator=episode.actuator[motor])
     actuator, lines = episode.actuator, []
     for bottom, height, plot, label in (
-        (TIME_HEIGHT + VOLTAGE_HEIGHT + GAP, TORQUE_HEIGHT, _plot_torque, torque_label(task, actuator, motor)),
+        (
+            TIME_HEIGHT + VOLTAGE_HEIGHT + GAP,
+            TORQUE_HEIGHT,
+            _plot_torque,
+            torque_label(task, actuator, motor),
+        ),
         (TIME_HEIGHT, VOLTAGE_HEIGHT, _plot_signal, _signal(actuator)[1]),
     ):
         total = HEADER_HEIGHT + body
@@ -51,9 +84,17 @@ def draw_strip(
         lines += plot(episode, axes)
         _share_axis(axis, axes, label, end, window)
     content.axes[0].set_xticks([])
-    tight = {"columnspacing": 1.0, "handlelength": 1.4, "handletextpad": 0.4} if len(lines) > 4 else {}
+    tight = (
+        {"columnspacing": 1.0, "handlelength": 1.4, "handletextpad": 0.4} if len(lines) > 4 else {}
+    )
     frame.legend(
-        handles=lines, loc="upper right", ncols=len(lines), fontsize=8, frameon=False, borderaxespad=0.2, **tight
+        handles=lines,
+        loc="upper right",
+        ncols=len(lines),
+        fontsize=8,
+        frameon=False,
+        borderaxespad=0.2,
+        **tight,
     )
     return scale, _pixels(frame), _pixels(content)
 
@@ -84,8 +125,12 @@ def _share_axis(axis: Any, axes: Any, label: str, end: float, window: float) -> 
     axis.set_xticks([])
     axes.set(yticks=[], xlim=(0, end))
     axes.spines["left"].set_visible(False)
-    axes.xaxis.set_major_locator(MultipleLocator(float(np.diff(MaxNLocator(6).tick_values(0, window))[0])))
-    axes.xaxis.set_major_formatter(lambda time, _: f"{time:g} s" if time else "")  # the edge would cut a label at 0
+    axes.xaxis.set_major_locator(
+        MultipleLocator(float(np.diff(MaxNLocator(6).tick_values(0, window))[0]))
+    )
+    axes.xaxis.set_major_formatter(
+        lambda time, _: f"{time:g} s" if time else ""
+    )  # the edge would cut a label at 0
 
 
 def _plot_torque(episode: Episode, axes: Any) -> list[Any]:
@@ -97,14 +142,22 @@ def _plot_torque(episode: Episode, axes: Any) -> list[Any]:
     axes.axhline(0, color="0.85", linewidth=0.8)
     lines = [
         axes.stairs(values, edges, baseline=None, color=colour, linewidth=line, label=label)
-        for values, colour, label, line in ((desired, DESIRED, "desired", 1.0), (actual, ACTUAL, "actual", 2.0))
+        for values, colour, label, line in (
+            (desired, DESIRED, "desired", 1.0),
+            (actual, ACTUAL, "actual", 2.0),
+        )
         if label == "actual" or all(episode.tracks)
     ]
     limits = [name for name in _LIMITS if name in episode.actuator.Signals._fields] or ["saturated"]
     for name in limits:
         met = episode.signals[name] != 0.0
         if met.any():
-            options = {"baseline": -limit, "fill": True, "color": _LIMITS.get(name, SATURATED), "alpha": 0.3}
+            options = {
+                "baseline": -limit,
+                "fill": True,
+                "color": _LIMITS.get(name, SATURATED),
+                "alpha": 0.3,
+            }
             band, label = np.where(met, limit, -limit), name.replace("_saturated", " limit")
             lines.append(axes.stairs(band, edges, label=label, **options))
     return lines
@@ -135,7 +188,11 @@ def _plot_signal(episode: Episode, axes: Any) -> list[Any]:
     name, _ = _signal(actuator)
     if name is None:
         axes.set_ylim(-1, 1)
-        shown = "an ideal actuator has" if isinstance(actuator, Ideal) else f"{type(actuator).__name__} shows"
+        shown = (
+            "an ideal actuator has"
+            if isinstance(actuator, Ideal)
+            else f"{type(actuator).__name__} shows"
+        )
         axes.text(0.02, 0, f"{shown} no voltage", va="center", fontsize=8, color="0.5")
         return []
     values, limit = episode.signals[name], actuator.voltage_limit if name == "voltage" else None
@@ -146,4 +203,13 @@ def _plot_signal(episode: Episode, axes: Any) -> list[Any]:
         for side in (-limit, limit):
             axes.axhline(side, color=SATURATED, linewidth=1.0, linestyle="--")
     label = name.replace("_", " ")
-    return [axes.stairs(values, np.append(0.0, episode.time), baseline=None, color=VOLTAGE, linewidth=1.6, label=label)]
+    return [
+        axes.stairs(
+            values,
+            np.append(0.0, episode.time),
+            baseline=None,
+            color=VOLTAGE,
+            linewidth=1.6,
+            label=label,
+        )
+    ]

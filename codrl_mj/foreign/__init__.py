@@ -20,8 +20,11 @@ def check_dm_control() -> None:
     """
     version = importlib.metadata.version("dm-control")
     numbers = tuple(int(number) for number in re.findall(r"\d+", version)[:3])
-    if int(mujoco.__version__.partition(".")[0]) >= 4 and numbers <= NEWEST_DM_CONTROL_WITHOUT_MUJOCO_4:
+    if (
+        int(mujoco.__version__.partition(".")[0]) >= 4
+        and numbers <= NEWEST_DM_CONTROL_WITHOUT_MUJOCO_4
+    ):
         raise RuntimeError(
-            f"dm_control {version} does not work with MuJoCo {mujoco.__version__}: it needs MuJoCo 3. "
-            "pip install 'codrl-mj[dm-control]' installs one that fits"
+            f"dm_control {version} does not work with MuJoCo {mujoco.__version__}: it needs MuJoCo"
+            " 3. pip install 'codrl-mj[dm-control]' installs one that fits"
         )

@@ -36,7 +36,9 @@ class Building:
         with _LOCK:
             for name, spec in _SPECS.items() if not _BLOCKS else ():
                 _PLAIN.callback(setattr, mujoco.MjModel, name, vars(mujoco.MjModel)[name])
-                setattr(mujoco.MjModel, name, staticmethod(_loader(getattr(mujoco.MjModel, name), spec)))
+                setattr(
+                    mujoco.MjModel, name, staticmethod(_loader(getattr(mujoco.MjModel, name), spec))
+                )
             _BLOCKS.append(self)
         try:
             yield
@@ -58,7 +60,9 @@ class Building:
             ValueError: see `codrl_mj.motorise`.
         """
         names = names_of(plain)
-        self._met[repr(names)] = names  # once each, though some build their model anew at every reset
+        self._met[repr(names)] = (
+            names  # once each, though some build their model anew at every reset
+        )
         wanted = {
             pattern: actuator
             for pattern, actuator in self.actuators.items()
@@ -67,13 +71,18 @@ class Building:
         if not wanted:
             return plain
         for pattern, actuator in wanted.items() if self._action == "force" else ():
-            plainly = plain.actuator_biastype[matched_by(pattern, names)] == int(mujoco.mjtBias.mjBIAS_NONE)
+            plainly = plain.actuator_biastype[matched_by(pattern, names)] == int(
+                mujoco.mjtBias.mjBIAS_NONE
+            )
             if actuator.MOTION and actuator.commands() and plainly.any():
                 raise ValueError(
-                    f"action = 'force': {pattern!r}: the environment asks its actuators for forces, and a "
-                    f"{type(actuator).__name__} is asked for motions; must be {' or '.join(actuator.commands())}"
+                    f"action = 'force': {pattern!r}: the environment asks its actuators for forces,"
+                    f" and a {type(actuator).__name__} is asked for motions; must be"
+                    f" {' or '.join(actuator.commands())}"
                 )
-        with warnings.catch_warnings():  # MuJoCo's of the model, which building it without motors has shown
+        with (
+            warnings.catch_warnings()
+        ):  # MuJoCo's of the model, which building it without motors has shown
             ours = r"codrl_mj\.(engine\.specs|foreign\.building)"
             warnings.filterwarnings("ignore", category=UserWarning, module=ours)
             return motorise(spec(), wanted, *self._how).compile()
@@ -82,13 +91,19 @@ class Building:
         """Refuse patterns that matched nothing, and an environment, of Gymnasium's if it has an id, without a model."""
         if not self._met and env_id:
             task = next((task.name for task in TASKS.values() if task.gymnasium_id == env_id), None)
-            remedy = f"take {task!r}, our task of it that has" if task else "only environments that have can get motors"
-            raise ValueError(f"the environment has no MuJoCo model built from XML, and so no motors: {remedy}")
+            remedy = (
+                f"take {task!r}, our task of it that has"
+                if task
+                else "only environments that have can get motors"
+            )
+            raise ValueError(
+                f"the environment has no MuJoCo model built from XML, and so no motors: {remedy}"
+            )
         if not self._met:
             raise ValueError(
-                f"actuators = {list(self.actuators)}: no model was built inside by MjModel.from_xml_path or "
-                "from_xml_string in this thread; build the environment inside, or put motors into its MjSpec with "
-                "codrl_mj.motorise"
+                f"actuators = {list(self.actuators)}: no model was built inside by"
+                " MjModel.from_xml_path or from_xml_string in this thread; build the environment"
+                " inside, or put motors into its MjSpec with codrl_mj.motorise"
             )
         for pattern in self.actuators:
             matched_by(pattern, [own for names in self._met.values() for own in names])
@@ -100,22 +115,27 @@ def motorised(
 ) -> Iterator[None]:
     """Put motors into any environment that is built inside: Gymnasium's, dm_control's, anybody's.
 
-    Models that this thread builds by `mujoco.MjModel.from_xml_path` or `from_xml_string` in the block go through
-    `codrl_mj.motorise`. Of nested blocks the innermost counts. What builds its model again later, as composer
-    environments of dm_control do at every reset, has to do so inside too (`codrl_mj.make_dm_control` sees to that).
+    Models that this thread builds by `mujoco.MjModel.from_xml_path` or `from_xml_string` in the
+    block go through `codrl_mj.motorise`. Of nested blocks the innermost counts. What builds its
+    model again later, as composer environments of dm_control do at every reset, has to do so inside
+    too (`codrl_mj.make_dm_control` sees to that).
 
         >>> with codrl_mj.motorised({".*": "maxon-ec45-flat-50w"}):
         ...     env = gym.make("HalfCheetah-v5")
 
     Args:
-        actuators: as for `codrl_mj.motorise`; a pattern has to match something in one of the models at least.
+        actuators: as for `codrl_mj.motorise`; a pattern has to match something in one of the models
+            at least.
         allow_unstable: likewise.
         joint_dynamics: likewise.
 
     Raises:
-        ValueError: see `codrl_mj.motorise`; or, at the end, no model was built inside, or a pattern matched nothing.
+        ValueError: see `codrl_mj.motorise`; or, at the end, no model was built inside, or a pattern
+            matched nothing.
     """
-    building = Building(resolve_patterns(actuators, "another's environment"), allow_unstable, joint_dynamics)
+    building = Building(
+        resolve_patterns(actuators, "another's environment"), allow_unstable, joint_dynamics
+    )
     with building.motorising():
         yield
     building.check()
@@ -139,9 +159,15 @@ _BLOCKS: list[Building] = []
 """The blocks of `motorising` that any thread is in: while there are any, models are built by `_loader`s."""
 
 
-def _loader(plain: Callable[..., mujoco.MjModel], spec: Callable[..., mujoco.MjSpec]) -> Callable[..., mujoco.MjModel]:
+def _loader(
+    plain: Callable[..., mujoco.MjModel], spec: Callable[..., mujoco.MjSpec]
+) -> Callable[..., mujoco.MjModel]:
     def load(*arguments: Any, **options: Any) -> mujoco.MjModel:
         model, building = plain(*arguments, **options), _PRESENT.get()
-        return model if building is None else building.motorised(model, lambda: spec(*arguments, **options))
+        return (
+            model
+            if building is None
+            else building.motorised(model, lambda: spec(*arguments, **options))
+        )
 
     return load

@@ -23,24 +23,33 @@ from codrl_mj.foreign.building import Building
 class MotorisedEnvironment(dm_env.Environment):
     """An environment of dm_control's that builds all its models with motors; whatever else it has is had through this.
 
-    Its own order of stepping is kept: by default `mj_step2` before `mj_step1`, where `signals` are those of the forces
-    that moved it last.
+    Its own order of stepping is kept: by default `mj_step2` before `mj_step1`, where `signals` are
+    those of the forces that moved it last.
     """
 
     def __init__(
-        self, build: Callable[[], dm_env.Environment], settings: MotorSettings, noise_seed: int | None = None
+        self,
+        build: Callable[[], dm_env.Environment],
+        settings: MotorSettings,
+        noise_seed: int | None = None,
     ) -> None:
         """Build it."""
         self._settings = settings
-        self._building = Building(settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action)
+        self._building = Building(
+            settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action
+        )
         with self._building.motorising():
             self._environment = build()
         self._building.check()
-        kinds = type(self._environment).__mro__  # of `dm_control.composer`, which need not have been imported?
-        if settings.randomize is not None and any(one.__module__.startswith("dm_control.composer") for one in kinds):
+        kinds = type(
+            self._environment
+        ).__mro__  # of `dm_control.composer`, which need not have been imported?
+        if settings.randomize is not None and any(
+            one.__module__.startswith("dm_control.composer") for one in kinds
+        ):
             raise ValueError(
-                f"randomize: {type(self._environment).__name__} builds its model anew at every reset; let its own "
-                "variations change it"
+                f"randomize: {type(self._environment).__name__} builds its model anew at every"
+                " reset; let its own variations change it"
             )
         self._generator = np.random.default_rng(noise_seed)
         self._ended = True
@@ -62,7 +71,8 @@ class MotorisedEnvironment(dm_env.Environment):
 
         Raises:
             ValueError: the action has not the shape of the action specification.
-            SimulationDivergedError: the simulation left the finite numbers, where the environment does not end then.
+            SimulationDivergedError: the simulation left the finite numbers, where the environment
+                does not end then.
         """
         if self._ended:
             return self.reset()
@@ -82,7 +92,9 @@ class MotorisedEnvironment(dm_env.Environment):
         model, data = self.mujoco
         if self._bound is None or self._bound[0] is not model:
             spec = self._environment.action_spec()
-            low, high = (np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum))
+            low, high = (
+                np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum)
+            )
             actions = spaces.Box(low, high, dtype=np.float64)
             motors = Motors(data, self._settings, actions, self._environment.control_timestep())
             self._bound = model, motors
@@ -101,8 +113,8 @@ class MotorisedEnvironment(dm_env.Environment):
     def signals(self) -> dict[str, Any]:
         """The motors' signals after the last step, as in `info` of `codrl_mj.make`.
 
-        `desired_force` and `actual_force` [N or N*m], the signals of the families and `saturated`; of several motors
-        arrays (n_motors,) in the model's order.
+        `desired_force` and `actual_force` [N or N*m], the signals of the families and `saturated`;
+        of several motors arrays (n_motors,) in the model's order.
         """
         return self._motors.signals()
 
@@ -165,8 +177,8 @@ def make_dm_control(
         environment: `DOMAIN/TASK` of the suite, or a function that makes an environment.
         actuators: what goes where, as for `codrl_mj.motorise`.
         action: as for `codrl_mj.make`, and so are the next three.
-        randomize: see there; what was drawn is in `randomization`. Not for environments that build their model anew at
-            every reset.
+        randomize: see there; what was drawn is in `randomization`. Not for environments that build
+            their model anew at every reset.
         disturbances: see there; actions have to be the model's controls.
         allow_unstable: see there.
         joint_dynamics: see there.
@@ -174,21 +186,23 @@ def make_dm_control(
         **options: of `dm_control.suite.load`, or of the function.
 
     Raises:
-        ValueError: see `codrl_mj.motorise`; an unknown environment; its model is not built from XML; or an argument
-            does not go with the actuators or the environment.
+        ValueError: see `codrl_mj.motorise`; an unknown environment; its model is not built from
+            XML; or an argument does not go with the actuators or the environment.
         RuntimeError: dm_control does not work with the installed MuJoCo.
     """
     check_dm_control()
     resolved = resolve_patterns(actuators, "an environment of dm_control")
     disturbed = resolve(disturbances, OFF)
-    settings = MotorSettings(resolved, action, False, randomize, disturbed, allow_unstable, joint_dynamics)
+    settings = MotorSettings(
+        resolved, action, False, randomize, disturbed, allow_unstable, joint_dynamics
+    )
     if not isinstance(environment, str):
         return MotorisedEnvironment(lambda: environment(**options), settings, noise_seed)
     domain, _, task = environment.partition("/")
     if (domain, task) not in suite.ALL_TASKS:
         known = ["/".join(each) for each in suite.ALL_TASKS]
         raise ValueError(
-            f"environment = {environment!r}: {did_you_mean(environment, known)}must be DOMAIN/TASK of "
-            "dm_control.suite.ALL_TASKS, or a function"
+            f"environment = {environment!r}: {did_you_mean(environment, known)}must be DOMAIN/TASK"
+            " of dm_control.suite.ALL_TASKS, or a function"
         )
     return MotorisedEnvironment(lambda: suite.load(domain, task, **options), settings, noise_seed)

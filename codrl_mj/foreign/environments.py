@@ -49,38 +49,46 @@ def make(
     With `"ideal"` actuators it is bit for bit the environment that `gymnasium.make` makes.
 
     Args:
-        env_id: the id; or a function, or class, that makes an environment of one's own, which needs no id.
+        env_id: the id; or a function, or class, that makes an environment of one's own, which needs
+            no id.
         actuators: what goes where, as for `codrl_mj.motorise`.
-        action: `force`: the environment's own actions, whose forces are what is desired (a position servo stays one);
-            or what the actuators take besides, such as `current` and `voltage`, with their limits as the action space.
-            The environment still computes its costs from its own controls: from the torque that a current makes, or as
-            many amperes as volts.
-        observe_actuator: whether the observation ends with what the motors' sensors say, motor by motor.
-        randomize: path -> distribution (or its text): what is drawn at every reset: FIELD of all motors, PATTERN:FIELD
-            of those of a pattern, and of the model `model.mass.BODY`, `model.gravity` and `model.damping.JOINT`; or
-            pattern -> field -> distribution. What was drawn is in the reset's info, `randomization`. The generator is
-            not the environment's: its initial states are the same as without.
-        disturbances: delay, quantum and rate of the commands, and load pulses, once an environment step: see
-            `codrl_mj.Disturbances`. Of a plain motor in its force [N or N*m] before the gear, of others in what their
-            control stands for.
+        action: `force`: the environment's own actions, whose forces are what is desired (a position
+            servo stays one); or what the actuators take besides, such as `current` and `voltage`,
+            with their limits as the action space. The environment still computes its costs from its
+            own controls: from the torque that a current makes, or as many amperes as volts.
+        observe_actuator: whether the observation ends with what the motors' sensors say, motor by
+            motor.
+        randomize: path -> distribution (or its text): what is drawn at every reset: FIELD of all
+            motors, PATTERN:FIELD of those of a pattern, and of the model `model.mass.BODY`,
+            `model.gravity` and `model.damping.JOINT`; or pattern -> field -> distribution. What was
+            drawn is in the reset's info, `randomization`. The generator is not the environment's:
+            its initial states are the same as without.
+        disturbances: delay, quantum and rate of the commands, and load pulses, once an environment
+            step: see `codrl_mj.Disturbances`. Of a plain motor in its force [N or N*m] before the
+            gear, of others in what their control stands for.
         allow_unstable: as for `codrl_mj.motorise`.
         joint_dynamics: likewise.
-        **options: of `gymnasium.make` and the environment, such as `render_mode` and `max_episode_steps`.
+        **options: of `gymnasium.make` and the environment, such as `render_mode` and
+            `max_episode_steps`.
 
     Raises:
         gymnasium.error.UnregisteredEnv: there is no such environment.
-        ValueError: see `codrl_mj.motorise`; a model is not built from XML; or an argument does not go with the
-            actuators or the environment.
+        ValueError: see `codrl_mj.motorise`; a model is not built from XML; or an argument does not
+            go with the actuators or the environment.
     """
     if isinstance(env_id, str):
         entry = gymnasium.spec(env_id)
     elif not callable(env_id):
-        raise ValueError(f"env_id = {env_id!r}: must be an id, or a function or class that makes an environment")
+        raise ValueError(
+            f"env_id = {env_id!r}: must be an id, or a function or class that makes an environment"
+        )
     else:
         entry = EnvSpec(getattr(env_id, "__name__", "environment"), env_id)
         env_id = entry.id
     if str(entry.entry_point).startswith("codrl_mj.envs:"):
-        raise ValueError(f"{env_id}: its actuators are its own: gymnasium.make({env_id!r}, actuator=...)")
+        raise ValueError(
+            f"{env_id}: its actuators are its own: gymnasium.make({env_id!r}, actuator=...)"
+        )
     settings = MotorSettings(
         resolve_patterns(actuators, f"the environment {env_id}"),
         action,
@@ -91,7 +99,9 @@ def make(
         joint_dynamics,
     )
     spec, makes = copy.copy(entry), entry.entry_point
-    spec.entry_point = Motorised(load_env_creator(makes) if isinstance(makes, str) else makes, settings, env_id)
+    spec.entry_point = Motorised(
+        load_env_creator(makes) if isinstance(makes, str) else makes, settings, env_id
+    )
     return MotorisedEnv(gymnasium.make(spec, **options))
 
 
@@ -109,19 +119,26 @@ class Motorised:
     @property
     def metadata(self) -> dict[str, Any]:
         """The environment's, which `gymnasium.make` asks for."""
-        return self.creator.metadata  # an AttributeError where a plain function makes the environment
+        return (
+            self.creator.metadata
+        )  # an AttributeError where a plain function makes the environment
 
     def __call__(self, **options: Any) -> gymnasium.Env:
         """Make it."""
         settings = self.settings
-        building = Building(settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action)
+        building = Building(
+            settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action
+        )
         with building.motorising():
             env = self.creator(**options)
         building.check(self.env_id)
         base: Any = env.unwrapped
         kind: Any = type(base)
         if issubclass(kind, MujocoEnv):
-            base.__class__, base.remade = _with_motors(kind), functools.partial(self.base, **options)
+            base.__class__, base.remade = (
+                _with_motors(kind),
+                functools.partial(self.base, **options),
+            )
         return env
 
     def base(self, **options: Any) -> gymnasium.Env:
@@ -159,9 +176,9 @@ def _with_motors(kind: Any) -> Any:
 class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
     """What `make` adds to an environment that was built with motors.
 
-    Every step's `info` has `desired_force` and `actual_force` [N or N*m], at the motors' side of the model's gears, the
-    signals of the actuators' families and `saturated`, at the end of the step; of several motors arrays (n_motors,) in
-    the model's order.
+    Every step's `info` has `desired_force` and `actual_force` [N or N*m], at the motors' side of
+    the model's gears, the signals of the actuators' families and `saturated`, at the end of the
+    step; of several motors arrays (n_motors,) in the model's order.
     """
 
     def __init__(self, env: gymnasium.Env) -> None:
@@ -169,10 +186,12 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self)
         super().__init__(env)
         base, name = env.unwrapped, env.spec.id if env.spec else ""
-        if not isinstance(getattr(base, "model", None), mujoco.MjModel) or not hasattr(base, "data"):
+        if not isinstance(getattr(base, "model", None), mujoco.MjModel) or not hasattr(
+            base, "data"
+        ):
             raise ValueError(
-                f"{name}: has no MuJoCo model and data as attributes: build it inside codrl_mj.motorised, and read the "
-                "motors with codrl_mj.signals"
+                f"{name}: has no MuJoCo model and data as attributes: build it inside"
+                " codrl_mj.motorised, and read the motors with codrl_mj.signals"
             )
         assert base.spec is not None
         self._settings: MotorSettings = base.spec.entry_point.settings  # type: ignore[union-attr]
@@ -184,7 +203,9 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         """Find the motors of the environment's model."""
         base: Any = self.unwrapped
         self._watch: StepWatch | None = None
-        self._motors = Motors(base.data, self._settings, self.env.action_space, getattr(base, "dt", None))
+        self._motors = Motors(
+            base.data, self._settings, self.env.action_space, getattr(base, "dt", None)
+        )
         if self._motors.action_space is not self.env.action_space:
             self.action_space = self._motors.action_space
         if self._motors.sensors:
@@ -205,7 +226,9 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         """Reads the environment between its steps; from now on every integration step is looked at."""
         if self._watch is None:
             dt = getattr(self.unwrapped, "dt", None)
-            self._watch = StepWatch(self._motors, self._settings.action, dt if isinstance(dt, float) else None)
+            self._watch = StepWatch(
+                self._motors, self._settings.action, dt if isinstance(dt, float) else None
+            )
         return self._watch
 
     @property
@@ -213,7 +236,9 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         """Names of what `observe_actuator` appends to the observation."""
         return self._motors.sensors
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode, the motors at rest; a seed starts the generator of their draws too."""
         if seed is not None:
             own = np.random.SeedSequence(seed, spawn_key=(1,))  # independent of the environment's
@@ -235,7 +260,9 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         motors = self._motors
         time = motors.data.time
         controls = motors.controls(action)
-        outcome = self.env.step(controls) if self._watch is None else self._watch.step(self.env, controls)
+        outcome = (
+            self.env.step(controls) if self._watch is None else self._watch.step(self.env, controls)
+        )
         observation, reward, terminated, truncated, info = outcome
         motors.check_finite(self._id, time)
         return self._observed(observation), reward, terminated, truncated, info | motors.signals()
@@ -253,10 +280,10 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
     def snapshot(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on, as plain arrays: simulation, motors, generators, draws, time limit.
 
-        That is MuJoCo's state and what was computed from it, which observations and rewards read; not what an
-        environment keeps in attributes of its own, nor what wrappers count besides `TimeLimit`. Of environments that
-        are no `MujocoEnv` of Gymnasium's nobody knows where their state is: the snapshot has the generators, and
-        `restore` starts an episode.
+        That is MuJoCo's state and what was computed from it, which observations and rewards read;
+        not what an environment keeps in attributes of its own, nor what wrappers count besides
+        `TimeLimit`. Of environments that are no `MujocoEnv` of Gymnasium's nobody knows where their
+        state is: the snapshot has the generators, and `restore` starts an episode.
         """
         return {
             "environment": letters(self._id),
@@ -271,7 +298,8 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
 
         Returns:
-            None; or the first observation of the episode that was started, where the state is not in the snapshot.
+            None; or the first observation of the episode that was started, where the state is not
+            in the snapshot.
         """
         check_snapshot(snapshot, self.snapshot(), "environment")
         if not self._begun:  # which Gymnasium's wrappers insist on
@@ -297,7 +325,11 @@ class MotorisedEnv(gymnasium.Wrapper, RecordConstructorArgs):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but what belongs to the model, which a copied environment makes again."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("_motors", "_watch")}
+        return {
+            name: value
+            for name, value in self.__dict__.items()
+            if name not in ("_motors", "_watch")
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, in this or another process; as with all of Gymnasium's, the copy has to be reset."""

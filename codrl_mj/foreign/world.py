@@ -38,8 +38,8 @@ class GymnasiumWorld(World):
             return gymnasium.spec(self.name.rpartition(":")[2])
         except (gymnasium.error.Error, ModuleNotFoundError) as error:
             raise ValueError(
-                f"task = {self.name!r}: {error}; environments of packages that Gymnasium does not load by itself are "
-                "named module:ID"
+                f"task = {self.name!r}: {error}; environments of packages that Gymnasium does not"
+                " load by itself are named module:ID"
             ) from None
 
     @property
@@ -69,8 +69,8 @@ class GymnasiumWorld(World):
 
         if config.time_limit is None:
             raise ValueError(
-                f"max_episode_steps = None: {self.name} was registered without a time limit, and its episodes might "
-                "never end: give one, in environment steps"
+                f"max_episode_steps = None: {self.name} was registered without a time limit, and"
+                " its episodes might never end: give one, in environment steps"
             )
         arguments = {**config.as_arguments(), "disable_env_checker": True, **view}
         with self._explaining(config):
@@ -88,7 +88,11 @@ class GymnasiumWorld(World):
             yield
         except (TypeError, ValueError) as error:
             asked = isinstance(error, TypeError) and config.options
-            whose = f"options = {config.options!r}: {self.name} does not take them" if asked else self.name
+            whose = (
+                f"options = {config.options!r}: {self.name} does not take them"
+                if asked
+                else self.name
+            )
             raise ValueError(f"{whose}: {error}") from error
 
     def view(self, config: Any, width: int, height: int, camera: str | None) -> dict[str, Any]:

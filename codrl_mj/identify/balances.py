@@ -1,8 +1,9 @@
 """Voltage and torque balances of a log by linear regression, without differentiating anything; lags by them.
 
-Both balances are multiplied by functions phi that vanish with their slope at both ends of a window, and integrated:
-the derivatives go over to phi. Source: Shinbrot, *On the Analysis of Linear and Nonlinear Systems* (1957), the method
-of modulating functions. Good for signs, orders of magnitude and starts; noise in what is regressed on biases it.
+Both balances are multiplied by functions phi that vanish with their slope at both ends of a window,
+and integrated: the derivatives go over to phi. Source: Shinbrot, *On the Analysis of Linear and
+Nonlinear Systems* (1957), the method of modulating functions. Good for signs, orders of magnitude
+and starts; noise in what is regressed on biases it.
 """
 
 import math
@@ -21,7 +22,11 @@ _BUMP = np.polynomial.Polynomial([0.0, 1.0, -1.0]) ** 5
 _UNIT = _BUMP / _BUMP.integ()(1.0)
 _PHI = {-1: _UNIT.integ(), 0: _UNIT, 1: _UNIT.deriv(), 2: _UNIT.deriv(2)}
 """Order of the derivative by the phase -> polynomial; -1: its integral."""
-BODY = "inertia", "viscous", "coulomb"  # terms of a torque balance that no body and no friction has negative
+BODY = (
+    "inertia",
+    "viscous",
+    "coulomb",
+)  # terms of a torque balance that no body and no friction has negative
 
 
 class Balance(NamedTuple):
@@ -40,7 +45,9 @@ class Windows:
         """Cut it."""
         duration = min(duration, float(log.time[-1] - log.time[0]) / 10.0)
         count = max(math.ceil(duration / log.step), _ROWS)
-        every = np.concatenate([np.arange(one.start, one.stop - count, max(count // 4, 1)) for one in usable(log)])
+        every = np.concatenate(
+            [np.arange(one.start, one.stop - count, max(count // 4, 1)) for one in usable(log)]
+        )
         self.rows = every[:: math.ceil(len(every) / most) or 1, None] + np.arange(count + 1)
         self._log = log
         time = log.time[self.rows] if self.rows.size else np.zeros(self.rows.shape)
@@ -57,7 +64,10 @@ class Windows:
         if order not in self._weights:
             self._weights[order] = _PHI[order](self._phase) * (-1.0 / self.length) ** order
         weighted = values * self._weights[order]
-        return np.sum(0.5 * self._steps * (weighted[:, 1:] + weighted[:, :-1]), axis=1) / self.length[:, 0]
+        return (
+            np.sum(0.5 * self._steps * (weighted[:, 1:] + weighted[:, :-1]), axis=1)
+            / self.length[:, 0]
+        )
 
     def mean_held(self, signal: str, lag: float = 0.0) -> np.ndarray:
         """The weighted mean of a signal that is held from a row to the next, shape (windows,)."""
@@ -65,14 +75,19 @@ class Windows:
         reach = 0 if lag == 0.0 else math.ceil(abs(lag) / self._log.step) + 1
         rows = np.arange(-reach, self.rows.shape[1] - 1 + reach) + self.rows[:, :1]
         rows = np.clip(rows, 0, len(time) - 2)
-        edges = [np.clip((time[rows + k] + lag - self.begin) / self.length, 0.0, 1.0) for k in (0, 1)]
+        edges = [
+            np.clip((time[rows + k] + lag - self.begin) / self.length, 0.0, 1.0) for k in (0, 1)
+        ]
         return np.sum(values[rows] * (_PHI[-1](edges[1]) - _PHI[-1](edges[0])), axis=1)
 
 
-def regress(target: np.ndarray, terms: Mapping[str, np.ndarray], least: float = -np.inf) -> Balance | None:
+def regress(
+    target: np.ndarray, terms: Mapping[str, np.ndarray], least: float = -np.inf
+) -> Balance | None:
     """Least squares that outliers do not move; None where there are too few windows, or terms say the same.
 
-    Inertia and friction (`BODY`) get coefficients of at least `least`; terms that are 0 throughout are left out.
+    Inertia and friction (`BODY`) get coefficients of at least `least`; terms that are 0 throughout
+    are left out.
     """
     from scipy.optimize import lsq_linear
 
@@ -85,7 +100,9 @@ def regress(target: np.ndarray, terms: Mapping[str, np.ndarray], least: float = 
     bounds = [least if name in BODY else -np.inf for name in terms], np.inf
     weights = np.ones(len(target))
     for _ in range(8 if least == -np.inf else 1):  # Huber's weights, reweighted
-        solution, _, rank, _ = np.linalg.lstsq(matrix * weights[:, None], target * weights, rcond=1e-9)
+        solution, _, rank, _ = np.linalg.lstsq(
+            matrix * weights[:, None], target * weights, rcond=1e-9
+        )
         if least > -np.inf:
             solution = lsq_linear(matrix * weights[:, None], target * weights, bounds).x
         residual = target - matrix @ solution
@@ -94,7 +111,8 @@ def regress(target: np.ndarray, terms: Mapping[str, np.ndarray], least: float = 
     if rank < len(terms):
         return None
     error = math.sqrt(float(np.mean((weights * residual) ** 2)))
-    # phi is about half as wide as its window, and so overlaps by half with the next one: they count for half
+    # phi is about half as wide as its window, and so overlaps by half with the next one: they count
+    # for half
     variance = 2.0 * error**2 * np.sum(np.linalg.pinv(matrix * weights[:, None]) ** 2, axis=1)
     certain = solution / np.sqrt(np.maximum(variance, 1e-300))
     return Balance(
@@ -107,7 +125,11 @@ def regress(target: np.ndarray, terms: Mapping[str, np.ndarray], least: float = 
 
 def _speed(log: Log, windows: Windows, order: int = 0) -> np.ndarray:
     """The weighted mean of the speed, or of its derivative; by the position if there is one."""
-    return windows.mean("position", order + 1) if log.has("position") else windows.mean("velocity", order)
+    return (
+        windows.mean("position", order + 1)
+        if log.has("position")
+        else windows.mean("velocity", order)
+    )
 
 
 def _voltage_terms(log: Log, windows: Windows, sag: bool = False) -> dict[str, np.ndarray]:
@@ -123,20 +145,32 @@ def _voltage_terms(log: Log, windows: Windows, sag: bool = False) -> dict[str, n
 def voltage_balance(log: Log, duration: float = 0.0, sag: bool = False) -> Balance | None:
     """Fits `resistance`*i + `inductance`*di/dt + `back_emf_constant`*omega, of the output, to the voltage; all SI.
 
-    Without a motion the shaft counts as locked. `sag`: on (u/max u)^2*i too, which a `supply_resistance` takes.
+    Without a motion the shaft counts as locked. `sag`: on (u/max u)^2*i too, which a
+    `supply_resistance` takes.
     """
     windows = Windows(log, duration)
     return regress(windows.mean_held("voltage"), _voltage_terms(log, windows, sag))
 
 
-def _torque_terms(log: Log, windows: Windows, aside: bool = False, rig: str | None = None) -> dict[str, np.ndarray]:
+def _torque_terms(
+    log: Log, windows: Windows, aside: bool = False, rig: str | None = None
+) -> dict[str, np.ndarray]:
     from scipy.integrate import cumulative_trapezoid
 
     speed, one = _speed(log, windows), windows.mean(np.ones(len(log.time)))
-    terms = {"inertia": _speed(log, windows, 1), "viscous": speed, "coulomb": np.sign(speed) * one, "constant": one}
+    terms = {
+        "inertia": _speed(log, windows, 1),
+        "viscous": speed,
+        "coulomb": np.sign(speed) * one,
+        "constant": one,
+    }
     if rig in (None, "pendulum"):
         known = log.has("position")
-        angle = log.signals["position"] if known else cumulative_trapezoid(log.signals["velocity"], log.time, initial=0)
+        angle = (
+            log.signals["position"]
+            if known
+            else cumulative_trapezoid(log.signals["velocity"], log.time, initial=0)
+        )
         terms["gravity"] = windows.mean(np.sin(angle))
         if aside:
             terms["gravity_aside"] = windows.mean(np.cos(angle))
@@ -153,8 +187,9 @@ def torque_balance(
 ) -> Balance | None:
     """Fits `inertia`*alpha + `gravity`*sin(q) + `viscous`*omega + `coulomb`*sign(omega) + `constant` to the effort.
 
-    A velocity alone counts from where the pendulum hangs; a `rig` without gravity has no term of it. A `sign` is that
-    of the effort, with which inertia and friction must not be negative; 0: they may be. Windows have a `duration` [s].
+    A velocity alone counts from where the pendulum hangs; a `rig` without gravity has no term of
+    it. A `sign` is that of the effort, with which inertia and friction must not be negative; 0:
+    they may be. Windows have a `duration` [s].
     """
     windows = Windows(log, duration)
     terms = _torque_terms(log, windows, aside, rig)
@@ -198,7 +233,8 @@ def velocity_lag(log: Log) -> Shift | None:
 def effort_lag(log: Log, effort: str) -> Shift | None:
     """How late what follows is against the effort, by their balance.
 
-    That is the current, up to 20 rows, against a `voltage`; the motion, up to 60 ms, against a `torque`.
+    That is the current, up to 20 rows, against a `voltage`; the motion, up to 60 ms, against a
+    `torque`.
     """
     log = log.part(slice(0, _LONGEST))
     if effort == "voltage":
@@ -210,7 +246,8 @@ def effort_lag(log: Log, effort: str) -> Shift | None:
 
     def compare(lag: float) -> tuple[float, float, float]:
         balance = regress(windows.mean_held(effort, lag), terms)
-        # of a nearly sinusoidal current a delay looks like more inductance, and too long a one like less than none
+        # of a nearly sinusoidal current a delay looks like more inductance, and too long a one like
+        # less than none
         if balance is None or (lag > 0.0 and balance.certainty.get("inductance", 0.0) < -3.0):
             return np.inf, 1.0, 1.0
         return balance.residual, 1.0, balance.unexplained
@@ -218,7 +255,9 @@ def effort_lag(log: Log, effort: str) -> Shift | None:
     return _least(compare, log.step, ahead, behind) if np.isfinite(compare(0.0)[0]) else None
 
 
-def _least(compare: Callable[[float], tuple[float, float, float]], step: float, ahead: float, behind: float) -> Shift:
+def _least(
+    compare: Callable[[float], tuple[float, float, float]], step: float, ahead: float, behind: float
+) -> Shift:
     """The shift of the least residual, to a quarter of a step: by long steps, then by shorter ones beside the best.
 
     Of a lag `compare` says residual, gain and what is left unexplained.

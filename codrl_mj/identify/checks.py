@@ -6,7 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.balances import Balance, effort_lag, torque_balance, velocity_lag, voltage_balance
+from codrl_mj.identify.balances import (
+    Balance,
+    effort_lag,
+    torque_balance,
+    velocity_lag,
+    voltage_balance,
+)
 from codrl_mj.identify.log import (
     LONGEST_STEP,
     SIGNALS,
@@ -37,7 +43,10 @@ FACTORS = {
     "rpm for turn/s": 60.0,
 }
 """What a factor between two numbers that should be equal may tell, one for the other or the other way round."""
-_RESISTANCES = 5e-3, 1e4  # of motors on a bench [ohm]: at 5 V the least would draw 1 kA; micromotors have some hundreds
+_RESISTANCES = (
+    5e-3,
+    1e4,
+)  # of motors on a bench [ohm]: at 5 V the least would draw 1 kA; micromotors have some hundreds
 _CERTAIN = 10.0  # coefficient over its standard error
 _TURNED = 2.0 / 3.0  # of the residual, that a sign must leave at most to be the right one
 _DROWNED = 0.1  # noise over the motion, beyond which no error of speeds is claimed
@@ -76,7 +85,10 @@ def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
     holds |= {"hangs"} if rig in (None, "pendulum") else set()
     winding = voltage_balance(log) if log.has("voltage", "current") else None
     seen = Seen(log, motor, rig, effort, holds, winding)
-    findings = [*log.findings, *(one for needs, found in CHECKS if needs <= holds for one in found(seen))]
+    findings = [
+        *log.findings,
+        *(one for needs, found in CHECKS if needs <= holds for one in found(seen)),
+    ]
     order = ("error", "warning", "info")
     return sorted(findings, key=lambda one: order.index(one.severity))
 
@@ -89,7 +101,9 @@ def name_of_factor(ratio: float, angle: bool = True) -> str:
         for name, factor in FACTORS.items()
         if abs(size - math.log(factor)) < 0.08 and (angle or "units" in name)
     ]
-    return f"a factor of {math.exp(size):.4g}, " + " or ".join([*near, "a wrong scale, another motor, or a gear"])
+    return f"a factor of {math.exp(size):.4g}, " + " or ".join(
+        [*near, "a wrong scale, another motor, or a gear"]
+    )
 
 
 @_needs("")
@@ -106,25 +120,42 @@ def _times(seen: Seen) -> Iterator[Finding]:
     steps = np.diff(log.time)
     gaps = np.flatnonzero(steps > LONGEST_STEP * usual)
     for place in gaps[:_MOST_LISTED]:
-        text = f"a gap of {steps[place]:.4g} s after {log.time[place]:.4g} s, {steps[place] / usual:.0f} usual steps"
-        yield Finding("warning", "gap", int(rows[place + 1]), text, "nothing is simulated across it")
+        text = (
+            f"a gap of {steps[place]:.4g} s after {log.time[place]:.4g} s,"
+            f" {steps[place] / usual:.0f} usual steps"
+        )
+        yield Finding(
+            "warning", "gap", int(rows[place + 1]), text, "nothing is simulated across it"
+        )
     if gaps.size > _MOST_LISTED:
-        yield Finding("warning", "gap", None, f"{gaps.size - _MOST_LISTED} more gaps", "see the first ones")
+        yield Finding(
+            "warning", "gap", None, f"{gaps.size - _MOST_LISTED} more gaps", "see the first ones"
+        )
     dropped = np.flatnonzero((steps > _DROPPED * usual) & (steps <= LONGEST_STEP * usual))
     if dropped.size:
         missing = int(np.sum(np.round(steps[dropped] / usual) - 1.0))
         share = missing / (len(log.time) + missing)
-        text = f"{missing} rows missing ({share:.2g} of all) in {dropped.size} places, the first one here"
-        remedy = "keep the stamps: they are gone by; as if the rows were uniform, the fit would be wrong"
+        text = (
+            f"{missing} rows missing ({share:.2g} of all) in {dropped.size} places, the first one"
+            " here"
+        )
+        remedy = (
+            "keep the stamps: they are gone by; as if the rows were uniform, the fit would be wrong"
+        )
         severity = "warning" if share > 0.01 else "info"
         yield Finding(severity, "dropped rows", int(rows[dropped[0] + 1]), text, remedy)
     regular = steps[steps <= _DROPPED * usual]
     jitter = float(np.std(regular)) / usual
     if jitter > 0.02:
         worst = int(np.argmax(np.where(steps <= _DROPPED * usual, np.abs(steps - usual), 0.0)))
-        text = f"steps of {regular.min():.3g} to {regular.max():.3g} s about {usual:.3g} s, {jitter:.0%} of it"
+        text = (
+            f"steps of {regular.min():.3g} to {regular.max():.3g} s about {usual:.3g} s,"
+            f" {jitter:.0%} of it"
+        )
         remedy = "take each stamp when the values are read"
-        yield Finding("warning" if jitter > 0.3 else "info", "jitter", int(rows[worst + 1]), text, remedy)
+        yield Finding(
+            "warning" if jitter > 0.3 else "info", "jitter", int(rows[worst + 1]), text, remedy
+        )
     if not 2e-6 <= usual <= 0.5:
         text = f"a row every {usual:.3g} s is unusual: is the time in another unit?"
         yield Finding("error", "unit", None, text, "write time=column:ms, or us, or ns")
@@ -153,9 +184,14 @@ def _sizes(seen: Seen) -> Iterator[Finding]:
         largest = float(np.quantile(np.abs(seen.log.signals[signal]), 0.99))  # not an outlier
         unit = SIGNALS[signal] or "of 1"
         if largest > _MOST[signal]:
-            text = f"the {signal} is up to {largest:.4g} {unit}, must be at most {_MOST[signal]:g} {unit} on a bench"
+            text = (
+                f"the {signal} is up to {largest:.4g} {unit}, must be at most {_MOST[signal]:g}"
+                f" {unit} on a bench"
+            )
             other = "percent" if signal == "duty" else f"m{unit}"
-            yield Finding("error", "unit", None, text, f"correct its unit, such as {signal}=column:{other}")
+            yield Finding(
+                "error", "unit", None, text, f"correct its unit, such as {signal}=column:{other}"
+            )
     if not seen.log.has("voltage"):
         return
     log, voltage = seen.log, np.abs(seen.log.signals["voltage"])
@@ -164,8 +200,17 @@ def _sizes(seen: Seen) -> Iterator[Finding]:
         rows, position = max(len(log.time) // 20, 1), log.signals["position"]
         others.append(position[rows:] - position[:-rows])
     if is_supply(log.signals["voltage"], others):
-        text = f"the voltage stays near {np.median(voltage):.3g} V while the motor goes both ways: it is the supply's"
-        yield Finding("error", "voltage", None, text, "write bus=column:V, and log the motor's own voltage or its duty")
+        text = (
+            f"the voltage stays near {np.median(voltage):.3g} V while the motor goes both ways: it"
+            " is the supply's"
+        )
+        yield Finding(
+            "error",
+            "voltage",
+            None,
+            text,
+            "write bus=column:V, and log the motor's own voltage or its duty",
+        )
     if log.has("bus"):
         excess = voltage / np.maximum(np.abs(log.signals["bus"]), 1e-9)
         row = int(np.argmax(excess))
@@ -176,7 +221,9 @@ def _sizes(seen: Seen) -> Iterator[Finding]:
     elif seen.motor is None and (0.0 < voltage.max() <= 1.0 or voltage.max() > 100.0):
         of = "a duty" if voltage.max() <= 1.0 else "of a duty in percent, or in mV"
         text = f"the voltage is at most {voltage.max():.3g} V: is it {of}?"
-        remedy = "if so, write voltage=duty*24:V, with a duty from -1 to 1 and the volts of the supply"
+        remedy = (
+            "if so, write voltage=duty*24:V, with a duty from -1 to 1 and the volts of the supply"
+        )
         yield Finding("warning", "unit", None, text, remedy)
 
 
@@ -189,7 +236,10 @@ def _degrees(seen: Seen) -> Iterator[Finding]:
         now, then = (torque_balance(one, effort, aside=True) for one in (log, turned))
         pulls = then is not None and then.certainty.get("gravity", 0.0) > _CERTAIN
         if now and then and pulls and then.residual < 0.5 * now.residual and now.unexplained > 0.1:
-            text = f"gravity pulls as if the position were in degrees: so {then.unexplained:.0%} of the {effort} are "
+            text = (
+                f"gravity pulls as if the position were in degrees: so {then.unexplained:.0%} of"
+                f" the {effort} are "
+            )
             text += f"not explained, of radians {now.unexplained:.0%}"
             yield Finding("error", "unit", None, text, remedy)
             return
@@ -197,7 +247,10 @@ def _degrees(seen: Seen) -> Iterator[Finding]:
     if step > 0.0 and 8.0 < (turns := 360.0 / step) < 1e5:
         count, of_radians = round(turns), 2.0 * math.pi / step
         if abs(turns - count) < 1e-6 * turns and abs(of_radians - round(of_radians)) > 1e-3:
-            text = f"the position's steps of {step:.4g} are 1/{count} of 360, not of 2 pi: is it in degrees?"
+            text = (
+                f"the position's steps of {step:.4g} are 1/{count} of 360, not of 2 pi: is it in"
+                " degrees?"
+            )
             decimal = round(step / 10.0 ** math.floor(math.log10(step)), 5) in (1.0, 2.0, 2.5, 5.0)
             encoder = not decimal and (count % 100 == 0 or count & (count - 1) == 0)
             yield Finding("error" if encoder else "warning", "unit", None, text, remedy)
@@ -211,22 +264,36 @@ def _velocity(seen: Seen) -> Iterator[Finding]:
         return
     clear = found.noise < _DROWNED
     if found.unexplained > 0.5:
-        text = f"velocity and differentiated position have nothing in common ({found.unexplained:.0%} is left over)"
+        text = (
+            f"velocity and differentiated position have nothing in common ({found.unexplained:.0%}"
+            " is left over)"
+        )
         if clear:
-            yield Finding("error", "velocity", None, text, "check both columns; leave the velocity out")
+            yield Finding(
+                "error", "velocity", None, text, "check both columns; leave the velocity out"
+            )
         return
     if clear and found.gain < 0.0:
         text = "the velocity falls where the position grows"
-        yield Finding("error", "sign", None, text, "give one of them a minus: velocity=-column:unit")
-    # noise of the one takes from its factor, of the other it adds to it: the true one is between both regressions
+        yield Finding(
+            "error", "sign", None, text, "give one of them a minus: velocity=-column:unit"
+        )
+    # noise of the one takes from its factor, of the other it adds to it: the true one is between
+    # both regressions
     ends = [math.log(abs(found.gain)), math.log(abs(found.gain) / (1.0 - found.unexplained**2))]
     if clear and (min(ends) > 0.1 or max(ends) < -0.1):
-        text = f"the velocity is {abs(found.gain):.4g} times what the position says: {name_of_factor(found.gain)}"
+        text = (
+            f"the velocity is {abs(found.gain):.4g} times what the position says:"
+            f" {name_of_factor(found.gain)}"
+        )
         yield Finding("error", "unit", None, text, "correct the unit of velocity, position or time")
     rows = abs(found.lag) / seen.log.step
     if (rows > 0.75 and found.improvement < 0.7) or (rows > 2.0 and found.improvement < 0.85):
         late = "after" if found.lag > 0.0 else "before"
-        text = f"the velocity comes {1e3 * abs(found.lag):.3g} ms {late} the differentiated position ({rows:.2g} rows)"
+        text = (
+            f"the velocity comes {1e3 * abs(found.lag):.3g} ms {late} the differentiated position"
+            f" ({rows:.2g} rows)"
+        )
         remedy = "leave the velocity out, so that the position alone is fitted, or fit its delay"
         yield Finding("warning", "lag", None, text, remedy)
 
@@ -237,27 +304,62 @@ def _electrical(seen: Seen) -> Iterator[Finding]:
     balance = seen.winding
     if balance is None:
         text = "voltage or current do not change, or there are too few rows in a row"
-        yield Finding("error", "excitation", None, text, "log while the voltage changes; see codrl-mj identify plan")
+        yield Finding(
+            "error",
+            "excitation",
+            None,
+            text,
+            "log while the voltage changes; see codrl-mj identify plan",
+        )
         return
     values, certain = balance.values, balance.certainty
     if certain["resistance"] < -_CERTAIN:
-        text = f"the resistance would be {values['resistance']:.3g} ohm: the current flows against the voltage"
+        text = (
+            f"the resistance would be {values['resistance']:.3g} ohm: the current flows against the"
+            " voltage"
+        )
         yield Finding("error", "sign", None, text, "give one of them a minus: current=-column:A")
-    elif certain["resistance"] > _CERTAIN and not _RESISTANCES[0] <= values["resistance"] <= _RESISTANCES[1]:
-        text = f"the resistance would be {values['resistance']:.3g} ohm, outside {_RESISTANCES[0]:g} to 1e4 ohm"
+    elif (
+        certain["resistance"] > _CERTAIN
+        and not _RESISTANCES[0] <= values["resistance"] <= _RESISTANCES[1]
+    ):
+        text = (
+            f"the resistance would be {values['resistance']:.3g} ohm, outside {_RESISTANCES[0]:g}"
+            " to 1e4 ohm"
+        )
         remedy = "correct the unit of voltage or current: current=column:mA if it is in mA"
         yield Finding("error", "unit", None, text, remedy)
     elif certain.get("back_emf_constant", 0.0) < -_CERTAIN:
-        text = f"the back-EMF constant would be {values['back_emf_constant']:.3g} V*s/rad: the motor turns against it"
+        text = (
+            f"the back-EMF constant would be {values['back_emf_constant']:.3g} V*s/rad: the motor"
+            " turns against it"
+        )
         remedy = "give position and velocity a minus, or voltage and current"
         yield Finding("error", "sign", None, text, remedy)
-    for name, what in (("inductance", "quickly: a PRBS"), ("back_emf_constant", "speed: a slow sine")):
+    for name, what in (
+        ("inductance", "quickly: a PRBS"),
+        ("back_emf_constant", "speed: a slow sine"),
+    ):
         if name in values and abs(certain[name]) < _CERTAIN:
-            text = f"the {name.replace('_', ' ')} hardly shows: it is {abs(certain[name]):.2g} standard errors"
-            yield Finding("info", "excitation", None, text, f"add a log that changes {what}, or give it by --known")
+            text = (
+                f"the {name.replace('_', ' ')} hardly shows: it is {abs(certain[name]):.2g}"
+                " standard errors"
+            )
+            yield Finding(
+                "info",
+                "excitation",
+                None,
+                text,
+                f"add a log that changes {what}, or give it by --known",
+            )
     if balance.unexplained > 0.3:
-        text = f"R*i + L*di/dt + kE*speed leaves {balance.unexplained:.0%} of the voltage unexplained"
-        remedy = "check that the voltage is that of the terminals, and that rows are as frequent as it changes"
+        text = (
+            f"R*i + L*di/dt + kE*speed leaves {balance.unexplained:.0%} of the voltage unexplained"
+        )
+        remedy = (
+            "check that the voltage is that of the terminals, and that rows are as frequent as it"
+            " changes"
+        )
         yield Finding("warning", "voltage", None, text, remedy)
 
 
@@ -270,11 +372,25 @@ def _delay(seen: Seen) -> Iterator[Finding]:
     rows = found.lag / log.step
     if abs(rows) >= 0.7 and found.improvement < 0.55:
         late = "after" if rows > 0.0 else "before"
-        text = f"the current comes {abs(rows):.2g} rows ({1e3 * abs(found.lag):.3g} ms) {late} the voltage"
-        yield Finding("warning", "lag", None, text, "fit with a scan over delays, or shift a column of the log")
+        text = (
+            f"the current comes {abs(rows):.2g} rows ({1e3 * abs(found.lag):.3g} ms) {late} the"
+            " voltage"
+        )
+        yield Finding(
+            "warning",
+            "lag",
+            None,
+            text,
+            "fit with a scan over delays, or shift a column of the log",
+        )
     elif -0.8 < rows < -0.2 and found.improvement < 0.8:
-        declared = "declared as the mean to the next row" if log.mean_voltage else "held to the next row"
-        text = f"the voltage fits better about half a row earlier than {declared}: it seems to be read at the row"
+        declared = (
+            "declared as the mean to the next row" if log.mean_voltage else "held to the next row"
+        )
+        text = (
+            f"the voltage fits better about half a row earlier than {declared}: it seems to be read"
+            " at the row"
+        )
         remedy = "log the mean of the voltage, or rows as frequent as it changes"
         if log.mean_voltage:
             remedy = "write voltage=column:V without mean(); or log the mean"
@@ -285,7 +401,11 @@ def _delay(seen: Seen) -> Iterator[Finding]:
 def _sag(seen: Seen) -> Iterator[Finding]:
     """A supply that gives way, where the share of its voltage changes; at one share it looks as the winding does."""
     balance, share = seen.winding, np.abs(seen.log.signals["voltage"])
-    sagging = voltage_balance(seen.log, sag=True) if float(np.std(share)) > 0.1 * float(share.max()) else None
+    sagging = (
+        voltage_balance(seen.log, sag=True)
+        if float(np.std(share)) > 0.1 * float(share.max())
+        else None
+    )
     if balance is None or sagging is None or sagging.residual > 0.96 * balance.residual:
         return
     supply, winding = sagging.values["supply_resistance"], sagging.values["resistance"]
@@ -300,7 +420,11 @@ def _mechanical(seen: Seen) -> Iterator[Finding]:
     """Signs of inertia and gravity; whether the motion follows from the torque."""
     log, effort, rig = seen.log, seen.effort, seen.rig
     # where it shakes, shorter windows show more of the inertia
-    balances = [one for seconds in (0.3, 0.03) if (one := torque_balance(log, effort, seconds, rig=rig)) is not None]
+    balances = [
+        one
+        for seconds in (0.3, 0.03)
+        if (one := torque_balance(log, effort, seconds, rig=rig)) is not None
+    ]
     if not balances:
         return
     balance, certain = balances[0], balances[0].certainty
@@ -309,30 +433,45 @@ def _mechanical(seen: Seen) -> Iterator[Finding]:
     wrong = heavy < -_CERTAIN or (certain.get("gravity", 0.0) < -_CERTAIN and heavy < -3.0)
     if wrong and (told := _told_sign(log, effort, rig)):
         remedy = f"give the {effort}, or position and velocity, a minus"
-        yield Finding("error", "sign", None, f"the {effort} accelerates the wrong way: {told}", remedy)
+        yield Finding(
+            "error", "sign", None, f"the {effort} accelerates the wrong way: {told}", remedy
+        )
     elif {"position", "hangs"} <= seen.holds:
         yield from _zero(torque_balance(log, effort, aside=True), effort)
-    large = 0.08 * float(np.std(log.signals[effort]))  # else it is what fast changes leave of rounding
+    large = 0.08 * float(
+        np.std(log.signals[effort])
+    )  # else it is what fast changes leave of rounding
     if effort == "torque" and balance.unexplained > 0.25 and balance.residual > large:
-        text = f"the motion leaves {balance.unexplained:.0%} of the torque unexplained (mean over 0.3 s)"
+        text = (
+            f"the motion leaves {balance.unexplained:.0%} of the torque unexplained (mean over"
+            " 0.3 s)"
+        )
         lag = effort_lag(log, effort)
         if lag is not None and abs(lag.lag) > log.step and lag.improvement < 0.9:
             text += f"; {lag.unexplained:.0%} if the motion came {1e3 * lag.lag:.3g} ms later"
-        remedy = "something else moves it, or the columns are not of one time: trust this log less than others"
+        remedy = (
+            "something else moves it, or the columns are not of one time: trust this log less than"
+            " others"
+        )
         yield Finding("warning", "torque", None, text, remedy)
 
 
 def _told_sign(log: Log, effort: str, rig: str | None) -> str:
     """How much better a body with friction explains the effort with a minus; empty where it does not.
 
-    The other check, by standard errors, is fooled where friction that holds, or a controller, makes what it sees.
+    The other check, by standard errors, is fooled where friction that holds, or a controller, makes
+    what it sees.
     """
     for seconds in (0.3, 0.03):
-        now, turned = (torque_balance(log, effort, seconds, rig=rig, sign=sign) for sign in (1.0, -1.0))
+        now, turned = (
+            torque_balance(log, effort, seconds, rig=rig, sign=sign) for sign in (1.0, -1.0)
+        )
         if now is None or turned is None or now.unexplained < 0.03:
             continue  # as it is nothing is amiss
         if turned.residual < _TURNED * now.residual:
-            shares = f"{now.unexplained:.1%} of it unexplained, with a minus {turned.unexplained:.2%}"
+            shares = (
+                f"{now.unexplained:.1%} of it unexplained, with a minus {turned.unexplained:.2%}"
+            )
             return f"inertia and friction leave {shares}"
     return ""
 
@@ -350,7 +489,9 @@ def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
         where = ", as if 0 were at the top" if abs(zero) > 2.5 else ""
         most = f"with up to {pull:.3g} {SIGNALS[effort]} of the {effort}"
         text = f"gravity pulls towards position {zero:.3g} rad and not 0{where}, {most}"
-        remedy = f"write position=column{-zero:+.4g}:rad, so that it hangs at 0; or its sign is wrong"
+        remedy = (
+            f"write position=column{-zero:+.4g}:rad, so that it hangs at 0; or its sign is wrong"
+        )
         yield Finding("warning", "zero", None, text, remedy)
 
 
@@ -360,8 +501,12 @@ def _motion(seen: Seen) -> Iterator[Finding]:
     signals, remedy = seen.log.signals, "leave position and velocity out if it is"
     speed = signals["velocity"] if "velocity" in signals else np.diff(signals["position"])
     if "stands" in seen.holds:
-        yield Finding("info", "excitation", None, "the shaft stands still, as if it were locked", remedy)
-    elif seen.effort and min(float(speed.max()), float(-speed.min())) < 0.05 * float(np.abs(speed).max()):
+        yield Finding(
+            "info", "excitation", None, "the shaft stands still, as if it were locked", remedy
+        )
+    elif seen.effort and min(float(speed.max()), float(-speed.min())) < 0.05 * float(
+        np.abs(speed).max()
+    ):
         text = "the shaft turns one way only: friction cannot be told from a constant load"
         yield Finding("info", "excitation", None, text, "add a log that reverses")
 
@@ -381,10 +526,13 @@ def _two_constants(seen: Seen) -> Iterator[Finding]:
         yield Finding("error", "sign", None, text, "give one of them a minus: torque=-column:N*m")
     elif abs(math.log(constant / back_emf)) > math.log(2.0):
         text = (
-            f"torque/current is {constant:.3g} N*m/A and the back-EMF constant {back_emf:.3g} V*s/rad, must be about "
+            f"torque/current is {constant:.3g} N*m/A and the back-EMF constant {back_emf:.3g}"
+            " V*s/rad, must be about "
         )
         text += f"equal: {name_of_factor(constant / back_emf)}"
-        yield Finding("error", "unit", None, text, "correct the unit of torque, current, voltage or motion")
+        yield Finding(
+            "error", "unit", None, text, "correct the unit of torque, current, voltage or motion"
+        )
 
 
 @_needs("voltage current datasheet")
@@ -398,7 +546,10 @@ def _datasheet(seen: Seen) -> Iterator[Finding]:
         found = balance.values[name]
         if abs(math.log(found / value)) > math.log(2.0):
             unit = PARAMETERS[name].unit
-            text = f"the {name.replace('_', ' ')} would be {found:.3g} {unit}, the datasheet says {value:.3g} {unit}: "
+            text = (
+                f"the {name.replace('_', ' ')} would be {found:.3g} {unit}, the datasheet says"
+                f" {value:.3g} {unit}: "
+            )
             remedy = "correct the units of voltage, current and motion, or name the right motor"
             text += name_of_factor(found / value, name != "resistance")
             yield Finding("error", "unit", None, text, remedy)

@@ -13,7 +13,11 @@ import numpy as np
 from codrl_mj.fields import check_names
 from codrl_mj.identify.log import SIGNALS
 
-KINDS: dict[str, str | None] = {"time": "s", **SIGNALS, "only": ""}  # what columns may be -> its SI unit; None: any
+KINDS: dict[str, str | None] = {
+    "time": "s",
+    **SIGNALS,
+    "only": "",
+}  # what columns may be -> its SI unit; None: any
 OPEN_UNIT = "UNIT"
 """Stands for the unit that a person has to fill in, in a proposal."""
 EXAMPLES = {
@@ -69,9 +73,14 @@ class Column:
     """A signal as a formula of a file's columns."""
 
     signal: str  # `time`, one of `SIGNALS`, or `only`: rows where it is 0 are left out
-    formula: str  # columns (one with spaces in quotes, column[0] of a list), numbers, `pi`, + - * / and `FUNCTIONS`
-    unit: str | None  # of the formula's value; None: SI, which only a formula of more than a name may leave out
-    mean: bool = False  # of a voltage: whether it is the mean from its row to the next, not what holds from its row on
+    # columns (one with spaces in quotes, column[0] of a list), numbers, `pi`, + - * / and
+    # `FUNCTIONS`
+    formula: str
+    unit: (
+        str | None
+    )  # of the formula's value; None: SI, which only a formula of more than a name may leave out
+    # of a voltage: whether it is the mean from its row to the next, not what holds from its row on
+    mean: bool = False
 
     def __post_init__(self) -> None:
         """Validate, without a file."""
@@ -103,8 +112,13 @@ class Column:
     def value(self, table: Mapping[str, Any]) -> Any:
         """The signal in SI, by a table of columns and constants."""
         for name in sorted(self.names - table.keys()):
-            if width := sum(bool(re.fullmatch(re.escape(name) + r"\[\d+\]", known)) for known in table):
-                raise self._wrong(f"{name} holds lists of {width} numbers; write the one you want, such as {name}[0]")
+            if width := sum(
+                bool(re.fullmatch(re.escape(name) + r"\[\d+\]", known)) for known in table
+            ):
+                raise self._wrong(
+                    f"{name} holds lists of {width} numbers; write the one you want, such as"
+                    f" {name}[0]"
+                )
         check_names(self.names, table, "column")
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._quantity(self._formula[0]({"pi": math.pi, **table}))
@@ -116,8 +130,8 @@ class Column:
             body = ast.parse(self.formula.strip(), mode="eval").body
         except SyntaxError as error:
             raise ValueError(
-                f"columns: {self.signal}={self.formula}: no formula ({error.msg}); write a column's name, in quotes if "
-                f"it has spaces, as in {_EXAMPLE}"
+                f"columns: {self.signal}={self.formula}: no formula ({error.msg}); write a column's"
+                f" name, in quotes if it has spaces, as in {_EXAMPLE}"
             ) from None
         value, names = self._made(body)
         return value, names - {"pi"}, isinstance(body, ast.Name | ast.Constant | ast.Subscript)
@@ -131,7 +145,10 @@ class Column:
                 value=ast.Name() | ast.Attribute() | ast.Constant(value=str()) as column,
                 slice=ast.Name() | ast.Attribute() | ast.Constant(value=int() | str()) as entry,
             ):
-                parts = (str(x.value) if isinstance(x, ast.Constant) else ast.unparse(x) for x in (column, entry))
+                parts = (
+                    str(x.value) if isinstance(x, ast.Constant) else ast.unparse(x)
+                    for x in (column, entry)
+                )
                 listed = "{}[{}]".format(*parts)
                 return lambda table: table[listed], {listed}
             case ast.Constant(value=number):
@@ -140,7 +157,11 @@ class Column:
                 value, names = self._made(inner)
                 return (lambda table: -value(table)) if isinstance(sign, ast.USub) else value, names
             case ast.BinOp(left=left, op=operator, right=right) if type(operator) in _OPERATORS:
-                (one, names), (other, more), apply = self._made(left), self._made(right), _OPERATORS[type(operator)]
+                (one, names), (other, more), apply = (
+                    self._made(left),
+                    self._made(right),
+                    _OPERATORS[type(operator)],
+                )
                 return lambda table: apply(one(table), other(table)), names | more
             case ast.Call(func=ast.Name(id=called), args=arguments, keywords=[]):
                 check_names([called], FUNCTIONS, "function")
@@ -149,10 +170,14 @@ class Column:
                     raise self._wrong(f"{called} takes {needed} arguments, not {len(arguments)}")
                 values, read = zip(*map(self._made, arguments), strict=True)
                 if needed == 2 and called != "atan2" and read[1] - {"pi"}:
-                    raise self._wrong(f"the second argument of {called} must be a number, such as 16")
+                    raise self._wrong(
+                        f"the second argument of {called} must be a number, such as 16"
+                    )
                 return lambda table: function(*(one(table) for one in values)), set().union(*read)
         known = ", ".join(FUNCTIONS)
-        raise self._wrong(f"{type(node).__name__} is not allowed; write names, numbers, + - * / and {known}")
+        raise self._wrong(
+            f"{type(node).__name__} is not allowed; write names, numbers, + - * / and {known}"
+        )
 
     def _quantity(self, value: Any) -> Any:
         """A value in SI."""
@@ -176,7 +201,9 @@ def parse_columns(given: str | Mapping[str, str]) -> dict[str, Column]:
     found: dict[str, Column] = {}
     for pair in pairs:
         if len(pair) != 2:
-            raise ValueError(f"columns: {'='.join(pair)!r}: must be signal=formula:unit, as in {_EXAMPLE}")
+            raise ValueError(
+                f"columns: {'='.join(pair)!r}: must be signal=formula:unit, as in {_EXAMPLE}"
+            )
         name, (formula, *unit) = pair[0].strip(), _split(pair[1], ":")
         if len(unit) > 1:
             raise ValueError(f"columns: {pair[1]!r}: has two colons; write formula:unit")
@@ -184,11 +211,16 @@ def parse_columns(given: str | Mapping[str, str]) -> dict[str, Column]:
             raise ValueError(f"columns: {name} is given twice, must be given once; leave one out")
         formula = formula.strip()
         mean = re.fullmatch(r"mean\((.*)\)", formula) if name == "voltage" else None
-        found[name] = Column(name, mean[1] if mean else formula, unit[0].strip() if unit else None, mean is not None)
+        found[name] = Column(
+            name, mean[1] if mean else formula, unit[0].strip() if unit else None, mean is not None
+        )
     if "time" not in found:
         raise ValueError(f"columns: there is no time; write for instance {_EXAMPLE}")
     if not found.keys() - {"time", "only"}:
-        raise ValueError(f"columns: nothing but time is given; add signals ({', '.join(SIGNALS)}), as in {_EXAMPLE}")
+        raise ValueError(
+            f"columns: nothing but time is given; add signals ({', '.join(SIGNALS)}), as in"
+            f" {_EXAMPLE}"
+        )
     return found
 
 

@@ -1,8 +1,8 @@
 """Output error: parameters of all segments at once, the initial states of each eliminated, a robust loss.
 
-The states are solved for within each evaluation, and their share of the Jacobian is projected out (Kaufman 1975, *A
-variable projection method for solving separable nonlinear least squares problems*), so that the outer problem has a
-handful of unknowns however many segments there are.
+The states are solved for within each evaluation, and their share of the Jacobian is projected out
+(Kaufman 1975, *A variable projection method for solving separable nonlinear least squares
+problems*), so that the outer problem has a handful of unknowns however many segments there are.
 """
 
 import abc
@@ -15,14 +15,16 @@ import numpy as np
 from codrl_mj.identify.log import Log, Segment, shifted
 from codrl_mj.identify.parameters import DEFAULTS, PARAMETERS
 
-DIFFERENCE = 1e-4  # step of finite differences, in the parameters' scales: dry friction makes smaller ones rough
+# step of finite differences, in the parameters' scales: dry friction makes smaller ones rough
+DIFFERENCE = 1e-4
 FAR = 1e30
 SCREENING = 12  # evaluations from each of several starts
 DELAYS = (-1, 1, 2, 3)  # rows that the input is tried to be late by, besides 0;
 LONGEST = 20  # and on to so many, while that is better
 STARTS = 4
 BETTER = 0.8  # a delay is believed where it takes the robust cost to less than this share, and
-SURE = 3.0  # lowers that of the segments by more, in the mean, than so many standard deviations of that mean
+# lowers that of the segments by more, in the mean, than so many standard deviations of that mean
+SURE = 3.0
 UNEXPLAINED = 8.0  # residuals of more standard deviations of the sensor in the mean are no noise,
 UNLIKE = 0.02
 """and more than this share of what moves within a segment is not explained: the log is bad, or the model is."""
@@ -51,7 +53,11 @@ class Model(abc.ABC):
 
     def all_values(self, values: np.ndarray) -> dict[str, float]:
         """Free and known parameters by name."""
-        return {**self.defaults, **self.known, **dict(zip(self.names, map(float, values), strict=True))}
+        return {
+            **self.defaults,
+            **self.known,
+            **dict(zip(self.names, map(float, values), strict=True)),
+        }
 
     @abc.abstractmethod
     def segments(self, logs: Sequence[Log]) -> list[Segment]:
@@ -74,8 +80,12 @@ class Fit:
     segments: Sequence[Segment]
     values: np.ndarray  # shape (p,)
     scale: float  # residuals beyond this, in standard deviations of the sensor, count less
-    residuals: tuple[np.ndarray, ...]  # of each segment, in standard deviations of the sensor, shape (m,)
-    jacobians: tuple[np.ndarray, ...]  # of each segment, what its states cannot do taken out, shape (m, p)
+    residuals: tuple[
+        np.ndarray, ...
+    ]  # of each segment, in standard deviations of the sensor, shape (m,)
+    jacobians: tuple[
+        np.ndarray, ...
+    ]  # of each segment, what its states cannot do taken out, shape (m, p)
     states: tuple[np.ndarray, ...]  # at the beginning of each segment
     logs: tuple[Log, ...] = ()  # of the segments, with the input in time
     delay: float = 0  # rows by which it was late
@@ -114,7 +124,12 @@ class _Settled(NamedTuple):
 
 
 def _settle(
-    simulate: Simulate, segment: Segment, state: np.ndarray, steps: np.ndarray, scale: float, most: int = 4
+    simulate: Simulate,
+    segment: Segment,
+    state: np.ndarray,
+    steps: np.ndarray,
+    scale: float,
+    most: int = 4,
 ) -> _Settled:
     """The segment from the best state near one, by Gauss-Newton steps that are cut where they are too long."""
     here = _residuals(simulate, segment, state)
@@ -148,27 +163,40 @@ def settled_state(model: Model, values: np.ndarray, segment: Segment) -> np.ndar
 class _Problem:
     """The outer problem, as scipy takes it; begins from the states at the last Jacobian, moved as that says."""
 
-    def __init__(self, model: Model, segments: Sequence[Segment], states: Sequence[np.ndarray], scale: float) -> None:
+    def __init__(
+        self, model: Model, segments: Sequence[Segment], states: Sequence[np.ndarray], scale: float
+    ) -> None:
         self.model, self.segments, self.scale = model, segments, scale
         self.known = list(states)
-        self.slopes = [np.zeros((len(one), len(model.names))) for one in states]  # of the states by the parameters, at
+        self.slopes = [
+            np.zeros((len(one), len(model.names))) for one in states
+        ]  # of the states by the parameters, at
         self.origin = np.zeros(len(model.names))
         self.at: tuple[bytes | None, list[_Settled]] = None, []
 
     def settle(self, values: np.ndarray, states: Sequence[np.ndarray]) -> list[_Settled]:
         simulate, steps = self.model.at(values), self.model.steps
-        return [_settle(simulate, *pair, steps, self.scale) for pair in zip(self.segments, states, strict=True)]
+        return [
+            _settle(simulate, *pair, steps, self.scale)
+            for pair in zip(self.segments, states, strict=True)
+        ]
 
     def solve(self, values: np.ndarray) -> list[_Settled]:
         if self.at[0] != values.tobytes():
             moved = values - self.origin
-            states = [one + slope @ moved for one, slope in zip(self.known, self.slopes, strict=True)]
+            states = [
+                one + slope @ moved for one, slope in zip(self.known, self.slopes, strict=True)
+            ]
             self.at = values.tobytes(), self.settle(values, states)
         return self.at[1]
 
     def reconsider(self, values: np.ndarray) -> None:
         """Begin each segment from where it fits best: what is known, or its own guess."""
-        both = zip(self.solve(values), self.settle(values, [one.state for one in self.segments]), strict=True)
+        both = zip(
+            self.solve(values),
+            self.settle(values, [one.state for one in self.segments]),
+            strict=True,
+        )
         best = [min(pair, key=lambda one: robust_cost(one.residuals, self.scale)) for pair in both]
         self.at = values.tobytes(), best
 
@@ -198,12 +226,17 @@ def robust_scale(residuals: np.ndarray) -> float:
 
 
 def search(
-    model: Model, segments: Sequence[Segment], starts: Sequence[np.ndarray], on_start: Callable[[], None] = lambda: None
+    model: Model,
+    segments: Sequence[Segment],
+    starts: Sequence[np.ndarray],
+    on_start: Callable[[], None] = lambda: None,
 ) -> tuple[Fit, tuple[Fit, ...]]:
     """The best fit from any of several starts, and what each of them led to, the best first."""
     found = []
     for start in starts:
-        found.append(refit(model, segments, start, SCREENING, states=[segment.state for segment in segments]))
+        found.append(
+            refit(model, segments, start, SCREENING, states=[segment.state for segment in segments])
+        )
         on_start()
     least = min(one.scale for one in found)
 
@@ -232,7 +265,9 @@ def refit(
     values = np.clip(start, lower, upper)
     if scale is None:
         simulate = model.at(values)
-        left = [_residuals(simulate, one, state) for one, state in zip(segments, states, strict=True)]
+        left = [
+            _residuals(simulate, one, state) for one, state in zip(segments, states, strict=True)
+        ]
         scale = robust_scale(np.concatenate(left))
     problem = _Problem(model, segments, states, scale)
     if model.names and most:
@@ -250,7 +285,9 @@ def refit(
             gtol=1e-10,
         ).x
     problem.scale = robust_scale(problem.residuals(values))
-    problem.reconsider(values)  # dry friction gives a segment several minima: that under other parameters may be worse
+    problem.reconsider(
+        values
+    )  # dry friction gives a segment several minima: that under other parameters may be worse
     jacobians = problem.jacobians(values)
     found = problem.solve(values)
     residuals = tuple(one.residuals for one in found)
@@ -268,8 +305,9 @@ def refitted(fit: Fit, model: Model) -> Fit:
 def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fit:
     """Fit a model to logs: several starts, then the delays.
 
-    A voltage whose mean between two rows fits worse than itself is shown to hold from row to row: then it is also the
-    mean, which fewer rows can be given. One that fits better is that of the rows' times, and taken half a row later.
+    A voltage whose mean between two rows fits worse than itself is shown to hold from row to row:
+    then it is also the mean, which fewer rows can be given. One that fits better is that of the
+    rows' times, and taken half a row later.
     """
     segments = model.segments(logs)
     model, starts = model.begun(segments)
@@ -286,7 +324,9 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
     def measure(*delays: float) -> float:
         """Their costs; returns the best delay that is believed."""
         for one in delays:
-            costs[one] = refit(model, model.segments(late(one)), fit.values, 20, fit.scale).costs(fit.scale)
+            costs[one] = refit(model, model.segments(late(one)), fit.values, 20, fit.scale).costs(
+                fit.scale
+            )
             on_step()
         best = min(costs, key=lambda one: costs[one].sum())
         return best if _better(costs[best], costs[0]) else 0
@@ -320,7 +360,9 @@ def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
     """Return what a fit says is wrong with its logs or its model; `shares` gets the unexplained share of each log."""
     unlike: dict[str, str] = {}
     for place, log in enumerate(fit.logs):
-        own = [pair for pair in zip(fit.segments, fit.residuals, strict=True) if pair[0].log == place]
+        own = [
+            pair for pair in zip(fit.segments, fit.residuals, strict=True) if pair[0].log == place
+        ]
         sizes = np.concatenate([np.abs(residuals) for _, residuals in own])
         rest = np.concatenate([residuals * segment.deviation for segment, residuals in own])
         swing = np.concatenate([segment.measured - segment.measured.mean() for segment, _ in own])
@@ -328,18 +370,20 @@ def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
         if sizes.mean() / 0.8 > UNEXPLAINED and share > UNLIKE:
             shares[log.name] = max(share, shares.get(log.name, 0.0))
             unlike[log.name] = (
-                f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} % of what moves"
+                f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} %"
+                " of what moves"
             )
     found = []
     if 1 < len(unlike) == len(fit.logs):
         found.append(
-            "the model does not explain any of the logs within what their sensors see: of the first, residuals are "
-            f"{next(iter(unlike.values()))}. Fit more friction, or find out what else moved"
+            "the model does not explain any of the logs within what their sensors see: of the"
+            f" first, residuals are {next(iter(unlike.values()))}. Fit more friction, or find out"
+            " what else moved"
         )
     else:
         found += [
-            f"log {name}: residuals are {text} in the mean: the model does not explain it. Leave it out, find out what "
-            "else moved, or fit more friction"
+            f"log {name}: residuals are {text} in the mean: the model does not explain it. Leave it"
+            " out, find out what else moved, or fit more friction"
             for name, text in unlike.items()
         ]
     values = np.array([one.values for one in fit.tried])
@@ -347,6 +391,10 @@ def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
     near = costs < 1.1 * costs.min()
     apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(fit.values), fit.model.scales)
     if np.any(apart > 0.2):
-        names = ", ".join(name for name, one in zip(fit.model.names, apart, strict=True) if one > 0.2)
-        found.append(f"several minima: starts ended within 10 % of the best cost, but apart in {names}")
+        names = ", ".join(
+            name for name, one in zip(fit.model.names, apart, strict=True) if one > 0.2
+        )
+        found.append(
+            f"several minima: starts ended within 10 % of the best cost, but apart in {names}"
+        )
     return found

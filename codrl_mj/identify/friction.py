@@ -11,9 +11,13 @@ from codrl_mj.identify.log import SIGNALS, Log
 from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.result import predict
 
-LEAST_LOGS = 3  # Fewer logs give no standard deviation of what a richer friction gains on the one left out.
+LEAST_LOGS = (
+    3  # Fewer logs give no standard deviation of what a richer friction gains on the one left out.
+)
 _LOADED = {"coulomb": "load", "stribeck": "both"}
-_HINTED = 0.9  # An efficiency is hinted at where it takes all cost, and half of the segments', to less than this share,
+# An efficiency is hinted at where it takes all cost, and half of the segments', to less than this
+# share,
+_HINTED = 0.9
 _APART = 0.05  # and differs by more than this from the one that the fit took as known.
 
 
@@ -25,20 +29,23 @@ class FrictionChoice(NamedTuple):
     """Why this kind; empty if it was asked for."""
 
 
-def choose_friction(model: ShaftModel, logs: Sequence[Log], wanted: str, on_step: Callable[[], None]) -> FrictionChoice:
+def choose_friction(
+    model: ShaftModel, logs: Sequence[Log], wanted: str, on_step: Callable[[], None]
+) -> FrictionChoice:
     """Return the model with the friction that is wanted or, for `auto`, with what leaving out one log at a time favors.
 
-    More than viscous and Coulomb friction is kept where the errors on the logs left out fall by more, in the mean, than
-    two standard deviations of that mean. With fewer than three logs none is.
+    More than viscous and Coulomb friction is kept where the errors on the logs left out fall by
+    more, in the mean, than two standard deviations of that mean. With fewer than three logs none
+    is.
     """
     if wanted != "auto":
         return FrictionChoice(dataclasses.replace(model, friction=wanted), "")
     if len(logs) < LEAST_LOGS:
         return FrictionChoice(
             model,
-            f"friction: coulomb, because auto compares the errors on logs left out: it needs {LEAST_LOGS} logs that "
-            f"move, and there {'is' if len(logs) == 1 else 'are'} {len(logs)}. Name more, or choose --friction load, "
-            "stribeck or both",
+            "friction: coulomb, because auto compares the errors on logs left out: it needs"
+            f" {LEAST_LOGS} logs that move, and there {'is' if len(logs) == 1 else 'are'}"
+            f" {len(logs)}. Name more, or choose --friction load, stribeck or both",
         )
     errors = {"coulomb": _left_out_errors(model, logs, on_step)}
     best = model
@@ -50,19 +57,24 @@ def choose_friction(model: ShaftModel, logs: Sequence[Log], wanted: str, on_step
             best = richer
     means = ", ".join(f"{friction} {error.mean():.3g}" for friction, error in errors.items())
     reason = (
-        f"friction: {best.friction}, by the mean errors on the logs left out [{SIGNALS[model.output]}]: {means}; a "
-        "richer one is taken if it is better by two standard deviations"
+        f"friction: {best.friction}, by the mean errors on the logs left out"
+        f" [{SIGNALS[model.output]}]: {means}; a richer one is taken if it is better by two"
+        " standard deviations"
     )
     return FrictionChoice(best, reason)
 
 
-def _left_out_errors(model: ShaftModel, logs: Sequence[Log], on_step: Callable[[], None]) -> np.ndarray:
+def _left_out_errors(
+    model: ShaftModel, logs: Sequence[Log], on_step: Callable[[], None]
+) -> np.ndarray:
     """Return the mean absolute error on each log of the fit to all others, from that to all, shape (n,)."""
     segments = model.segments(logs)
     model, starts = model.begun(segments)
     whole, errors = search(model, segments, starts[:2])[0].values, []
     for place, log in enumerate(logs):
-        found = predict(refit(model, model.segments([*logs[:place], *logs[place + 1 :]]), whole, 12), log)
+        found = predict(
+            refit(model, model.segments([*logs[:place], *logs[place + 1 :]]), whole, 12), log
+        )
         errors.append(found.open_loop if found.closed_loop is None else found.closed_loop)
         on_step()
     return np.array(errors)
@@ -73,7 +85,9 @@ def load_hint(fit: Fit) -> str | None:
     model = fit.model
     if model.friction not in _LOADED or "gear_efficiency" in (*model.known, *model.names):
         return None
-    loaded = dataclasses.replace(model, names=(*model.names, "gear_efficiency"), scales=np.append(model.scales, 0.1))
+    loaded = dataclasses.replace(
+        model, names=(*model.names, "gear_efficiency"), scales=np.append(model.scales, 0.1)
+    )
     known = model.defaults["gear_efficiency"]
     richer = refit(loaded, fit.segments, np.append(fit.values, min(known, 0.9)), 20, fit.scale)
     costs, before = richer.costs(fit.scale), fit.costs(fit.scale)
@@ -81,7 +95,7 @@ def load_hint(fit: Fit) -> str | None:
     if abs(richer.values[-1] - known) <= _APART or left > _HINTED:
         return None
     return (
-        f"friction grows with the load: an efficiency of {richer.values[-1]:.2g} instead of {known:.2g} would take "
-        f"{1.0 - left:.0%} off what is not explained; fit it by --friction "
-        f"{_LOADED[model.friction]}"
+        f"friction grows with the load: an efficiency of {richer.values[-1]:.2g} instead of"
+        f" {known:.2g} would take {1.0 - left:.0%} off what is not explained; fit it by --friction"
+        f" {_LOADED[model.friction]}"
     )

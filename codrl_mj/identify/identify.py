@@ -14,7 +14,14 @@ from codrl_mj.identify.estimate import Fit, fitted, refitted
 from codrl_mj.identify.friction import choose_friction, load_hint
 from codrl_mj.identify.log import SEGMENT, Log, moves, obstacle, shifted, usage
 from codrl_mj.identify.models import ShaftModel, WindingModel
-from codrl_mj.identify.parameters import DEFAULTS, ESTIMABLE, OF_LOSS, OF_RIG, OF_WINDING, PARAMETERS
+from codrl_mj.identify.parameters import (
+    DEFAULTS,
+    ESTIMABLE,
+    OF_LOSS,
+    OF_RIG,
+    OF_WINDING,
+    PARAMETERS,
+)
 from codrl_mj.identify.result import (
     MISUNDERSTOOD,
     USABLE,
@@ -46,46 +53,60 @@ def identify(
     """Identify a motor.
 
     Args:
-        logs: to fit, at least one, as they are: `check` says what is wrong with one. Voltage and current tell the
-            winding; torque or current, or else voltage, and position or velocity tell the shaft.
-        rig: what the output moves: `pendulum`, `free` or `load`; None: a pendulum where `mgl` is known.
+        logs: to fit, at least one, as they are: `check` says what is wrong with one. Voltage and
+            current tell the winding; torque or current, or else voltage, and position or velocity
+            tell the shaft.
+        rig: what the output moves: `pendulum`, `free` or `load`; None: a pendulum where `mgl` is
+            known.
         known: parameters that are not to be fitted, by names of `PARAMETERS`.
-        friction: `coulomb` (viscous and Coulomb), `stribeck`, `load`, `both`, or `auto`: whichever foretells logs that
-            it was not fitted to, by more than those differ.
+        friction: `coulomb` (viscous and Coulomb), `stribeck`, `load`, `both`, or `auto`: whichever
+            foretells logs that it was not fitted to, by more than those differ.
         held_out: logs that are only foretold.
         estimated: parameters to fit that are otherwise taken as known, such as `torque_gain`.
-        segment: time [s] that the shaft is simulated for at once, >= 0.05: short where it tips over by itself, a second
-            or two where it only sticks and slides.
-        base: the mapping of a drive that gives what the logs do not tell, and the gear where `known` does not.
+        segment: time [s] that the shaft is simulated for at once, >= 0.05: short where it tips over
+            by itself, a second or two where it only sticks and slides.
+        base: the mapping of a drive that gives what the logs do not tell, and the gear where
+            `known` does not.
         on_progress: called with what is being done, steps done and steps in all.
         seed: of the resampling.
 
     Raises:
-        ValueError: unknown names, values out of bounds, or logs that tell nothing; the message says what is missing.
+        ValueError: unknown names, values out of bounds, or logs that tell nothing; the message says
+            what is missing.
     """
     logs, held_out, repeated = distinct(logs, held_out)
-    given, motor = checked(logs, rig, known or {}, friction, estimated, segment, base), motor_of(base)
+    given, motor = (
+        checked(logs, rig, known or {}, friction, estimated, segment, base),
+        motor_of(base),
+    )
     defaults = DEFAULTS | {name: getattr(motor, name) for name in OF_LOSS if motor is not None}
     rig = rig or ("pendulum" if "mgl" in given else "free")
     electrical, moving, driven_by, output = usage(logs)
-    total = STEPS_OF_A_PART * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (friction == "auto")
+    total = STEPS_OF_A_PART * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (
+        friction == "auto"
+    )
     done = itertools.count(1)
 
     def step(what: str) -> Callable[[], None]:
         return lambda: on_progress(what, min(next(done), total), total)
 
-    # the winding, and the shaft by the torque constant that the winding tells; then each again, beside the other
+    # the winding, and the shaft by the torque constant that the winding tells; then each again,
+    # beside the other
     parts: dict[str, Fit] = {}
     if electrical:
         parts["winding"] = fitted(WindingModel(known=given), electrical, step("winding"))
     if driven_by:
         shaft = ShaftModel(rig=rig, friction="coulomb", driven_by=driven_by, output=output, known=given,
                            defaults=defaults, estimated=tuple(estimated), segment=segment)  # fmt: skip
-        choice = choose_friction(_told(shaft, parts.get("winding")), moving, friction, step("friction"))
+        choice = choose_friction(
+            _told(shaft, parts.get("winding")), moving, friction, step("friction")
+        )
         shaft, friction = choice.model, choice.model.friction
         parts["shaft"] = fitted(shaft, moving, step("shaft"))
         if electrical and driven_by != "voltage":
-            parts["winding"] = refitted(parts["winding"], WindingModel(known=given, shaft=parts["shaft"]))
+            parts["winding"] = refitted(
+                parts["winding"], WindingModel(known=given, shaft=parts["shaft"])
+            )
         shaft = _told(dataclasses.replace(shaft, known=given), parts.get("winding"))
         parts["shaft"] = refitted(parts["shaft"], shaft)
     estimates, warnings, unexplained = judged(parts, given, defaults, seed, step)
@@ -105,13 +126,17 @@ def identify(
         warnings=tuple(warnings),
         base=base,
         traces=tuple(one for name, part in parts.items() for one in fitted_traces(name, part)),
-        correlations={name: correlations(parts[name]) if name in parts else {} for name in ("winding", "shaft")},
+        correlations={
+            name: correlations(parts[name]) if name in parts else {}
+            for name in ("winding", "shaft")
+        },
         supply=max((float(np.abs(one).max()) for one in volts), default=None),
         unexplained=unexplained,
         friction_reason=choice.reason if driven_by else "",
     )
     if _is_better_blind(found, moving):
-        # The current must not take away what the voltage alone tells, for example at few rows in a time constant.
+        # The current must not take away what the voltage alone tells, for example at few rows in a
+        # time constant.
         fewer = [_without_current(log) for log in logs]
         arguments = rig, known, friction, held_out, estimated, segment, base, on_progress, seed
         found = _joined(found, identify(fewer, *arguments))
@@ -120,7 +145,9 @@ def identify(
 
 def _is_better_blind(found: Identified, moving: Sequence[Log]) -> bool:
     """Return True if a shaft under the current has no constant, and might have one under the voltage."""
-    refused = any(one.name == "back_emf_constant" and one.status not in USABLE for one in found.estimates)
+    refused = any(
+        one.name == "back_emf_constant" and one.status not in USABLE for one in found.estimates
+    )
     has_voltage = found.driven_by == "current" and all(log.has("voltage") for log in moving)
     return refused and has_voltage and found.unexplained <= MISUNDERSTOOD
 
@@ -139,7 +166,9 @@ def _joined(whole: Identified, blind: Identified) -> Identified:
     if refused[1] >= refused[0]:
         return whole
     named = {one.name: one for one in (*whole.estimates, *blind.estimates)}
-    note = "the shaft is fitted under the voltage: under the current its back-EMF constant was refused"
+    note = (
+        "the shaft is fitted under the voltage: under the current its back-EMF constant was refused"
+    )
     return dataclasses.replace(
         blind,
         delays={**whole.delays, **blind.delays},
@@ -150,15 +179,18 @@ def _joined(whole: Identified, blind: Identified) -> Identified:
             *(one for one in whole.traces if one.part == "winding"),
             *(one for one in blind.traces if one.part == "shaft"),
         ),
-        correlations={"winding": whole.correlations["winding"], "shaft": blind.correlations["shaft"]},
+        correlations={
+            "winding": whole.correlations["winding"],
+            "shaft": blind.correlations["shaft"],
+        },
     )
 
 
 def _told(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
     """The shaft, with what it has of the winding where that is not known.
 
-    Under a current the back-EMF constant for a torque constant: but for losses they are equal; under a voltage the
-    resistance.
+    Under a current the back-EMF constant for a torque constant: but for losses they are equal;
+    under a voltage the resistance.
     """
     numbers = shaft.known if winding is None else winding.model.all_values(winding.values)
     name, source = OF_WINDING.get(shaft.driven_by, ("", ""))
@@ -168,11 +200,13 @@ def _told(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
     return dataclasses.replace(shaft, known={**shaft.known, name: value})
 
 
-def distinct(logs: Sequence[Log], held_out: Sequence[Log]) -> tuple[list[Log], list[Log], list[str]]:
+def distinct(
+    logs: Sequence[Log], held_out: Sequence[Log]
+) -> tuple[list[Log], list[Log], list[str]]:
     """Return the logs to fit and the logs held out, each measurement once, and a sentence for each one left out.
 
-    A measurement is recognized by its content, because copies have other names. One that is fitted and held out is
-    held out.
+    A measurement is recognized by its content, because copies have other names. One that is fitted
+    and held out is held out.
     """
     fitted: dict[bytes, Log] = {}
     predicted: dict[bytes, Log] = {}
@@ -194,8 +228,8 @@ def distinct(logs: Sequence[Log], held_out: Sequence[Log]) -> tuple[list[Log], l
             repeated.append(f"log {log.name} is {told}")
     if logs and not fitted:
         raise ValueError(
-            f"logs {', '.join(log.name for log in logs)}: all are held out, too, so none is left to fit; hold out "
-            "others (--holdout on the command line, held_out= in Python)"
+            f"logs {', '.join(log.name for log in logs)}: all are held out, too, so none is left to"
+            " fit; hold out others (--holdout on the command line, held_out= in Python)"
         )
     return [*fitted.values()], [*predicted.values()], repeated
 
@@ -217,8 +251,9 @@ def _contradictions(estimates: Sequence[Estimate], motor: Any) -> list[str]:
     if reflected <= whole.high:
         return []
     return [
-        f"the motor's rotor_inertia = {motor.rotor_inertia:.4g} kg*m^2 is {reflected:.4g} at the output, but all that "
-        f"moves has {whole.value:.4g}: fit it by --known load_inertia=VALUE, or correct the --motor"
+        f"the motor's rotor_inertia = {motor.rotor_inertia:.4g} kg*m^2 is {reflected:.4g} at the"
+        f" output, but all that moves has {whole.value:.4g}: fit it by --known load_inertia=VALUE,"
+        " or correct the --motor"
     ]
 
 
@@ -241,7 +276,9 @@ def checked(
         raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
     if not logs:
         raise ValueError("logs: none was given; give one or more")
-    check_names(known, [name for name in PARAMETERS if name != "friction_torque"], "parameter", "known.")
+    check_names(
+        known, [name for name in PARAMETERS if name != "friction_torque"], "parameter", "known."
+    )
     if rig is not None:
         check_names([rig], OF_RIG, "rig")
     check_names([friction], ("auto", "coulomb", "stribeck", "load", "both"), "friction")
@@ -257,22 +294,32 @@ def checked(
         raise ValueError(f"{found.message}; {found.remedy} (logs and their signals: {have})")
     twice = sorted({*known} & {*estimated})
     if twice:
-        raise ValueError(f"{', '.join(twice)}: both known and estimated, must be one of them; leave the other out")
+        raise ValueError(
+            f"{', '.join(twice)}: both known and estimated, must be one of them; leave the"
+            " other out"
+        )
     possible = [name for name, only in ESTIMABLE.items() if only is None or only == driven_by]
     if driven_by is not None or estimated:
         check_names(estimated, possible, f"parameter of a shaft under a {driven_by}", "estimated.")
     if moving and not output:
-        have = "; ".join(f"{log.name}: {'position' if log.has('position') else 'velocity'}" for log in moving)
-        raise ValueError(f"logs tell different things ({have}): give all that move a position, or all a velocity")
+        have = "; ".join(
+            f"{log.name}: {'position' if log.has('position') else 'velocity'}" for log in moving
+        )
+        raise ValueError(
+            f"logs tell different things ({have}): give all that move a position, or all a velocity"
+        )
     if rig is None and "mgl" not in known and driven_by is not None:
         raise ValueError(
-            "rig is not given (--rig on the command line, rig= in Python): what the output moves decides what is "
-            "fitted, must be pendulum, free or load; a motor on its own is free, with load_inertia=0 known"
+            "rig is not given (--rig on the command line, rig= in Python): what the output moves"
+            " decides what is fitted, must be pendulum, free or load; a motor on its own is free,"
+            " with load_inertia=0 known"
         )
     return {name: float(value) for name, value in known.items()}
 
 
-def foreseen(logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None) -> str | None:
+def foreseen(
+    logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None
+) -> str | None:
     """What will be missing for an actuator however well logs are fitted, by their signals; None: nothing."""
     electrical, moving, driven_by, _ = usage(logs)
     names = {*known, *(("resistance", "inductance") if electrical else ())}

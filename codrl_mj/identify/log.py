@@ -21,7 +21,11 @@ SIGNALS = {
 }
 """What a log may hold -> its SI unit; None: any."""
 LONGEST_STEP = 5.0  # a longer step, in median steps, is a gap, across which nothing is simulated
-_ROUND = {*(tenths / 10 for tenths in range(10, 100)), 1.25, 2.25}  # leading digits of a step that a file rounds to
+_ROUND = {
+    *(tenths / 10 for tenths in range(10, 100)),
+    1.25,
+    2.25,
+}  # leading digits of a step that a file rounds to
 _MOST_LEVELS = 1_000_000  # of a converter: what has more is as good as continuous
 
 
@@ -45,11 +49,12 @@ class Finding:
 class Log:
     """A bench log in SI units; times increase strictly, gaps and dropped rows stay as they are.
 
-    Signals are at the motor's output as logged; positive voltage, current, torque and speed point the same way.
+    Signals are at the motor's output as logged; positive voltage, current, torque and speed point
+    the same way.
 
     Raises:
-        ValueError: a signal is unknown, has another shape than the times or a value that is not finite; fewer than two
-            rows; times that do not increase.
+        ValueError: a signal is unknown, has another shape than the times or a value that is not
+            finite; fewer than two rows; times that do not increase.
     """
 
     name: str
@@ -73,21 +78,32 @@ class Log:
         """Validate."""
         shape = self.time.shape
         if len(shape) != 1 or shape[0] < 2:
-            raise ValueError(f"log {self.name}: time has shape {shape}, must be (n,) with n >= 2; give a longer log")
+            raise ValueError(
+                f"log {self.name}: time has shape {shape}, must be (n,) with n >= 2; give a"
+                " longer log"
+            )
         for name, values in {"time": self.time, **self.signals}.items():
             if name != "time" and name not in SIGNALS:
-                raise ValueError(f"log {self.name}: unknown signal {name!r}, must be one of {', '.join(SIGNALS)}")
+                raise ValueError(
+                    f"log {self.name}: unknown signal {name!r}, must be one of {', '.join(SIGNALS)}"
+                )
             if values.shape != shape:
-                raise ValueError(f"log {self.name}: {name} has shape {values.shape}, must be that of time, {shape}")
+                raise ValueError(
+                    f"log {self.name}: {name} has shape {values.shape}, must be that of time,"
+                    f" {shape}"
+                )
             if not np.isfinite(values).all():
                 row = int(np.flatnonzero(~np.isfinite(values))[0])
-                raise ValueError(f"log {self.name}: {name}[{row}] = {values[row]}, must be finite; leave the row out")
+                raise ValueError(
+                    f"log {self.name}: {name}[{row}] = {values[row]}, must be finite; leave the"
+                    " row out"
+                )
         late = np.flatnonzero(np.diff(self.time) <= 0.0)
         if late.size:
             row = int(late[0]) + 1
             raise ValueError(
-                f"log {self.name}: time[{row}] = {self.time[row]!r}, must be above {self.time[row - 1]!r} of the row "
-                "before; leave such rows out"
+                f"log {self.name}: time[{row}] = {self.time[row]!r}, must be above"
+                f" {self.time[row - 1]!r} of the row before; leave such rows out"
             )
 
     def has(self, *names: str) -> bool:
@@ -97,7 +113,9 @@ class Log:
     def part(self, rows: slice) -> "Log":
         """Some of its rows."""
         signals = {name: values[rows] for name, values in self.signals.items()}
-        return dataclasses.replace(self, time=self.time[rows], signals=signals, rows=self.row_numbers[rows])
+        return dataclasses.replace(
+            self, time=self.time[rows], signals=signals, rows=self.row_numbers[rows]
+        )
 
     @property
     def row_numbers(self) -> np.ndarray:
@@ -156,17 +174,27 @@ def counts_per_turn(step: float, period: float) -> int | None:
 
 def is_supply(volts: np.ndarray, others: Sequence[np.ndarray]) -> bool:
     """Return True if a voltage hardly changes although the motor is driven or turns both ways, as only a supply's."""
-    reverses = any(one.size and float(one.min()) < -0.2 * float(np.abs(one).max()) < 0.0 < one.max() for one in others)
+    reverses = any(
+        one.size and float(one.min()) < -0.2 * float(np.abs(one).max()) < 0.0 < one.max()
+        for one in others
+    )
     return bool(volts.size) and 0.0 < float(volts.max()) <= 1.3 * float(volts.min()) and reverses
 
 
 # -- whether a fit can use it ---------------------------------------------------------------------------------------
 
-INPUTS = "torque", "current", "voltage"  # what drives the shaft: the nearest to it that all logs that move have
+INPUTS = (
+    "torque",
+    "current",
+    "voltage",
+)  # what drives the shaft: the nearest to it that all logs that move have
 OUTPUTS = "position", "velocity"  # what a simulation is compared with
 MAX_STEP = 0.05  # rows that are farther apart [s] say too little within the time that is predicted
-MIN_ROWS = 20  # of the longest stretch without a gap: a shaft has up to five parameters and two states
-MIN_DURATION = 0.04  # of that stretch [s], if the shaft moves: the first 0.03 s only tell the state it begins from
+MIN_ROWS = (
+    20  # of the longest stretch without a gap: a shaft has up to five parameters and two states
+)
+# of that stretch [s], if the shaft moves: the first 0.03 s only tell the state it begins from
+MIN_DURATION = 0.04
 
 
 class Usage(NamedTuple):
@@ -174,7 +202,9 @@ class Usage(NamedTuple):
 
     electrical: list[Log]  # tell the winding
     moving: list[Log]  # tell the shaft
-    driven_by: str | None  # the shaft's input in the fit; None if the moving logs have none in common
+    driven_by: (
+        str | None
+    )  # the shaft's input in the fit; None if the moving logs have none in common
     output: str  # the motion that the fit compares; empty if the moving logs have none in common
 
 
@@ -185,7 +215,9 @@ def usage(logs: Sequence[Log]) -> Usage:
         next((name for name in names if moving and all(log.has(name) for log in moving)), None)
         for names in (INPUTS, OUTPUTS)
     )
-    return Usage([log for log in logs if log.has("voltage", "current")], moving, driven_by, output or "")
+    return Usage(
+        [log for log in logs if log.has("voltage", "current")], moving, driven_by, output or ""
+    )
 
 
 def obstacle(logs: Sequence[Log]) -> Finding | None:
@@ -199,11 +231,19 @@ def obstacle(logs: Sequence[Log]) -> Finding | None:
             remedy = "log more often; or correct the unit of time"
             return Finding("error", "rows", None, text, remedy)
     for log in [*electrical, *moving]:
-        rows = max(usable(log), key=lambda stretch: stretch.stop - stretch.start, default=slice(0, 1))
-        count, seconds = rows.stop - rows.start, float(log.time[rows.stop - 1] - log.time[rows.start])
+        rows = max(
+            usable(log), key=lambda stretch: stretch.stop - stretch.start, default=slice(0, 1)
+        )
+        count, seconds = (
+            rows.stop - rows.start,
+            float(log.time[rows.stop - 1] - log.time[rows.start]),
+        )
         is_moving = any(log is one for one in moving)
         if count < MIN_ROWS or (is_moving and seconds < MIN_DURATION):
-            text = f"log {log.name}: {count} rows in {seconds:.3g} s without a gap, must be at least {MIN_ROWS}"
+            text = (
+                f"log {log.name}: {count} rows in {seconds:.3g} s without a gap, must be at least"
+                f" {MIN_ROWS}"
+            )
             text += f" in {MIN_DURATION:g} s" if is_moving else ""
             return Finding("error", "rows", None, text, "log for longer, without gaps")
     return None
@@ -215,25 +255,41 @@ def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
     if not signals & {*INPUTS}:
         lacking, remedy = "no voltage, current or torque", "log one of them"
         if "duty" in signals:
-            remedy = "write voltage=duty*bus:V with the columns of both, or voltage=duty*12:V if the supply has 12 V"
+            remedy = (
+                "write voltage=duty*bus:V with the columns of both, or voltage=duty*12:V if the"
+                " supply has 12 V"
+            )
         elif "command" in signals:
-            remedy += "; of a servo also the duty (Feetech: Present Load, Dynamixel: Present PWM) and the input voltage"
+            remedy += (
+                "; of a servo also the duty (Feetech: Present Load, Dynamixel: Present PWM) and the"
+                " input voltage"
+            )
     elif is_moving:
-        lacking, remedy = "no torque, current or voltage in all logs that move", "fit alike logs together"
+        lacking, remedy = (
+            "no torque, current or voltage in all logs that move",
+            "fit alike logs together",
+        )
     else:
-        lacking, remedy = "no position or velocity that moves", "log the motion, or both voltage and current"
+        lacking, remedy = (
+            "no position or velocity that moves",
+            "log the motion, or both voltage and current",
+        )
     who, them = ("this log has", "it") if len(logs) == 1 else ("these logs have", "them")
-    return Finding("error", "signals", None, f"{who} {lacking}: nothing can be identified from {them}", remedy)
+    return Finding(
+        "error", "signals", None, f"{who} {lacking}: nothing can be identified from {them}", remedy
+    )
 
 
 # -- cut into segments, each simulated from an initial state of its own ----------------------------------------------
 
 SEGMENT = 0.5
 """Time [s] that a shaft is simulated for at once: longer ones meet friction that no model has, and several minima."""
-BLOCK = 1.0  # shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together
+# shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together
+BLOCK = 1.0
 SHAFT_STEP = 5e-4
 """Rows that are nearer [s] are taken together for a shaft, which is slower: their mean input, their first position."""
-SPIKE = 50.0  # a row is a spike where it sticks out by more than so many times what nine of ten rows do at most
+# a row is a spike where it sticks out by more than so many times what nine of ten rows do at most
+SPIKE = 50.0
 WINDOW = 4e-3
 """Time [s] that positions are smoothed over: short beside what a shaft does, long beside an encoder's steps."""
 STILL = 10.0  # a shaft that moves by no more than so many steps of its encoder is locked
@@ -273,7 +329,8 @@ def replaced(log: Log, name: str, values: np.ndarray) -> Log:
 def without_spikes(values: np.ndarray) -> np.ndarray:
     """A sampled signal, rows that stick out of both their neighbours by far more than is usual in place of the nearer.
 
-    Residuals of an output bear outliers, by the robust loss; what drives a simulation has to be free of them.
+    Residuals of an output bear outliers, by the robust loss; what drives a simulation has to be
+    free of them.
     """
     middle = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
     off = np.abs(values[1:-1] - middle)
@@ -294,23 +351,35 @@ def sensor_deviation(log: Log, name: str) -> float:
         return max(step / math.sqrt(12.0), 1e-9)
     ripple = np.diff(values, n=3) / math.sqrt(20.0)  # 1, 3, 3, 1
     noise = 1.4826 * float(np.median(np.abs(ripple)))
-    return max(noise if noise > step else step / math.sqrt(12.0), 1e-6 * float(np.ptp(values)), 1e-12)
+    return max(
+        noise if noise > step else step / math.sqrt(12.0), 1e-6 * float(np.ptp(values)), 1e-12
+    )
 
 
 def moves(log: Log) -> bool:
     """Whether the shaft moves, by more than an encoder flickers or a velocity is noisy; no where neither is logged."""
     if log.has("position"):
-        return float(np.ptp(log.signals["position"])) > max(STILL * log.resolution.get("position", 0.0), 1e-4)
+        return float(np.ptp(log.signals["position"])) > max(
+            STILL * log.resolution.get("position", 0.0), 1e-4
+        )
     if not log.has("velocity"):
         return False
-    velocity, rows = log.signals["velocity"], max(min(round(0.05 / log.step), len(log.time) // 4), 1)
-    return float(np.std(np.convolve(velocity, np.full(rows, 1.0 / rows), "valid"))) > 0.3 * float(np.std(velocity))
+    velocity, rows = (
+        log.signals["velocity"],
+        max(min(round(0.05 / log.step), len(log.time) // 4), 1),
+    )
+    return float(np.std(np.convolve(velocity, np.full(rows, 1.0 / rows), "valid"))) > 0.3 * float(
+        np.std(velocity)
+    )
 
 
-def speeds(times: np.ndarray, positions: np.ndarray, at: np.ndarray, window: float = WINDOW) -> np.ndarray:
+def speeds(
+    times: np.ndarray, positions: np.ndarray, at: np.ndarray, window: float = WINDOW
+) -> np.ndarray:
     """Slopes [rad/s] of straight lines through the positions within half a window of a time, at least three of them.
 
-    In the middle of a window that is also the slope of the parabola. Near the ends the window is what there is.
+    In the middle of a window that is also the slope of the parabola. Near the ends the window is
+    what there is.
     """
     count = len(times)
     first = np.searchsorted(times, at - 0.5 * window - 1e-9)
@@ -319,7 +388,10 @@ def speeds(times: np.ndarray, positions: np.ndarray, at: np.ndarray, window: flo
     first = np.clip(np.minimum(first, near - 1), 0, max(count - 2, 0))
     last = np.clip(np.maximum(last, near + 1), first + 2, count)
     shifted, moved = times - times[0], positions - positions[0]
-    sums = [np.concatenate([[0.0], np.cumsum(one)]) for one in (shifted, moved, shifted * moved, shifted**2)]
+    sums = [
+        np.concatenate([[0.0], np.cumsum(one)])
+        for one in (shifted, moved, shifted * moved, shifted**2)
+    ]
     t, q, tq, tt = (one[last] - one[first] for one in sums)
     number = last - first
     return (number * tq - t * q) / (number * tt - t * t)
@@ -331,7 +403,10 @@ def cut(log: Log, longest: float) -> list[slice]:
     for stretch in usable(log):
         begin, end = log.time[stretch.start], log.time[stretch.stop - 1]
         count = max(round((end - begin) / longest), 1)
-        edges = np.searchsorted(log.time[stretch], np.linspace(begin, end, count + 1)[:-1]) + stretch.start
+        edges = (
+            np.searchsorted(log.time[stretch], np.linspace(begin, end, count + 1)[:-1])
+            + stretch.start
+        )
         edges = [*map(int, np.unique(edges)), stretch.stop]
         found += [slice(a, b) for a, b in itertools.pairwise(edges) if b - a >= 4]
     return found
@@ -345,7 +420,9 @@ def initial_state(log: Log, rows: slice) -> np.ndarray:
     last = min(max(int(np.searchsorted(log.time, time + 0.015)), rows.start + 3), stretch.stop)
     near = slice(first, last)
     degree = min(2, last - first - 1)
-    fitted = np.polynomial.polynomial.polyfit(log.time[near] - time, log.signals["position"][near], degree)
+    fitted = np.polynomial.polynomial.polyfit(
+        log.time[near] - time, log.signals["position"][near], degree
+    )
     return np.array([fitted[0], fitted[1]])
 
 

@@ -45,9 +45,13 @@ class WindingModel(Model):
         number = self.all_values(values)
         resistance, inductance = number["resistance"], number["inductance"]
         constant = number.get("back_emf_constant", 0.0) * number["gear_ratio"]
-        return lambda one, state: winding(one.times, one.inputs, one.speeds, state[0], resistance, inductance, constant)
+        return lambda one, state: winding(
+            one.times, one.inputs, one.speeds, state[0], resistance, inductance, constant
+        )
 
-    def segments(self, logs: Sequence[Log], turned: Sequence[np.ndarray] | None = None) -> list[Segment]:
+    def segments(
+        self, logs: Sequence[Log], turned: Sequence[np.ndarray] | None = None
+    ) -> list[Segment]:
         """The logs, cut into a block each, in which voltage and speed drive the current; speeds may be given."""
         made: list[Segment] = []
         for place, log in enumerate(logs):
@@ -56,40 +60,59 @@ class WindingModel(Model):
             for rows in cut(log, BLOCK):
                 times, current = log.time[rows], log.signals["current"][rows]
                 drive = times, volts[rows], np.zeros(len(times)), speed[rows]
-                made.append(Segment(place, len(made), rows, *drive, current, deviation, current[:1]))
+                made.append(
+                    Segment(place, len(made), rows, *drive, current, deviation, current[:1])
+                )
         return made
 
     def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
         """With starts by regressions of the voltage's integral over windows of several lengths.
 
-        The integral over a window is R times that of the current, L times its change and kE times the turn.
+        The integral over a window is R times that of the current, L times its change and kE times
+        the turn.
         """
         moving = any(np.any(segment.speeds) for segment in segments)
-        free = tuple(name for name in ELECTRICAL if name not in self.known and (moving or name != "back_emf_constant"))
+        free = tuple(
+            name
+            for name in ELECTRICAL
+            if name not in self.known and (moving or name != "back_emf_constant")
+        )
         given = {**self.defaults, "back_emf_constant": 0.0, **self.known}
         starts = []
         for count in (2, 8, 32):  # rows of a window
             rows = []
             for one in segments:
-                steps, current, turns = np.diff(one.times), one.measured, one.speeds[:-1] * given["gear_ratio"]
+                steps, current, turns = (
+                    np.diff(one.times),
+                    one.measured,
+                    one.speeds[:-1] * given["gear_ratio"],
+                )
                 edges = np.arange(0, len(current), min(count, len(current) - 1))
                 rates = 0.5 * (current[1:] + current[:-1]), turns, one.inputs[:-1]
-                charge, turn, flux = (np.diff(np.append(0.0, np.cumsum(rate * steps))[edges]) for rate in rates)
+                charge, turn, flux = (
+                    np.diff(np.append(0.0, np.cumsum(rate * steps))[edges]) for rate in rates
+                )
                 rows.append(np.stack([charge, np.diff(current[edges]), turn, flux], axis=1))
             table = np.concatenate(rows)
             starts.append(_regressed(table[:, :3], table[:, 3], ELECTRICAL, free, given))
         magnitudes = np.abs(np.median(starts, axis=0))
         volts = np.concatenate([one.inputs for one in segments])
         amperes = np.concatenate([one.measured for one in segments])
-        fallback = {"resistance": np.std(volts) / max(np.std(amperes), 1e-9) + 1e-6, "inductance": 1e-4}
-        scales = np.maximum(magnitudes, 0.03 * np.array([fallback.get(name, 1e-3) for name in free]))
+        fallback = {
+            "resistance": np.std(volts) / max(np.std(amperes), 1e-9) + 1e-6,
+            "inductance": 1e-4,
+        }
+        scales = np.maximum(
+            magnitudes, 0.03 * np.array([fallback.get(name, 1e-3) for name in free])
+        )
         starts = [np.where(one > 0.02 * scales, one, scales) for one in starts]
         return dataclasses.replace(self, names=free, scales=scales), starts
 
     def _turning(self, log: Log) -> np.ndarray:
         """Mean speeds till the next row, (n,), 0 if locked: of smoothed positions, or what the shaft does and leaves.
 
-        A smoothed speed lags behind a light rotor, and the back-EMF that it misses would be taken for inductance.
+        A smoothed speed lags behind a light rotor, and the back-EMF that it misses would be taken
+        for inductance.
         """
         found, part = np.zeros(len(log.time)), self.shaft
         for rows in usable(log) if moves(log) else ():
@@ -114,10 +137,16 @@ class WindingModel(Model):
 
 
 def _regressed(
-    columns: np.ndarray, target: np.ndarray, names: Sequence[str], free: Sequence[str], given: Mapping[str, float]
+    columns: np.ndarray,
+    target: np.ndarray,
+    names: Sequence[str],
+    free: Sequence[str],
+    given: Mapping[str, float],
 ) -> np.ndarray:
     """Least squares for the free ones of the columns' factors, the others being given."""
-    rest = target - sum(columns[:, place] * given[name] for place, name in enumerate(names) if name not in free)
+    rest = target - sum(
+        columns[:, place] * given[name] for place, name in enumerate(names) if name not in free
+    )
     matrix = columns[:, [names.index(name) for name in free]]
     norms = np.maximum(np.linalg.norm(matrix, axis=0), 1e-30)
     found = np.linalg.lstsq(matrix / norms, rest, rcond=1e-6)[0]
@@ -157,7 +186,9 @@ class ShaftModel(Model):
         from codrl_mj.identify.simulation import moving
 
         moved, output = self.moved(values), int(self.output == "velocity")
-        return lambda one, state: moving(one.times, one.inputs, one.slopes, state[0], state[1], moved)[output]
+        return lambda one, state: moving(
+            one.times, one.inputs, one.slopes, state[0], state[1], moved
+        )[output]
 
     def segments(self, logs: Sequence[Log], shortest: float = SHAFT_STEP) -> list[Segment]:
         """The logs, cut; rows that are nearer than `shortest` [s] are taken together."""
@@ -190,7 +221,20 @@ class ShaftModel(Model):
                     times, slopes = times[edges], np.zeros(len(edges))
                 state = np.array([angle[rows.start], measured[rows.start]])
                 state = initial_state(log, rows) if output == "position" else state
-                made.append(Segment(place, block, rows, times, drive, slopes, slopes, measured[rows], deviation, state))
+                made.append(
+                    Segment(
+                        place,
+                        block,
+                        rows,
+                        times,
+                        drive,
+                        slopes,
+                        slopes,
+                        measured[rows],
+                        deviation,
+                        state,
+                    )
+                )
         return made
 
     def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
@@ -205,10 +249,15 @@ class ShaftModel(Model):
         firsts = []
         for window in (0.02, 0.004):
             factors, drive, speed = _shaft_regression(segments, self.rig, self.output, window)
-            firsts.append(_shaft_start(factors, drive, speed, driven_by, {**self.defaults, **known}, known))
+            firsts.append(
+                _shaft_start(factors, drive, speed, driven_by, {**self.defaults, **known}, known)
+            )
         start, floors = firsts[0]
         scales = np.array(
-            [floors[name] if name in FRICTION else max(abs(start[name]), floors.get(name, 1e-9)) for name in free]
+            [
+                floors[name] if name in FRICTION else max(abs(start[name]), floors.get(name, 1e-9))
+                for name in free
+            ]
         )
         positive = np.array([PARAMETERS[name].least >= 0.0 for name in free], bool)
         starts = [np.array([one[name] for name in free]) for one, _ in firsts]
@@ -235,7 +284,9 @@ def _shaft_start(
     start = dict(given)
     if driven_by == "voltage":
         if "torque_constant" in known or "resistance" in known:
-            per_volt = _gain_of(factors, known, gain / resistance if "torque_constant" in known else gain)
+            per_volt = _gain_of(
+                factors, known, gain / resistance if "torque_constant" in known else gain
+            )
             resistance = resistance if "resistance" in known else gain / max(per_volt, 1e-9)
         else:  # as if all of what brakes were the back-EMF
             per_volt = gain
@@ -272,7 +323,9 @@ def _shaft_start(
     return start, floors
 
 
-def _gain_of(factors: Mapping[str, float], known: Mapping[str, float], otherwise: float = 1.0) -> float:
+def _gain_of(
+    factors: Mapping[str, float], known: Mapping[str, float], otherwise: float = 1.0
+) -> float:
     """Torque at the output for one of the input, by whatever torque or inertia is known."""
     for name in ("mgl", "constant_torque", "inertia"):
         if known.get(name, 0.0) != 0.0 and factors[name] > 0.0:
@@ -294,14 +347,25 @@ def _shaft_regression(
     for segment in segments:
         times, step = segment.times, float(np.median(np.diff(segment.times)))
         if output == "position":
-            position, speed = segment.measured, speeds(times, segment.measured, times, max(window, 5.0 * step))
+            position, speed = (
+                segment.measured,
+                speeds(times, segment.measured, times, max(window, 5.0 * step)),
+            )
         else:
             position, speed = segment.state[0] + turned(segment.measured, times), segment.measured
-        columns = np.sin(position), np.ones(len(times)), np.sign(speed) * (np.abs(speed) > 0.0), speed, segment.inputs
+        columns = (
+            np.sin(position),
+            np.ones(len(times)),
+            np.sign(speed) * (np.abs(speed) > 0.0),
+            speed,
+            segment.inputs,
+        )
         sums = [turned(one, times) for one in columns]
         edges = np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 2.5 * window))
         edges = np.unique(np.minimum(edges, len(times) - 1))
-        rows.append(np.stack([np.diff(speed[edges]), *(np.diff(one[edges]) for one in sums)], axis=1))
+        rows.append(
+            np.stack([np.diff(speed[edges]), *(np.diff(one[edges]) for one in sums)], axis=1)
+        )
         inputs.append(segment.inputs)
         turning.append(speed)
     table = np.concatenate(rows)

@@ -32,11 +32,15 @@ def fetch(name: str, folder: Path = Path("data")) -> list[Path]:
     """
     sets = published()
     if name not in sets:
-        raise ValueError(f"NAME = {name!r}: {did_you_mean(name, sets)}published are {', '.join(sets)}")
+        raise ValueError(
+            f"NAME = {name!r}: {did_you_mean(name, sets)}published are {', '.join(sets)}"
+        )
     try:
         import pooch
     except ModuleNotFoundError:
-        raise RuntimeError("measurements are fetched by pooch: pip install 'codrl-mj[data]'") from None
+        raise RuntimeError(
+            "measurements are fetched by pooch: pip install 'codrl-mj[data]'"
+        ) from None
     known, place = sets[name], folder / LAYOUT / name
     base = known["source"].replace("https://github.com/", "https://raw.githubusercontent.com/")
     found = []
@@ -44,9 +48,13 @@ def fetch(name: str, folder: Path = Path("data")) -> list[Path]:
     for file, about in known["files"].items():
         url = f"{base}/{known['commit']}/{about['path']}"
         try:
-            found.append(Path(pooch.retrieve(url, f"sha256:{about['sha256']}", fname=file, path=place)))
+            found.append(
+                Path(pooch.retrieve(url, f"sha256:{about['sha256']}", fname=file, path=place))
+            )
         except ValueError as error:  # of another digest
-            raise OSError(f"{url}: is not the file that was published: {' '.join(str(error).split())}") from error
+            raise OSError(
+                f"{url}: is not the file that was published: {' '.join(str(error).split())}"
+            ) from error
         except OSError as error:
             raise OSError(f"{url}: cannot be had: {' '.join(str(error).split())}") from error
     return found

@@ -16,7 +16,15 @@ import numpy as np
 from codrl_mj.identify.columns import Column, parse_columns
 from codrl_mj.identify.log import SIGNALS, Finding, Log, find_resolution
 
-_WORDS = {"": np.nan, "nan": np.nan, "none": np.nan, "null": np.nan, "na": np.nan, "true": 1.0, "false": 0.0}
+_WORDS = {
+    "": np.nan,
+    "nan": np.nan,
+    "none": np.nan,
+    "null": np.nan,
+    "na": np.nan,
+    "true": 1.0,
+    "false": 0.0,
+}
 STAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d")  # seconds since 1970, or since midnight
 _SIGN_BITS = {
     **dict.fromkeys(("duty", "voltage", "torque"), ((11, 1000.0), (16, 8192.0))),
@@ -35,12 +43,16 @@ class Cells(NamedTuple):
     lines: Sequence[int] = ()  # of the file, of each row
     units: Mapping[str, str] = {}  # by column, where a line states them
     commas: bool = False  # whether a number may have a decimal comma
-    entries: Mapping[str, list[str]] = {}  # names of the entries of columns that held lists, such as joints
+    entries: Mapping[
+        str, list[str]
+    ] = {}  # names of the entries of columns that held lists, such as joints
 
     @property
     def labels(self) -> dict[str, str]:
         """Columns by the names of their entries: action[elbow] -> action[1]."""
-        pairs = ((name, *pair) for name, entries in self.entries.items() for pair in enumerate(entries))
+        pairs = (
+            (name, *pair) for name, entries in self.entries.items() for pair in enumerate(entries)
+        )
         return {f"{name}[{entry}]": f"{name}[{place}]" for name, place, entry in pairs}
 
     def numbers(self, name: str) -> np.ndarray:
@@ -61,32 +73,41 @@ class Cells(NamedTuple):
                 else:
                     found[place] = float(text.replace(",", ".") if self.commas else text)
             except ValueError:
-                remedy = "write a decimal point" if "," in text else "leave such rows out, or map another column"
+                remedy = (
+                    "write a decimal point"
+                    if "," in text
+                    else "leave such rows out, or map another column"
+                )
                 where = f"line {self.lines[place]}" if self.lines else f"row {place + 1}"
-                raise ValueError(f"column {name} in {where} is {text!r}, must be a number; {remedy}") from None
+                raise ValueError(
+                    f"column {name} in {where} is {text!r}, must be a number; {remedy}"
+                ) from None
         return found
 
 
 def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
     """A log from a file; what could not be read of it is among the log's findings.
 
-    Rows with missing values, and those whose time does not increase, are left out. Time starts at 0.
+    Rows with missing values, and those whose time does not increase, are left out. Time starts at
+    0.
 
     Args:
-        path: .csv, .txt, .dat, .tsv, .json, any of them .gz, or .parquet. CSV has a line of names, and a comma,
-            semicolon, tab or blanks between values; lines that begin with # or hold one cell are no rows, one without a
-            number under the names is of units. Decimal commas, times of day (ISO 8601) and Latin-1 are read.
-            JSON is a list of rows, or an object with one such list, such as `entries`, and numbers beside it,
-            which formulas can use, or an object of columns. Of a column that holds lists, `column[0]` is the first
-            entry, and `column[elbow]` the one of that name: by `features` in the file, or in meta/info.json of the
-            data set that the file lies in.
-        columns: `signal=formula:unit` separated by commas, or a mapping of signals to `formula:unit`. The voltage is
-            what holds from its row to the next, or `mean(formula)`: the mean in between. `only=formula` leaves out the
-            rows where it is 0.
+        path: .csv, .txt, .dat, .tsv, .json, any of them .gz, or .parquet. CSV has a line of names,
+            and a comma, semicolon, tab or blanks between values; lines that begin with # or hold
+            one cell are no rows, one without a number under the names is of units. Decimal commas,
+            times of day (ISO 8601) and Latin-1 are read. JSON is a list of rows, or an object with
+            one such list, such as `entries`, and numbers beside it, which formulas can use, or an
+            object of columns. Of a column that holds lists, `column[0]` is the first entry, and
+            `column[elbow]` the one of that name: by `features` in the file, or in meta/info.json of
+            the data set that the file lies in.
+        columns: `signal=formula:unit` separated by commas, or a mapping of signals to
+            `formula:unit`. The voltage is what holds from its row to the next, or `mean(formula)`:
+            the mean in between. `only=formula` leaves out the rows where it is 0.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is none of these, lacks a column, has text where a number is needed, or too few rows are left.
+        ValueError: it is none of these, lacks a column, has text where a number is needed, or too
+            few rows are left.
     """
     path, mapping = Path(path), parse_columns(columns)
     if not path.is_file():
@@ -100,76 +121,140 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
 def to_log(name: str, table: Cells, mapping: Mapping[str, Column]) -> Log:
     """Return the log that a file's columns are by a mapping, as `read_log` does."""
     count = len(next(iter(table.columns.values()), ()))
-    numbers = np.setdiff1d(np.arange(1, count + len(table.ragged) + 1), table.ragged)  # of the rows, in the file
+    numbers = np.setdiff1d(
+        np.arange(1, count + len(table.ragged) + 1), table.ragged
+    )  # of the rows, in the file
     labels = table.labels
     used = set().union(*(one.names for one in mapping.values()))
     needed = {labels.get(name, name) for name in used} & table.columns.keys()
-    read = {**dict.fromkeys(table.columns), **table.constants, **{one: table.numbers(one) for one in needed}}
+    read = {
+        **dict.fromkeys(table.columns),
+        **table.constants,
+        **{one: table.numbers(one) for one in needed},
+    }
     read |= {label: read[column] for label, column in labels.items() if column in read}
-    signals = {one: np.broadcast_to(np.asarray(made.value(read), float), (count,)) for one, made in mapping.items()}
+    signals = {
+        one: np.broadcast_to(np.asarray(made.value(read), float), (count,))
+        for one, made in mapping.items()
+    }
     time, wanted = signals.pop("time"), signals.pop("only", np.ones(count)) != 0.0
-    finite = np.isfinite(time) & np.all([np.isfinite(values) for values in signals.values()], axis=0)
+    finite = np.isfinite(time) & np.all(
+        [np.isfinite(values) for values in signals.values()], axis=0
+    )
     rows = np.flatnonzero(wanted & finite)
     forward = time[rows] > np.append(-np.inf, np.maximum.accumulate(time[rows])[:-1])
     findings = [
         *_unsigned(read, mapping, numbers),
-        *_left_out(numbers[wanted & ~finite], "missing", "have no number in some column, and are left out"),
         *_left_out(
-            numbers[rows[~forward]], "stamps", "have a time that is not after the rows before, and are left out"
+            numbers[wanted & ~finite], "missing", "have no number in some column, and are left out"
+        ),
+        *_left_out(
+            numbers[rows[~forward]],
+            "stamps",
+            "have a time that is not after the rows before, and are left out",
         ),
         *(
-            Finding("info", "units", None, f"{one.text}: no unit is given, taken as {SIGNALS[one.signal]}", "")
+            Finding(
+                "info",
+                "units",
+                None,
+                f"{one.text}: no unit is given, taken as {SIGNALS[one.signal]}",
+                "",
+            )
             for one in mapping.values()
             if one.unit is None and SIGNALS.get(one.signal)
         ),
-        *_left_out(np.array(table.ragged), "missing", "have not as many cells as there are columns, and are left out"),
+        *_left_out(
+            np.array(table.ragged),
+            "missing",
+            "have not as many cells as there are columns, and are left out",
+        ),
     ]
     unusable = int((wanted & ~finite).sum() + (~forward).sum())
     rows = rows[forward]
     if rows.size < 2 or unusable > _MOST_UNUSABLE * max(int(wanted.sum()), 1):
         raise ValueError(
-            f"{rows.size} of {int(wanted.sum())} rows can be used, must be 2 or more, and {1.0 - _MOST_UNUSABLE:.0%}: "
-            + ("; ".join(one.message for one in findings if one.severity != "info") or "there are no more")
+            f"{rows.size} of {int(wanted.sum())} rows can be used, must be 2 or more, and"
+            f" {1.0 - _MOST_UNUSABLE:.0%}: "
+            + (
+                "; ".join(one.message for one in findings if one.severity != "info")
+                or "there are no more"
+            )
             + "; check the columns"
         )
     kept = {signal: np.ascontiguousarray(values[rows]) for signal, values in signals.items()}
     resolution = {signal: find_resolution(values) for signal, values in kept.items()}
     mean = "voltage" in mapping and mapping["voltage"].mean
     return Log(
-        name, time[rows] - time[rows[0]], kept, resolution, mean, table.constants, numbers[rows], tuple(findings)
+        name,
+        time[rows] - time[rows[0]],
+        kept,
+        resolution,
+        mean,
+        table.constants,
+        numbers[rows],
+        tuple(findings),
     )
 
 
-def _unsigned(values: Mapping[str, Any], mapping: Mapping[str, Column], numbers: np.ndarray) -> Iterator[Finding]:
+def _unsigned(
+    values: Mapping[str, Any], mapping: Mapping[str, Column], numbers: np.ndarray
+) -> Iterator[Finding]:
     """Find columns that look like registers whose sign is read as part of the number."""
-    unsigned = (one for one in mapping.values() if not re.search("twos_complement|sign_magnitude", one.formula))
+    unsigned = (
+        one
+        for one in mapping.values()
+        if not re.search("twos_complement|sign_magnitude", one.formula)
+    )
     for name, signal in sorted({(name, one.signal) for one in unsigned for name in one.names}):
         column = np.asarray(values[name] if values[name] is not None else 0.0, float)
         for bits in (8, 16, 32):
             whole = 2.0**bits
             high, low = column >= 0.75 * whole, column < 0.25 * whole
-            within = (column >= 0.0) & (column < whole) & (column == np.round(column)) & (high | low)
+            within = (
+                (column >= 0.0) & (column < whole) & (column == np.round(column)) & (high | low)
+            )
             if high.any() and low.any() and np.all(within | np.isnan(column)):
                 row = int(numbers[np.flatnonzero(high)[0]])
-                text = f"{name} is below {whole / 4:.0f} or above {3 * whole / 4:.0f}: has it {bits} bits and a sign?"
-                yield Finding("error", "register", row, text, f"write twos_complement({name}, {bits})")
+                text = (
+                    f"{name} is below {whole / 4:.0f} or above {3 * whole / 4:.0f}: has it {bits}"
+                    " bits and a sign?"
+                )
+                yield Finding(
+                    "error", "register", row, text, f"write twos_complement({name}, {bits})"
+                )
         for bits, largest in _SIGN_BITS.get(signal, ()):
             half = 2.0 ** (bits - 1)
-            high, low = (column >= half) & (column <= half + largest), (column >= 0.0) & (column <= largest)
+            high, low = (
+                (column >= half) & (column <= half + largest),
+                (column >= 0.0) & (column <= largest),
+            )
             within = (column == np.round(column)) & (high | low)
             # a signal that changes its sign passes near 0 on both sides
-            near = [column[one].min() - less <= 0.25 * largest for one, less in ((high, half), (low, 0.0)) if one.any()]
+            near = [
+                column[one].min() - less <= 0.25 * largest
+                for one, less in ((high, half), (low, 0.0))
+                if one.any()
+            ]
             if len(near) == 2 and all(near) and np.all(within | np.isnan(column)):
                 row = int(numbers[np.flatnonzero(high)[0]])
-                text = f"{name} is at most {largest:.0f}, or {half:.0f} and more: is its bit {bits - 1} the sign?"
-                yield Finding("error", "register", row, text, f"write sign_magnitude({name}, {bits})")
+                text = (
+                    f"{name} is at most {largest:.0f}, or {half:.0f} and more: is its bit"
+                    f" {bits - 1} the sign?"
+                )
+                yield Finding(
+                    "error", "register", row, text, f"write sign_magnitude({name}, {bits})"
+                )
 
 
 def _left_out(rows: np.ndarray, check: str, what: str) -> Iterator[Finding]:
     """What is said of rows, by their numbers in the file, from 1."""
     if rows.size:
         text = f"{rows.size} row{'s' if rows.size > 1 else ''}, the first one {rows[0]}, {what}"
-        remedy = "find out why the logger wrote them; sort the file, or cut it, if its clock was set back"
+        remedy = (
+            "find out why the logger wrote them; sort the file, or cut it, if its clock was set"
+            " back"
+        )
         severity, remedy = ("error", remedy) if check == "stamps" else ("warning", "")
         yield Finding(severity, check, int(rows[0]), text, remedy)
 
@@ -179,15 +264,23 @@ def read_table(path: Path) -> Cells:
     table = _read_table(path)
     columns: dict[str, Any] = {}
     for name, values in table.columns.items():
-        lists = [_as_list(value) for value in values] if any(_as_list(value) for value in values[:20]) else []
+        lists = (
+            [_as_list(value) for value in values]
+            if any(_as_list(value) for value in values[:20])
+            else []
+        )
         for entry in range(max((len(one) for one in lists if one), default=0)):
-            columns[f"{name}[{entry}]"] = [one[entry] if one and entry < len(one) else None for one in lists]
+            columns[f"{name}[{entry}]"] = [
+                one[entry] if one and entry < len(one) else None for one in lists
+            ]
         if not lists:
             columns[name] = values
     if len(columns) > len(table.columns) and not table.entries:
         for folder in [*path.absolute().parents][:3]:
             if (info := folder / "meta" / "info.json").is_file():
-                table = table._replace(entries=_entry_names(json.loads(info.read_text(encoding="utf-8"))))
+                table = table._replace(
+                    entries=_entry_names(json.loads(info.read_text(encoding="utf-8")))
+                )
                 break
     return table._replace(columns=columns)
 
@@ -196,7 +289,11 @@ def _as_list(value: Any) -> list[Any] | None:
     """Return a cell's list, also from a text such as `[0.1 2]`; None if it holds none."""
     if isinstance(value, str) and value[:1] == "[" and value[-1:] == "]":
         return value.strip("[]").replace(",", " ").split()
-    return value if isinstance(value, list) and not any(isinstance(one, list | dict) for one in value) else None
+    return (
+        value
+        if isinstance(value, list) and not any(isinstance(one, list | dict) for one in value)
+        else None
+    )
 
 
 def _entry_names(content: Any) -> dict[str, list[str]]:
@@ -219,13 +316,20 @@ def _read_table(path: Path) -> Cells:
         try:
             parquet = importlib.import_module("pyarrow.parquet")
         except ModuleNotFoundError:
-            raise ValueError("reading Parquet needs pyarrow: pip install pyarrow, or save the log as .csv") from None
+            raise ValueError(
+                "reading Parquet needs pyarrow: pip install pyarrow, or save the log as .csv"
+            ) from None
         return Cells(parquet.read_table(path).to_pydict(), {}, [])
     if kind not in (".csv", ".txt", ".dat", ".tsv", ".json"):
-        raise ValueError(f"unknown kind of file {kind!r}, must be .csv, .txt, .dat, .tsv, .json (or .gz) or .parquet")
+        raise ValueError(
+            f"unknown kind of file {kind!r}, must be .csv, .txt, .dat, .tsv, .json (or .gz) or"
+            " .parquet"
+        )
     content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
     try:
-        text = content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+        text = content.decode(
+            "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+        )
     except UnicodeDecodeError:
         text = content.decode("latin-1")  # what instruments write for degrees and ohms
     return _json(json.loads(text)) if kind == ".json" else _csv(text)
@@ -237,35 +341,58 @@ def _csv(text: str) -> Cells:
     bare = [(number, line) for number, line in lines if not line.startswith("#")]
     last = [line for _, line in bare[-20:]]
     usual = [one for one in ";\t," if 2 * sum(one in line for line in last) > len(last)]
-    separator = next((one for _, line in bare for one in usual if one in line), " ")  # the names' own, not a note's
+    separator = next(
+        (one for _, line in bare for one in usual if one in line), " "
+    )  # the names' own, not a note's
     cells = []
     for number, line in bare:
         try:
             row = next(
-                csv.reader([line.strip() if separator == " " else line], delimiter=separator, skipinitialspace=True)
+                csv.reader(
+                    [line.strip() if separator == " " else line],
+                    delimiter=separator,
+                    skipinitialspace=True,
+                )
             )
         except csv.Error as error:
             raise ValueError(f"line {number} is no row of cells: {error}") from None
         cells.append((number, [cell.strip() for cell in row]))
-    common = collections.Counter(len(row) for _, row in cells[-20:]).most_common(1)[0][0] if cells else 0
-    filled = (place for place, (_, row) in enumerate(cells) if len(row) == common and _is_filled(row))
+    common = (
+        collections.Counter(len(row) for _, row in cells[-20:]).most_common(1)[0][0] if cells else 0
+    )
+    filled = (
+        place for place, (_, row) in enumerate(cells) if len(row) == common and _is_filled(row)
+    )
     first = next(filled, len(cells))
     above = [row for _, row in cells[:first] if len(row) > 1 or separator == " "]
     if first == 0 or not above:  # names behind a #, as numpy writes them
         comments = [line.lstrip("# ") for _, line in lines if line.startswith("#")]
-        above = [[cell.strip() for cell in row] for row in csv.reader(comments, delimiter=separator)]
+        above = [
+            [cell.strip() for cell in row] for row in csv.reader(comments, delimiter=separator)
+        ]
         above = [row for row in above if len(row) == common][-1:] or above[-1:]
     units: list[str] = []
     width = len(cells[first][1]) if first < len(cells) else 0
-    if len(above) > 1 and len(above[-1]) == len(above[-2]) == width and all(len(one) < 12 for one in above[-1]):
+    if (
+        len(above) > 1
+        and len(above[-1]) == len(above[-2]) == width
+        and all(len(one) < 12 for one in above[-1])
+    ):
         units = above.pop()
     names = above[-1] if above else []
     if len(named := [one for one in names if one]) > len({*named}) or not named:
-        raise ValueError(f"a line must name the columns, each once, above the numbers; it is {separator.join(names)!r}")
+        raise ValueError(
+            "a line must name the columns, each once, above the numbers; it is"
+            f" {separator.join(names)!r}"
+        )
     rows = cells[first:]
     ragged = [place for place, (_, row) in enumerate(rows, 1) if len(row) != len(names)]
     whole = [row for _, row in rows if len(row) == len(names)]
-    columns = dict(zip(names, zip(*whole, strict=True), strict=True)) if whole else dict.fromkeys(names, ())
+    columns = (
+        dict(zip(names, zip(*whole, strict=True), strict=True))
+        if whole
+        else dict.fromkeys(names, ())
+    )
     kept = [number for number, row in rows if len(row) == len(names)]
     return Cells(columns, {}, ragged, kept, dict(zip(names, units, strict=False)), separator != ",")
 
@@ -292,9 +419,14 @@ def _json(content: Any) -> Cells:
         names = dict.fromkeys(name for row in tables[0] for name in row)
         columns = {name: [row.get(name) for row in tables[0]] for name in names}
         return Cells(columns, constants, [], entries=_entry_names(content))
-    if isinstance(content, dict) and not tables and lists and len({len(one) for one in lists.values()}) == 1:
+    if (
+        isinstance(content, dict)
+        and not tables
+        and lists
+        and len({len(one) for one in lists.values()}) == 1
+    ):
         return Cells(lists, constants, [], entries=_entry_names(content))
     raise ValueError(
-        "JSON must be a list of rows, an object with one such list and numbers beside it, or an object of columns of "
-        "the same length"
+        "JSON must be a list of rows, an object with one such list and numbers beside it, or an"
+        " object of columns of the same length"
     )

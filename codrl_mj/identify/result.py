@@ -32,11 +32,16 @@ def motor_of(base: Mapping[str, Any] | None) -> Any:
 def missing(names: Collection[str], base: Mapping[str, Any] | None) -> str | None:
     """Which numbers of a motor are neither among these nor in a base, and what to do; None: none."""
     motor = motor_of(base)
-    if motor is not None and motor.rotor_inertia == 0.0 and "inertia" in names and "rotor_inertia" not in names:
+    if (
+        motor is not None
+        and motor.rotor_inertia == 0.0
+        and "inertia" in names
+        and "rotor_inertia" not in names
+    ):
         return (
-            "rotor_inertia is unknown (0) in the datasheet, and the logs tell the inertia of all that moves. Give what "
-            "is not the motor's, at the output: --known load_inertia=VALUE; or --known rotor_inertia=0 if the model "
-            "that you train in has all of it"
+            "rotor_inertia is unknown (0) in the datasheet, and the logs tell the inertia of all"
+            " that moves. Give what is not the motor's, at the output: --known load_inertia=VALUE;"
+            " or --known rotor_inertia=0 if the model that you train in has all of it"
         )
     needed = ("resistance", "inductance", "torque_constant", "back_emf_constant", "rotor_inertia")
     lacking = [name for name in needed if name not in names]
@@ -46,9 +51,13 @@ def missing(names: Collection[str], base: Mapping[str, Any] | None) -> str | Non
     remedy = f"--known {flags}, or the motor that has the rest of its numbers with --motor NAME"
     if lacking[-1] == "rotor_inertia":
         remedy += (
-            "; of the inertia that is found give the load's share: --known load_inertia=VALUE, 0 for a motor alone"
+            "; of the inertia that is found give the load's share: --known load_inertia=VALUE, 0"
+            " for a motor alone"
         )
-    return f"{', '.join(lacking)}: these logs say nothing of {'it' if len(lacking) == 1 else 'them'}. Give {remedy}"
+    return (
+        f"{', '.join(lacking)}: these logs say nothing of {'it' if len(lacking) == 1 else 'them'}."
+        f" Give {remedy}"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,9 +94,13 @@ class Trace(NamedTuple):
     starts: np.ndarray  # rows at which pieces begin
 
 
-def traced(log: str, part: str, output: str, segments: Sequence[Segment], made: Sequence[np.ndarray]) -> Trace:
+def traced(
+    log: str, part: str, output: str, segments: Sequence[Segment], made: Sequence[np.ndarray]
+) -> Trace:
     """A trace of segments of a log, beside what a simulation made of each, of shape (m,)."""
-    times, measured = (np.concatenate([getattr(one, name) for one in segments]) for name in ("times", "measured"))
+    times, measured = (
+        np.concatenate([getattr(one, name) for one in segments]) for name in ("times", "measured")
+    )
     starts = np.cumsum([0, *(len(one.times) for one in segments)])[:-1]
     return Trace(log, part, output, times, measured, np.concatenate(made), starts)
 
@@ -115,15 +128,19 @@ def predict(fit: Fit, log: Log) -> Prediction:
         known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
         made.append(simulate(segment, settled_state(model, fit.values, segment.first(known))))
         errors.append(np.abs(made[-1] - segment.measured)[known:])
-    foretold, error = traced(log.name, "shaft", model.output, segments, made), float(np.concatenate(errors).mean())
+    foretold, error = (
+        traced(log.name, "shaft", model.output, segments, made),
+        float(np.concatenate(errors).mean()),
+    )
     return Prediction(log.name, model.output, error, closed_loop_error(fit, log), foretold)
 
 
 def closed_loop_error(fit: Fit, log: Log) -> float | None:
     """Mean absolute error [rad] of a whole log under its own command, by a proportional law found in the log.
 
-    The law is the straight line through the origin from the command's error to the input, where the input is not at
-    its limit: a voltage's `bus`, or the largest that the log has. None where the log has no command that explains it.
+    The law is the straight line through the origin from the command's error to the input, where the
+    input is not at its limit: a voltage's `bus`, or the largest that the log has. None where the
+    log has no command that explains it.
     """
     from codrl_mj.identify.simulation import served
 
@@ -147,7 +164,9 @@ def closed_loop_error(fit: Fit, log: Log) -> float | None:
     moved, found = model.moved(fit.values), []
     for stretch in usable(log):
         position, speed = initial_state(log, stretch)
-        simulated = served(log.time[stretch], wanted[stretch], limits[stretch], law, position, speed, moved)
+        simulated = served(
+            log.time[stretch], wanted[stretch], limits[stretch], law, position, speed, moved
+        )
         found.append(np.abs(simulated - log.signals["position"][stretch]))
     total = float(np.concatenate(found).mean())
     return total if math.isfinite(total) else None
@@ -157,7 +176,11 @@ def fitted_traces(part: str, fit: Fit) -> Iterator[Trace]:
     """The fit of `winding` or `shaft` to each of its logs."""
     for place, log in enumerate(fit.logs):
         pairs = zip(fit.segments, fit.residuals, strict=True)
-        own = [(one, one.measured + residuals * one.deviation) for one, residuals in pairs if one.log == place]
+        own = [
+            (one, one.measured + residuals * one.deviation)
+            for one, residuals in pairs
+            if one.log == place
+        ]
         if own:
             yield traced(log.name, part, fit.model.output, *zip(*own, strict=True))
 
@@ -188,7 +211,9 @@ class Identified:
     """The drive that gives what the logs do not tell, as a mapping; None: none."""
     traces: tuple[Trace, ...] = ()
     """Winding and shaft beside the logs that were fitted; in no file."""
-    correlations: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(default_factory=dict)
+    correlations: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(
+        default_factory=dict
+    )
     """Of the parameters of `winding` and `shaft`, each with each."""
     supply: float | None = None
     """Largest voltage [V] of the supply, or at the terminals, that the logs have; None: they have none."""
@@ -208,17 +233,22 @@ class Identified:
         """What stands against an actuator of these numbers, with a remedy; None: nothing."""
         if self.unexplained > MISUNDERSTOOD:
             return (
-                f"the fit leaves {self.unexplained:.0%} of what moves in a log unexplained, so that numbers mean "
-                "little. Correct the columns, their units and signs, or the rig: codrl-mj identify check"
+                f"the fit leaves {self.unexplained:.0%} of what moves in a log unexplained, so that"
+                " numbers mean little. Correct the columns, their units and signs, or the rig:"
+                " codrl-mj identify check"
             )
         bad = [one for one in self.estimates if one.name in OF_MOTOR and one.status not in USABLE]
         alike: dict[str, list[str]] = {}
         for one in bad:
             alike.setdefault(f"{one.status}: {one.why}", []).append(one.name)
-        told = "; ".join(f"{', '.join(s)} {'is' if len(s) == 1 else 'are'} {why}" for why, s in alike.items())
+        told = "; ".join(
+            f"{', '.join(s)} {'is' if len(s) == 1 else 'are'} {why}" for why, s in alike.items()
+        )
         if bad:
             them = "it" if len(bad) == 1 else "them"
-            return f"{told}. Give {them} with --known {' '.join(f'{one.name}=VALUE' for one in bad)}"
+            return (
+                f"{told}. Give {them} with --known {' '.join(f'{one.name}=VALUE' for one in bad)}"
+            )
         return missing([one.name for one in self.estimates], self.base)
 
     @property
@@ -230,7 +260,10 @@ class Identified:
         if self.base is not None:
             of = "the motor's, by --motor"
         elif self.supply is not None:
-            of = f"the largest of the logs; no current limit: set controller.max_current in {ACTUATOR}"
+            of = (
+                "the largest of the logs; no current limit: set controller.max_current in"
+                f" {ACTUATOR}"
+            )
         return f"supply {volts:.4g} V: {of}"
 
     @property
@@ -240,8 +273,16 @@ class Identified:
         if motor is None or self.problem() is not None:
             return None
         own = {*DEFAULTS, *(one.name for one in self.estimates)}
-        told = [f"{name} = {getattr(motor, name):.4g} {PARAMETERS[name].unit}" for name in OF_MOTOR if name not in own]
-        return f"not from these logs but the motor's, by --motor: {', '.join(map(str.strip, told))}" if told else None
+        told = [
+            f"{name} = {getattr(motor, name):.4g} {PARAMETERS[name].unit}"
+            for name in OF_MOTOR
+            if name not in own
+        ]
+        return (
+            f"not from these logs but the motor's, by --motor: {', '.join(map(str.strip, told))}"
+            if told
+            else None
+        )
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """Field of a drive -> interval, of what is used and is not a point."""
@@ -264,7 +305,9 @@ class Identified:
             raise ValueError(problem)
         own = None if self.supply is None else Supply(self.supply)
         base = Drive(supply=own) if self.base is None else actuator_from_mapping(self.base)
-        return base.replaced({f"motor.{one.name}": one.value for one in self.estimates if one.name in OF_MOTOR})
+        return base.replaced(
+            {f"motor.{one.name}": one.value for one in self.estimates if one.name in OF_MOTOR}
+        )
 
     def as_mapping(self) -> dict[str, Any]:
         """As JSON-serialisable values."""
@@ -278,8 +321,8 @@ class Identified:
     def write(self, folder: Path) -> list[Path]:
         """Write result.json and, without a problem, actuator.yaml into a folder, whole or not at all.
 
-        The actuator's file has a drive's fields and `identified`: their intervals. With a problem, an actuator.yaml of
-        an earlier fit is removed, because it would be taken for this one's.
+        The actuator's file has a drive's fields and `identified`: their intervals. With a problem,
+        an actuator.yaml of an earlier fit is removed, because it would be taken for this one's.
 
         Returns:
             The paths of the files written.

@@ -27,10 +27,15 @@ def _resolution(log: Log, signal: str) -> Iterator[Finding]:
         return
     spread = float(np.ptp(values))
     if spread < 100.0 * step if signal == "position" else step > 0.1 * float(np.std(values)):
-        text = f"{signal} is known to {step:.3g} {unit} and spans {spread:.3g} {unit}, {spread / step:.0f} steps"
+        text = (
+            f"{signal} is known to {step:.3g} {unit} and spans {spread:.3g} {unit},"
+            f" {spread / step:.0f} steps"
+        )
         remedies = {
             "position": "move further, or use a finer encoder",
-            "velocity": "leave it out and give the position, or smooth it over several ms and give that",
+            "velocity": (
+                "leave it out and give the position, or smooth it over several ms and give that"
+            ),
         }
         remedy = remedies.get(signal, "measure in a smaller range, or drive harder")
         yield Finding("warning", "resolution", None, text, remedy)
@@ -46,7 +51,10 @@ def _repeated(log: Log, signal: str) -> Iterator[Finding]:
     every, size = float(np.median(np.diff(changes))), float(np.median(np.abs(steps[changes])))
     if every >= 2.0 and size > 2.5 * log.resolution.get(signal, 0.0):
         unit = SIGNALS[signal]
-        text = f"{signal} changes in every {every:.0f}th row only, by {size:.3g} {unit}: rows repeat old values"
+        text = (
+            f"{signal} changes in every {every:.0f}th row only, by {size:.3g} {unit}: rows repeat"
+            " old values"
+        )
         remedy = "log a row when a value is read, or leave out the rows that repeat it"
         yield Finding("warning", "repeated", int(log.row_numbers[changes[0] + 1]), text, remedy)
 
@@ -62,8 +70,14 @@ def _saturation(log: Log, signal: str) -> Iterator[Finding]:
         # flat tops in the middle of motion; a signal that rests at 0 is not clipped there
         if at.sum() >= 10 and at.sum() > 3 * beside.sum() and abs(bound) > 0.2 * spread:
             row = int(log.row_numbers[np.flatnonzero(at)[0]])
-            text = f"{int(at.sum())} rows are at the {name} {signal}, {bound:.4g} {SIGNALS[signal]}, the first one here"
-            remedy = "if the sensor is clipped there, measure in a larger range, or leave these rows out with only="
+            text = (
+                f"{int(at.sum())} rows are at the {name} {signal}, {bound:.4g} {SIGNALS[signal]},"
+                " the first one here"
+            )
+            remedy = (
+                "if the sensor is clipped there, measure in a larger range, or leave these rows out"
+                " with only="
+            )
             yield Finding("warning", "saturation", row, text, remedy)
 
 
@@ -75,7 +89,9 @@ def _outliers(log: Log, signal: str) -> Iterator[Finding]:
     before, after = np.diff(values)[:-1], np.diff(values)[1:]
     height = np.where(before * after < 0.0, np.minimum(np.abs(before), np.abs(after)), 0.0)
     if log.has("voltage"):  # where that jumps, the current may have a peak
-        jumps = np.abs(np.diff(log.signals["voltage"])) > 0.05 * float(np.ptp(log.signals["voltage"]))
+        jumps = np.abs(np.diff(log.signals["voltage"])) > 0.05 * float(
+            np.ptp(log.signals["voltage"])
+        )
         near = np.convolve(jumps, np.ones(5), mode="same") > 0.0
         height[near[:-1] | near[1:]] = 0.0
     peaks = height[height > 0.0]
@@ -86,7 +102,13 @@ def _outliers(log: Log, signal: str) -> Iterator[Finding]:
     wild = np.flatnonzero(height > bound) + 1
     if wild.size:
         rows = ", ".join(str(log.row_numbers[row]) for row in wild[:5])
-        text = f"{signal} leaves both its neighbours by over {bound:.3g} {SIGNALS[signal]} in {wild.size} rows ({rows})"
-        remedy = "nothing up to 1 % of the rows, which a robust fit bears; else find out where they come from"
+        text = (
+            f"{signal} leaves both its neighbours by over {bound:.3g} {SIGNALS[signal]} in"
+            f" {wild.size} rows ({rows})"
+        )
+        remedy = (
+            "nothing up to 1 % of the rows, which a robust fit bears; else find out where they come"
+            " from"
+        )
         severity = "info" if wild.size / len(values) <= 0.01 else "warning"
         yield Finding(severity, "outliers", int(log.row_numbers[wild[0]]), text, remedy)

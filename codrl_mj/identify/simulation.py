@@ -1,8 +1,8 @@
 """A motor's winding and shaft, stepped by the time stamps of a log, for fits and for logs that are made alike.
 
-Friction is that of `GearMotor`: what `codrl_mj.actuators.shaft.friction` takes from the motor's torque, and then
-Coulomb friction, which stops the shaft and holds it, as MuJoCo's constraint does. So fitted numbers mean there what
-they mean here.
+Friction is that of `GearMotor`: what `codrl_mj.actuators.shaft.friction` takes from the motor's
+torque, and then Coulomb friction, which stops the shaft and holds it, as MuJoCo's constraint does.
+So fitted numbers mean there what they mean here.
 """
 
 import math
@@ -32,7 +32,9 @@ class Moved(NamedTuple):
     stribeck_exponent: float  # what `GearMotor.stribeck_exponent` is
     rotor_inertia: float  # not used where the inertia is known; `shaft.friction` asks for it
     gain: float  # torque [N*m] for one of the input
-    braking: float  # torque [N*m] that the motor loses for one [rad/s]: kT*kE/R where the input is a voltage, else 0
+    # torque [N*m] that the motor loses for one [rad/s]: kT*kE/R where the input is a voltage, else
+    # 0
+    braking: float
 
 
 def moved(number: Mapping[str, float], gain: float, braking: float = 0.0) -> Moved:
@@ -84,13 +86,15 @@ def turned(
 ) -> tuple[float, float]:
     """Position [rad] and speed [rad/s] after a duration [s] under an input that grows by `slope` [1/s].
 
-    Gravity acts in the middle of a substep, and viscous friction by its mean speed: both to second order; dry friction
-    is an implicit step, and never chatters.
+    Gravity acts in the middle of a substep, and viscous friction by its mean speed: both to second
+    order; dry friction is an implicit step, and never chatters.
     """
     pieces = max(math.ceil(duration / LONGEST_SUBSTEP - 1e-6), 1)
     step = duration / pieces
     damped = 0.5 * step * (moved.viscous + moved.braking) / moved.inertia
-    inertia = moved.inertia * (1.0 + damped)  # as dry friction finds it, so that it ends where torques balance
+    inertia = moved.inertia * (
+        1.0 + damped
+    )  # as dry friction finds it, so that it ends where torques balance
     for piece in range(pieces):
         position += 0.5 * step * speed
         driving = moved.gain * (given + slope * (piece + 0.5) * step)
@@ -98,7 +102,9 @@ def turned(
         if moved.gravity != 0.0:  # a sine takes as long as all the rest
             others -= moved.gravity * math.sin(position)
         free = (speed * (1.0 - damped) + step * (driving + others) / moved.inertia) / (1.0 + damped)
-        if moved.gear_efficiency < 1.0 or moved.stribeck_friction > 0.0:  # of the torque after back-EMF
+        if (
+            moved.gear_efficiency < 1.0 or moved.stribeck_friction > 0.0
+        ):  # of the torque after back-EMF
             torque = driving - 0.5 * moved.braking * (speed + free)
             rest = (free - speed) / step - torque / inertia
             free -= step * _friction(moved, step, torque, _Shaft(inertia, rest, speed)) / inertia
@@ -110,13 +116,20 @@ def turned(
 
 @njit(nogil=True, error_model="numpy")
 def moving(
-    times: np.ndarray, inputs: np.ndarray, slopes: np.ndarray, position: float, speed: float, moved: Any
+    times: np.ndarray,
+    inputs: np.ndarray,
+    slopes: np.ndarray,
+    position: float,
+    speed: float,
+    moved: Any,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and speeds at the times, each (n,), under inputs[k] + slopes[k]*(t - times[k]) between two rows."""
     positions, speeds = np.empty(len(times)), np.empty(len(times))
     positions[0], speeds[0] = position, speed
     for row in range(len(times) - 1):
-        position, speed = turned(times[row + 1] - times[row], inputs[row], slopes[row], position, speed, moved)
+        position, speed = turned(
+            times[row + 1] - times[row], inputs[row], slopes[row], position, speed, moved
+        )
         positions[row + 1], speeds[row + 1] = position, speed
     return positions, speeds
 
@@ -143,12 +156,19 @@ def served(
 
 @njit(nogil=True, error_model="numpy")
 def driven(
-    period: float, shares: np.ndarray, limit: float, sag: float, parts: Any, locked: bool, position: float
+    period: float,
+    shares: np.ndarray,
+    limit: float,
+    sag: float,
+    parts: Any,
+    locked: bool,
+    position: float,
 ) -> np.ndarray:
     """Voltage, current, speed and position of the output, and bus voltage of a drive at each sample, shape (n, 5).
 
-    The winding is exact between the samples, at the speed in their middle; the shaft moves half a sample before and
-    half a sample after it (Strang's splitting, of second order). `parts` are (R, L, kE at the output), and a `Moved`.
+    The winding is exact between the samples, at the speed in their middle; the shaft moves half a
+    sample before and half a sample after it (Strang's splitting, of second order). `parts` are (R,
+    L, kE at the output), and a `Moved`.
     """
     states = np.empty((len(shares), 5))
     (resistance, inductance, constant), moved = parts

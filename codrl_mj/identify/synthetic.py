@@ -1,8 +1,8 @@
 """Logs that are computed: a drive of ours under a voltage, through sensors and a sampler, with faults to order.
 
-Voltages are pure functions of time. Slow turning shows resistance, back-EMF and friction; only what changes within the
-winding's time constant L/R shows the inductance. PRBS: a pseudo-random binary sequence, white up to its clock. Source:
-Ljung, *System Identification* (2nd ed. 1999), sec. 13.3.
+Voltages are pure functions of time. Slow turning shows resistance, back-EMF and friction; only what
+changes within the winding's time constant L/R shows the inductance. PRBS: a pseudo-random binary
+sequence, white up to its clock. Source: Ljung, *System Identification* (2nd ed. 1999), sec. 13.3.
 """
 
 import dataclasses
@@ -50,7 +50,9 @@ class Excitation(Checked):
     def voltage(self, time: np.ndarray) -> np.ndarray:
         """[V], of the shape of time [s]; 0 after the duration."""
         time = np.asarray(time, dtype=float)
-        return self.amplitude * np.where(time < self.duration, EXCITATIONS[self.kind](self, time), 0.0)
+        return self.amplitude * np.where(
+            time < self.duration, EXCITATIONS[self.kind](self, time), 0.0
+        )
 
 
 def _slow_sine(excitation: Excitation, time: np.ndarray) -> np.ndarray:
@@ -71,7 +73,10 @@ EXCITATIONS: dict[str, Callable[[Excitation, np.ndarray], np.ndarray]] = {
     "square": lambda one, time: np.where((one.frequency * time) % 1.0 < 0.5, 1.0, -1.0),
     # its frequency grows in proportion to time
     "chirp": lambda one, time: np.sin(
-        2.0 * math.pi * (one.frequency + 0.5 * (one.highest - one.frequency) * time / one.duration) * time
+        2.0
+        * math.pi
+        * (one.frequency + 0.5 * (one.highest - one.frequency) * time / one.duration)
+        * time
     ),
     "prbs": lambda one, time: 0.5 * _bits(one, time) + 0.5 * _slow_sine(one, time),
     "locked_prbs": _bits,  # with the shaft held
@@ -94,8 +99,19 @@ class Load(Checked):
 
 
 FREE = Load()  # nothing but the rotor
-SEEN = "current", "position", "velocity", "torque", "bus", "voltage", "duty"  # what a simulated log has
-_SAMPLE_SIZE, _ROW_SIZE = 80, 200  # memory [bytes] of a drive's sample, and of a row until it is written, as measured
+SEEN = (
+    "current",
+    "position",
+    "velocity",
+    "torque",
+    "bus",
+    "voltage",
+    "duty",
+)  # what a simulated log has
+_SAMPLE_SIZE, _ROW_SIZE = (
+    80,
+    200,
+)  # memory [bytes] of a drive's sample, and of a row until it is written, as measured
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +137,9 @@ class Sensor(Checked):
         wrong = random.random(len(values)) < self.outliers
         off = random.uniform(3.0, 10.0, len(values)) * random.choice([-1.0, 1.0], len(values))
         seen = seen + np.where(wrong, off * float(np.std(seen)), 0.0)
-        return seen if self.resolution == 0.0 else self.resolution * np.round(seen / self.resolution)
+        return (
+            seen if self.resolution == 0.0 else self.resolution * np.round(seen / self.resolution)
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,11 +156,13 @@ class Sampler(Checked):
     """Whether the voltage is the mean from a row to the next, and not what it is at the row."""
 
 
-def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, position: float = 0.0) -> Log:
+def run(
+    drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, position: float = 0.0
+) -> Log:
     """What a drive does, without its loop, under a voltage, or its values [V] in each sample, from standstill.
 
-    A row is a sample of the drive, its `command` the voltage [V] asked for. A bridge makes the voltage u of a share
-    d = u/V of the supply, which sags by its resistance times d*i.
+    A row is a sample of the drive, its `command` the voltage [V] asked for. A bridge makes the
+    voltage u of a share d = u/V of the supply, which sags by its resistance times d*i.
     """
     from codrl_mj.identify.simulation import driven, moved
 
@@ -152,16 +172,23 @@ def run(drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, po
         locked = locked or excitation.locked
         excitation = excitation.voltage(sample_times(drive, excitation.duration))
     commanded = np.clip(excitation, -limit, limit)
-    shares = np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
+    shares = (
+        np.sign(commanded) * np.maximum(np.abs(commanded) - drive.controller.deadband, 0.0) / limit
+    )
     resistance = resistance_at(motor, motor.ambient_temperature)
     winding = resistance, motor.inductance, motor.back_emf_constant * motor.gear_ratio
     inertia = motor.rotor_inertia * motor.gear_ratio**2 + load.inertia
     if not inertia > 0.0 and not locked:
         raise ValueError(
-            f"motor.rotor_inertia = {motor.rotor_inertia:g} and load.inertia = {load.inertia:g}: one must be > 0; "
-            "give the load its inertia, or lock the shaft"
+            f"motor.rotor_inertia = {motor.rotor_inertia:g} and load.inertia = {load.inertia:g}:"
+            " one must be > 0; give the load its inertia, or lock the shaft"
         )
-    numbers = {**vars(motor), "inertia": inertia, "mgl": load.gravity, "constant_torque": load.against}
+    numbers = {
+        **vars(motor),
+        "inertia": inertia,
+        "mgl": load.gravity,
+        "constant_torque": load.against,
+    }
     parts = winding, moved(numbers, motor.torque_constant * motor.gear_ratio)
     states = driven(period, shares, float(limit), float(drive.sag), parts, locked, float(position))
     names = "voltage", "current", "velocity", "position", "bus"
@@ -196,7 +223,8 @@ def simulate(
 ) -> Log:
     """A log of a drive with all that can be logged, from a `position` [rad] on, under a voltage as `run` takes it.
 
-    Signals without a sensor show what is. The voltage is the one asked for, without sag; the torque n*kT*i.
+    Signals without a sensor show what is. The voltage is the one asked for, without sag; the torque
+    n*kT*i.
     """
     if isinstance(excitation, Excitation):
         check_size(drive, excitation.duration, sampler.rate)
@@ -205,7 +233,9 @@ def simulate(
     random = np.random.default_rng(seed)
     period = 1.0 / sampler.rate
     time = period * np.arange(math.floor(course.time[-1] / period + 1e-9) + 1)
-    time[1:-1] += period * sampler.jitter * np.clip(random.standard_normal(max(len(time) - 2, 0)), -3.0, 3.0)
+    time[1:-1] += (
+        period * sampler.jitter * np.clip(random.standard_normal(max(len(time) - 2, 0)), -3.0, 3.0)
+    )
     time = np.maximum.accumulate(time + 1e-9 * period * np.arange(len(time)))  # rows never swap
     torque = drive.motor.gear_ratio * drive.motor.torque_constant * course.signals["current"]
     commanded, known = course.signals["command"], {**course.signals, "torque": torque}
@@ -215,7 +245,9 @@ def simulate(
         sensor = (sensors or {}).get(signal, Sensor())
         past = time - sensor.delay
         if signal in ("voltage", "duty"):  # what was asked for holds for a sample of the drive
-            places = np.clip(np.floor(past / course.time[1] + 1e-6).astype(int), 0, len(commanded) - 1)
+            places = np.clip(
+                np.floor(past / course.time[1] + 1e-6).astype(int), 0, len(commanded) - 1
+            )
             values = commanded[places]
             if sampler.mean_voltage:
                 values[:-1] = np.diff(np.interp(past, course.time, flux)) / np.diff(past)
@@ -227,7 +259,9 @@ def simulate(
     kept[[0, -1]] = True
     found = {signal: values[kept] for signal, values in found.items()}
     resolution = {signal: (sensors or {}).get(signal, Sensor()).resolution for signal in found}
-    return Log(name, time[kept], found, resolution, sampler.mean_voltage, rows=np.flatnonzero(kept) + 1)
+    return Log(
+        name, time[kept], found, resolution, sampler.mean_voltage, rows=np.flatnonzero(kept) + 1
+    )
 
 
 def write_log(path: Path, log: Log) -> str:
@@ -236,5 +270,7 @@ def write_log(path: Path, log: Log) -> str:
     table = np.column_stack([log.time, *log.signals.values()])
     with writing(path) as temporary:
         np.savetxt(temporary, table, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
-    texts = {name: f"mean({name})" if log.mean_voltage and name == "voltage" else name for name in names}
+    texts = {
+        name: f"mean({name})" if log.mean_voltage and name == "voltage" else name for name in names
+    }
     return ",".join(f"{name}={text}:{KINDS[name] or '1'}" for name, text in texts.items())

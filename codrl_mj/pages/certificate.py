@@ -20,22 +20,31 @@ def html(certificate: Certificate, caught: Sequence[Caught] = ()) -> str:
     """The page of what was found, and of what mutations did, if they were tried."""
     top = [page.judged(certificate.passed, certificate.verdict, "p", "verdict")]
     if certificate.quick:
-        top.append(page.note("The quick form: fewer states, runs and step sizes than in the full one."))
+        top.append(
+            page.note("The quick form: fewer states, runs and step sizes than in the full one.")
+        )
     top.append(
         page.paragraph(
-            "Each check has an oracle, a tolerance, and the worst case that was found. The margin is tolerance over "
-            "worst case: a check passes while it is at least 1."
+            "Each check has an oracle, a tolerance, and the worst case that was found. The margin"
+            " is tolerance over worst case: a check passes while it is at least 1."
         )
     )
     software = page.definitions(versions().items())
     top.append(page.folded(f"Made in {certificate.seconds:.0f} s, with this software", software))
     sections = [_group(name, title, certificate) for name, title in GROUPS.items()]
     skipped = [(skip.name, skip.group, skip.reason) for skip in certificate.skipped]
-    left = page.table("What was not checked", ("what", "group", "why"), skipped, cards=True) if skipped else Markup()
+    left = (
+        page.table("What was not checked", ("what", "group", "why"), skipped, cards=True)
+        if skipped
+        else Markup()
+    )
     sections += [_mutations(certificate, caught)] if caught else []
     sections.append(page.Section("skipped", "Not checked", left))
     return page.page(
-        f"Is the port right? {certificate.subject}", "Certificate of validation", page.joined(top), sections
+        f"Is the port right? {certificate.subject}",
+        "Certificate of validation",
+        page.joined(top),
+        sections,
     )
 
 
@@ -49,8 +58,18 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
         failed = (place for place, check in enumerate(own) if not check.passed)
         rows = [
             (
-                *(check.name, check.oracle, f"{check.samples:,}", f"{check.worst:.2g}", f"{check.tolerance:.2g}"),
-                *(check.margin, check.unit, f"{check.where}. {check.fault}" if check.fault else check.where),
+                *(
+                    check.name,
+                    check.oracle,
+                    f"{check.samples:,}",
+                    f"{check.worst:.2g}",
+                    f"{check.tolerance:.2g}",
+                ),
+                *(
+                    check.margin,
+                    check.unit,
+                    f"{check.where}. {check.fault}" if check.fault else check.where,
+                ),
                 page.judged(check.passed, "passed" if check.passed else "FAILED"),
             )
             for check in own
@@ -58,14 +77,19 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
         body.append(page.table(caption, _CHECKS, rows, range(2, 6), True, failed))
         body.append(page.plots(plot for check in own for plot in check.plots))
     good = sum(check.passed for check in checks)
-    mark = Markup("({})").format(page.judged(good == len(checks), f"{good} of {len(checks)}", "span"))
+    mark = Markup("({})").format(
+        page.judged(good == len(checks), f"{good} of {len(checks)}", "span")
+    )
     return page.Section(name, name.capitalize(), page.joined(body), mark)
 
 
 def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Section:
     rows = []
     for one in caught:
-        clearest, cells = one.clearest, [one.mutation, one.task or "the motor", f"{len(one.failed)} of {one.made}"]
+        clearest, cells = (
+            one.clearest,
+            [one.mutation, one.task or "the motor", f"{len(one.failed)} of {one.made}"],
+        )
         found = ["none", "", "", ""]
         if clearest is not None:
             values = (clearest.worst, clearest.tolerance, clearest.beyond)
@@ -77,8 +101,9 @@ def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Secti
     told = "; ".join(f"{check.group}, {check.task}: {check.name}" for check in blind)
     body = (
         page.paragraph(
-            "The certificate put to the test: each fault was made on purpose, and the quick checks were run with it. "
-            "“Beyond” is how many times its tolerance the clearest of the failed checks was."
+            "The certificate put to the test: each fault was made on purpose, and the quick checks"
+            " were run with it. “Beyond” is how many times its tolerance the clearest of the failed"
+            " checks was."
         ),
         page.table(
             "Faults made on purpose",
@@ -88,9 +113,13 @@ def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Secti
             cards=True,
             failed=(place for place, one in enumerate(caught) if not one.failed),
         ),
-        page.note(f"✗ No fault fails these checks: {told}", bad=True)
-        if blind
-        else page.paragraph("Every check of the certificate is failed by at least one of the faults."),
+        (
+            page.note(f"✗ No fault fails these checks: {told}", bad=True)
+            if blind
+            else page.paragraph(
+                "Every check of the certificate is failed by at least one of the faults."
+            )
+        ),
     )
     return page.Section("mutations", "Mutations", page.joined(body))
 
@@ -108,15 +137,25 @@ def summary(content: Mapping[str, Any]) -> Markup:
     return page.joined(
         (
             page.judged(passed, whole, "p", "verdict"),
-            page.paragraph(f"Of {content['subject']}, made {content['made']}{', the quick form' * content['quick']}."),
+            page.paragraph(
+                f"Of {content['subject']}, made"
+                f" {content['made']}{', the quick form' * content['quick']}."
+            ),
             page.table("Checks passed", ("group", "what", "passed"), rows, numbers=(2,)),
         )
     )
 
 
-def write(certificate: Certificate, folder: Path, caught: Sequence[Caught] = ()) -> tuple[Path, Path]:
+def write(
+    certificate: Certificate, folder: Path, caught: Sequence[Caught] = ()
+) -> tuple[Path, Path]:
     """Write `certificate.json` and `certificate.html` into a folder, whole or not at all; older ones are replaced."""
-    text = json.dumps(certificate.as_mapping() | as_mapping(certificate, caught), indent=2, allow_nan=False) + "\n"
+    text = (
+        json.dumps(
+            certificate.as_mapping() | as_mapping(certificate, caught), indent=2, allow_nan=False
+        )
+        + "\n"
+    )
     found = html(certificate, caught)
     check_writable(folder)
     with writing(folder / JSON_NAME) as json_file, writing(folder / HTML_NAME) as html_file:

@@ -57,9 +57,13 @@ def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Sh
             panel = record(policy, env, seed, *_SIZE)
             episode = panel.episode
             film = clip(panel, *_SIZE)
-        except Exception as error:  # each renderer raises its own kind, and so do libraries that are not installed
+        except (
+            Exception
+        ) as error:  # each renderer raises its own kind, and so do libraries that are not installed
             problem = f"{type(error).__name__}: {error}"
-    return Shown(name, env, episode or run_episodes(policy, env.make, 1, seed)[0], film, problem, seed)
+    return Shown(
+        name, env, episode or run_episodes(policy, env.make, 1, seed)[0], film, problem, seed
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,13 +87,18 @@ class _MotorLine(Driven):
         """Whether its family has these signals."""
         return not isinstance(self.actuator, Ideal) and set(names) <= self.signals.keys()
 
-    def curve(self, label: str, values: np.ndarray, colour: int, held: bool = True, dashed: bool = False) -> Curve:
+    def curve(
+        self, label: str, values: np.ndarray, colour: int, held: bool = True, dashed: bool = False
+    ) -> Curve:
         """A curve over the integration steps; what is held begins with them, what is not is at their ends."""
         kept = slice(None, None, self.stride)
         values = np.asarray(values, dtype=float)
         time = self.timestep * (np.arange(len(values)) + (not held))
         if held:
-            time, values = np.append(time[kept], time[-1] + self.timestep), np.append(values[kept], values[-1])
+            time, values = (
+                np.append(time[kept], time[-1] + self.timestep),
+                np.append(values[kept], values[-1]),
+            )
         else:
             time, values = time[kept], values[kept]
         style: Any = {"style": "step" if held else "line", "colour": colour, "dashed": dashed}
@@ -101,16 +110,30 @@ def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Ma
     motors = list(dict.fromkeys(name for one in shown for name in one.episode.motors or ("motor",)))
     lines = _lines(shown, motors)
     end = max(float(one.episode.time[-1]) for one in shown)
-    films = [page.part("film", _caption(one, len(shown) > 1), *one.film) for one in shown if one.film is not None]
-    boxes = [page.part("selector", "Runs", "run", [one.name for one in shown], None)] if len(shown) > 1 else []
+    films = [
+        page.part("film", _caption(one, len(shown) > 1), *one.film)
+        for one in shown
+        if one.film is not None
+    ]
+    boxes = (
+        [page.part("selector", "Runs", "run", [one.name for one in shown], None)]
+        if len(shown) > 1
+        else []
+    )
     if len(motors) > 1:
-        boxes.append(page.part("selector", "Motors", "motor", motors, 0 if len(motors) > _MANY else None))
-    notes = [page.note(f"No film of {one.name}: {one.problem}") for one in shown if one.film is None]
+        boxes.append(
+            page.part("selector", "Motors", "motor", motors, 0 if len(motors) > _MANY else None)
+        )
+    notes = [
+        page.note(f"No film of {one.name}: {one.problem}") for one in shown if one.film is None
+    ]
     stage = [
         *notes,
         Markup('<div class="pinned">{}{}</div>').format(
             Markup('<div class="films">{}</div>').format(page.joined(films)) if films else "",
-            page.part("transport", f"{end:.6g}", f"{min(float(one.episode.time[0]) for one in shown):.6g}"),
+            page.part(
+                "transport", f"{end:.6g}", f"{min(float(one.episode.time[0]) for one in shown):.6g}"
+            ),
         ),
         Markup('<div class="selectors">{}</div>').format(page.joined(boxes)) if boxes else Markup(),
         *joined,
@@ -121,17 +144,19 @@ def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Ma
     right = [page.plot(one, low=True) for one in (*_motor_plots(lines), *_run_plots(shown))]
     ends = [page.paragraph(_caption(one, True), "soft") for one in shown] if not films else []
     if lines and lines[0].stride > 1:
-        ends.append(page.paragraph(f"Plots have every {lines[0].stride}th integration step.", "soft"))
+        ends.append(
+            page.paragraph(f"Plots have every {lines[0].stride}th integration step.", "soft")
+        )
     return page.joined(
         (
             page.paragraph(
-                "Film and plots share a clock: play the film, or drag in any plot over time. Torque, current and speed "
-                "are the motor's own, at its shaft."
+                "Film and plots share a clock: play the film, or drag in any plot over time."
+                " Torque, current and speed are the motor's own, at its shaft."
             ),
             *ends,
-            Markup('<div class="episode"><div class="stage">{}</div><div class="stack">{}</div></div>').format(
-                page.joined(stage), page.joined(right)
-            ),
+            Markup(
+                '<div class="episode"><div class="stage">{}</div><div class="stack">{}</div></div>'
+            ).format(page.joined(stage), page.joined(right)),
         )
     )
 
@@ -139,13 +164,18 @@ def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Ma
 def _caption(one: Shown, named: bool) -> str:
     episode = one.episode
     over = f"{'ended' if episode.terminated else 'time limit'} at {episode.time[-1]:.2f} s"
-    found = f"{one.name + ': ' if named else ''}seed {one.seed}, return {page.number(episode.total)}, {over}"
+    found = (
+        f"{one.name + ': ' if named else ''}seed {one.seed}, return {page.number(episode.total)},"
+        f" {over}"
+    )
     return f"{found}; {one.rank}" if one.rank else found
 
 
 def _lines(shown: Sequence[Shown], motors: list[str]) -> list[_MotorLine]:
     """Every motor of every run; by the names of all."""
-    pairs = [(one, number, motor) for one in shown for number, motor in enumerate(driven_in(one.episode))]
+    pairs = [
+        (one, number, motor) for one in shown for number, motor in enumerate(driven_in(one.episode))
+    ]
     most = max(POINTS // 4, _BUDGET // (10 * len(pairs)))
     stride = max(-(-len(one.episode.trace["speed"]) // most) for one in shown)
     made = []
@@ -155,7 +185,13 @@ def _lines(shown: Sequence[Shown], motors: list[str]) -> list[_MotorLine]:
         tags = f"run:{shown.index(one)}", f"motor:{motors.index(names[number])}"
         before = f"{', '.join(words)}: " if words else ""
         made.append(
-            _MotorLine(**vars(motor), before=before, place=place if len(pairs) > 1 else None, tags=tags, stride=stride)
+            _MotorLine(
+                **vars(motor),
+                before=before,
+                place=place if len(pairs) > 1 else None,
+                tags=tags,
+                stride=stride,
+            )
         )
     return made
 
@@ -168,7 +204,11 @@ def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
     ideal = [isinstance(line.actuator, Ideal) for line in lines]
     force, unit = all(ideal), "torque [N·m]"
     if any(ideal):
-        unit = "force [N] or torque [N·m]" if force else "torque [N·m], of the ideal actuator force [N]"
+        unit = (
+            "force [N] or torque [N·m]"
+            if force
+            else "torque [N·m], of the ideal actuator force [N]"
+        )
     torque, error, current, voltage, power, warmth = ([] for _ in range(6))  # type: ignore[var-annotated]
     for line in lines:
         torque.append(line.curve("actual", line.actual, 1))
@@ -178,7 +218,9 @@ def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
         if line.has("current"):
             current.append(line.curve("current", line.signals["current"], 1, held=False))
         if line.has("current", "reference_current"):
-            current.append(line.curve("reference", line.signals["reference_current"], 0, dashed=True))
+            current.append(
+                line.curve("reference", line.signals["reference_current"], 0, dashed=True)
+            )
         if line.has("voltage"):
             voltage.append(line.curve("voltage", line.signals["voltage"], 2))
         power.append(line.curve("mechanical", line.actual * line.turning, 1))
@@ -189,22 +231,41 @@ def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
             amperes, volts = line.signals["current"], line.signals["voltage"]
             power.append(line.curve("electrical", volts * amperes, 2, dashed=True))
             if line.actuator.winding is not None:
-                power.append(line.curve("heat in the winding", line.actuator.winding[0] * amperes**2, 4))
+                power.append(
+                    line.curve("heat in the winding", line.actuator.winding[0] * amperes**2, 4)
+                )
         if line.has("temperature") and np.ptp(line.signals["temperature"]) > 0.0:
             warmth.append(line.curve("winding", line.signals["temperature"], 4, held=False))
     title = "Force" if force else "Torque at the shaft"
-    found = [Plot(title, _TIME, unit, tuple(torque), clock=True, shades=_shades(lines, "saturated"))]
+    found = [
+        Plot(title, _TIME, unit, tuple(torque), clock=True, shades=_shades(lines, "saturated"))
+    ]
     if any(np.ptp(curve.y) > 0.0 or curve.y.any() for curve in error):
         found.append(Plot("Error: desired less actual", _TIME, unit, tuple(error), clock=True))
     if current:
         shades = _shades(lines, "current_saturated", "temperature_saturated")
-        found.append(Plot("Current and its reference", _TIME, "current [A]", tuple(current), clock=True, shades=shades))
+        found.append(
+            Plot(
+                "Current and its reference",
+                _TIME,
+                "current [A]",
+                tuple(current),
+                clock=True,
+                shades=shades,
+            )
+        )
     if voltage:
         curves = (*voltage, *_voltage_limits(lines, voltage))
-        split = [line for line in lines if line.has("voltage_saturated")]  # the only limit of others is the voltage's
-        others = [line for line in lines if line.has("voltage") and not line.has("voltage_saturated")]
+        split = [
+            line for line in lines if line.has("voltage_saturated")
+        ]  # the only limit of others is the voltage's
+        others = [
+            line for line in lines if line.has("voltage") and not line.has("voltage_saturated")
+        ]
         shades = _shades(split, "voltage_saturated") + _shades(others, "saturated")
-        found.append(Plot("Voltage and its limit", _TIME, "voltage [V]", curves, clock=True, shades=shades))
+        found.append(
+            Plot("Voltage and its limit", _TIME, "voltage [V]", curves, clock=True, shades=shades)
+        )
     found += _other_signals(lines)
     if not force:
         found.append(Plot("Power and losses", _TIME, "power [W]", tuple(power), clock=True))
@@ -219,7 +280,13 @@ def _shades(lines: Sequence[_MotorLine], *names: str) -> tuple[Shade, ...]:
     for line, name in itertools.product(lines, names):
         if line.has(name):
             times = line.timestep * np.arange(len(line.signals[name]) + 1)
-            found.append(Shade(line.before + name.replace("_", " "), spans(times, line.signals[name]), line.tags))
+            found.append(
+                Shade(
+                    line.before + name.replace("_", " "),
+                    spans(times, line.signals[name]),
+                    line.tags,
+                )
+            )
     return tuple(found)
 
 
@@ -233,7 +300,10 @@ def _voltage_limits(lines: Sequence[_MotorLine], drawn: Sequence[Curve]) -> list
             ends = np.array([0.0, max(curve.x[-1] for curve in drawn)])
             own = tags if len(each) > 1 else ()
             found += [
-                Curve(f"{side}{limit:g} V", ends, np.full(2, float(f"{side}{limit}")), True, tags=own) for side in "+-"
+                Curve(
+                    f"{side}{limit:g} V", ends, np.full(2, float(f"{side}{limit}")), True, tags=own
+                )
+                for side in "+-"
             ]
     return found
 
@@ -254,7 +324,9 @@ def _other_signals(lines: Sequence[_MotorLine]) -> list[Plot]:
         curves = tuple(line.curve(name.replace("_", " "), line.signals[name], 3) for line in own)
         if own:
             title = name.replace("_", " ").capitalize()
-            found.append(Plot(title, _TIME, f"{name.replace('_', ' ')} [{unit}]", curves, clock=True))
+            found.append(
+                Plot(title, _TIME, f"{name.replace('_', ' ')} [{unit}]", curves, clock=True)
+            )
     return found
 
 
@@ -274,12 +346,16 @@ def _run_plots(shown: Sequence[Shown]) -> list[Plot]:
             count = counts[unit] = counts.get(unit, -1) + 1
             if count < _MOST_STATES:
                 more = {"colour": count, "dashed": several and count > 0, **own}
-                curve = Curve(before + name.partition(" [")[0], time, one.episode.state[:, index], **more)
+                curve = Curve(
+                    before + name.partition(" [")[0], time, one.episode.state[:, index], **more
+                )
                 groups.setdefault(unit, []).append(curve)
         held = np.append(one.episode.reward, one.episode.reward[-1])
         rewards.append(Curve(f"{before}reward", time, held, style="step", colour=5, **own))
     for unit, curves in groups.items():
-        names = list(dict.fromkeys(curve.label.rpartition(": ")[2].replace("_", " ") for curve in curves))
+        names = list(
+            dict.fromkeys(curve.label.rpartition(": ")[2].replace("_", " ") for curve in curves)
+        )
         title = (
             f"State: {', '.join(names)}"
             if len(names) < 4

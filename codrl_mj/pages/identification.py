@@ -16,10 +16,17 @@ from codrl_mj.pages.plots import Curve, Plot
 _LAGS = 400
 _STRONG = 0.9
 _ADVICE = {
-    "resistance": "lock the rotor, drive it with steps of voltage (PRBS), log voltage and current at the terminals",
+    "resistance": (
+        "lock the rotor, drive it with steps of voltage (PRBS), log voltage and current at the"
+        " terminals"
+    ),
     "inductance": "lock the rotor, and log several rows within L/R of every step of the voltage",
-    "back_emf_constant": "log voltage and current while the shaft turns fast: a slow, large sine of the voltage",
-    "torque_constant": "measure it with a known mass (--known mgl=…), or give the datasheet's with --known",
+    "back_emf_constant": (
+        "log voltage and current while the shaft turns fast: a slow, large sine of the voltage"
+    ),
+    "torque_constant": (
+        "measure it with a known mass (--known mgl=…), or give the datasheet's with --known"
+    ),
     "torque_gain": "hang a known mass and give --known mgl=…: all torques scale with it",
     "inertia": "accelerate and brake hard: steps of the input, in both directions",
     "rotor_inertia": "log the motor without its load, or give --known load_inertia=…",
@@ -39,15 +46,23 @@ def identification_page(found: Identified, out: Path) -> Path:
     winding = [one for one in found.traces if one.part == "winding"]
     shaft = [one for one in found.traces if one.part == "shaft"]
     predicted = [one.trace for one in found.held_out if one.trace is not None]
-    fits = [page.heading("Winding: the current under the logged voltage"), *map(_looked_at, winding)] if winding else []
+    fits = (
+        [page.heading("Winding: the current under the logged voltage"), *map(_looked_at, winding)]
+        if winding
+        else []
+    )
     fits += [page.heading("Shaft, piece by piece"), *map(_looked_at, shaft)] if shaft else []
     sections = [
         page.Section("parameters", "Parameters", _parameters(found)),
         page.Section("better", "What to do better on the bench", _advice(found)),
         page.Section("errors", "Errors of the simulation", _errors(found)),
         page.Section("fits", "Logs that were fitted", page.joined(fits)),
-        page.Section("held-out", "Logs that were only predicted", page.joined(map(_looked_at, predicted))),
-        page.Section("correlations", "Which parameters can stand for each other", _correlations(found)),
+        page.Section(
+            "held-out", "Logs that were only predicted", page.joined(map(_looked_at, predicted))
+        ),
+        page.Section(
+            "correlations", "Which parameters can stand for each other", _correlations(found)
+        ),
     ]
     title = f"Identified from {', '.join(found.logs)}"
     return page.write(out, page.page(title, "A motor from its bench logs", _top(found), sections))
@@ -58,13 +73,19 @@ def _top(found: Identified) -> Markup:
     by = f", driven by its {found.driven_by}" if found.driven_by else ""
     good = sum(one.status in USABLE for one in found.estimates)
     late = [
-        f"the input of the {part} is late by {rows:g} row{'s' * (abs(rows) != 1)}, which is allowed for"
+        f"the input of the {part} is late by {rows:g} row{'s' * (abs(rows) != 1)}, which is"
+        " allowed for"
         for part, rows in found.delays.items()
         if rows
     ]
     told = (
-        f"{good} of {len(found.estimates)} numbers can be relied on. Rig: {found.rig}{by}; friction: {found.friction}"
-        + "".join(f"; {text}" for text in (found.friction_reason, found.supply_text, found.base_text) if text)
+        f"{good} of {len(found.estimates)} numbers can be relied on. Rig: {found.rig}{by};"
+        f" friction: {found.friction}"
+        + "".join(
+            f"; {text}"
+            for text in (found.friction_reason, found.supply_text, found.base_text)
+            if text
+        )
     )
     usable = "usable as an actuator" if problem is None else "not to be used as an actuator"
     parts = [
@@ -78,7 +99,9 @@ def _top(found: Identified) -> Markup:
 def _parameters(found: Identified) -> Markup:
     rows = []
     for one in found.estimates:
-        interval = "" if one.status == "given" else f"{page.number(one.low)} to {page.number(one.high)}"
+        interval = (
+            "" if one.status == "given" else f"{page.number(one.low)} to {page.number(one.high)}"
+        )
         half = 50.0 * (one.high - one.low) / abs(one.value) if one.value else math.nan
         worst = max(one.causes, key=lambda cause: one.causes[cause]) if one.causes else ""
         good = one.status in USABLE
@@ -95,20 +118,31 @@ def _parameters(found: Identified) -> Markup:
             CAUSES.get(worst, ""),
         )
         rows.append(cells)
-    columns = ("parameter", "value", "95 % interval", "half of it", "unit", "status", "why", "mostly because")
+    columns = (
+        "parameter",
+        "value",
+        "95 % interval",
+        "half of it",
+        "unit",
+        "status",
+        "why",
+        "mostly because",
+    )
     failed = (place for place, one in enumerate(found.estimates) if one.status not in USABLE)
     return page.table("Parameters with 95 % intervals", columns, rows, (1, 2, 3), True, failed)
 
 
 def _advice(found: Identified) -> Markup:
     texts = [
-        Markup("<b>{}</b> is {}: {}.").format(one.name.replace("_", " "), one.status, _ADVICE[one.name])
+        Markup("<b>{}</b> is {}: {}.").format(
+            one.name.replace("_", " "), one.status, _ADVICE[one.name]
+        )
         for one in found.estimates
         if one.status not in ("identified", "given") and one.name in _ADVICE
     ]
     told = Markup(
-        "<b>{}</b> and <b>{}</b> stand for each other (correlation {:+.2f}): give one of them with --known, or excite "
-        "what tells them apart."
+        "<b>{}</b> and <b>{}</b> stand for each other (correlation {:+.2f}): give one of them with"
+        " --known, or excite what tells them apart."
     )
     texts += [
         told.format(one.replace("_", " "), other.replace("_", " "), table[one][other])
@@ -117,13 +151,22 @@ def _advice(found: Identified) -> Markup:
         if abs(table[one][other]) >= _STRONG
     ]
     if not found.held_out and found.driven_by:
-        texts.append(Markup("No log was held out: keep one back with --holdout, to see what the numbers predict."))
+        texts.append(
+            Markup(
+                "No log was held out: keep one back with --holdout, to see what the numbers"
+                " predict."
+            )
+        )
     if len(found.logs) < 2:
         texts.append(Markup("A single log: a second one shows what differs from day to day."))
     if not texts:
-        return page.paragraph("Nothing stands out: every number is identified or given, and a log was held out.")
+        return page.paragraph(
+            "Nothing stands out: every number is identified or given, and a log was held out."
+        )
     texts.append(Markup("<code>codrl-mj identify plan</code> says which excitation tells what."))
-    return Markup("<ul>{}</ul>").format(page.joined(Markup("<li>{}</li>").format(text) for text in texts))
+    return Markup("<ul>{}</ul>").format(
+        page.joined(Markup("<li>{}</li>").format(text) for text in texts)
+    )
 
 
 def _errors(found: Identified) -> Markup:
@@ -136,8 +179,9 @@ def _errors(found: Identified) -> Markup:
         return Markup()
     columns = ("log", "", "of", "open loop, half a second", "closed loop")
     told = page.paragraph(
-        "Mean absolute errors. Open loop: the simulation begins from where the shaft was and runs half a second under "
-        "the logged input. Closed loop: over the whole log under the servo's own law, where the log has a command."
+        "Mean absolute errors. Open loop: the simulation begins from where the shaft was and runs"
+        " half a second under the logged input. Closed loop: over the whole log under the servo's"
+        " own law, where the log has a command."
     )
     return told + page.table("Errors of the simulation", columns, rows, numbers=(3, 4))
 
@@ -149,9 +193,16 @@ def _looked_at(one: Trace) -> Markup:
     unit, what = SIGNALS[one.output], f"{one.log}: {one.output}"
     gaps = one.starts[1:]
     time, simulated = (np.insert(values, gaps, np.nan) for values in (one.time, one.simulated))
-    time = np.where(np.isnan(time), np.interp(np.arange(len(time)), np.flatnonzero(~np.isnan(time)), one.time), time)
+    time = np.where(
+        np.isnan(time),
+        np.interp(np.arange(len(time)), np.flatnonzero(~np.isnan(time)), one.time),
+        time,
+    )
     residuals = one.measured - one.simulated
-    curves = Curve("measured", one.time, one.measured, colour=0), Curve("simulated", time, simulated, colour=1)
+    curves = (
+        Curve("measured", one.time, one.measured, colour=0),
+        Curve("simulated", time, simulated, colour=1),
+    )
     off = Curve("residual", time, np.insert(residuals, gaps, np.nan), colour=4)
     centred = residuals - residuals.mean()
     whole = correlate(centred, centred, method="fft")[len(centred) - 1 :]
@@ -177,7 +228,12 @@ def _correlations(found: Identified) -> Markup:
         if len(table) > 1:
             names = [name.replace("_", " ") for name in table]
             shares = [
-                [Markup("<b>{:+.2f}</b>" if _STRONG <= abs(one) < 1.0 - 1e-9 else "{:+.2f}").format(one) for one in row]
+                [
+                    Markup(
+                        "<b>{:+.2f}</b>" if _STRONG <= abs(one) < 1.0 - 1e-9 else "{:+.2f}"
+                    ).format(one)
+                    for one in row
+                ]
                 for row in (row.values() for row in table.values())
             ]
             rows = [(name, *row) for name, row in zip(names, shares, strict=True)]

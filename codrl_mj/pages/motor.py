@@ -39,13 +39,16 @@ def loop_section(loops: Loops) -> Markup:
     if not found:
         return page.joined(notes)
     rows = [
-        (label, *(page.number(_right(one, field)) for one in found.values()), unit) for field, label, unit in _RIGHTS
+        (label, *(page.number(_right(one, field)) for one in found.values()), unit)
+        for field, label, unit in _RIGHTS
     ]
     late = {name: "a sample of delay" if one.delayed else "no delay" for name, one in found.items()}
     rows.append(("the voltage comes with", *late.values(), ""))
     table = page.table("Current loop", ("", *found, "unit"), rows, numbers=range(1, 1 + len(found)))
     if any(math.isnan(_right(one, field)) for one in found.values() for field, _, _ in _RIGHTS):
-        notes.append(page.paragraph("–: not below half the sample rate, or not within sight.", "soft"))
+        notes.append(
+            page.paragraph("–: not below half the sample rate, or not within sight.", "soft")
+        )
     known = {name: loops[name] for name in found}
     return page.joined((table, *notes, page.plots((*bode(known, found), *small_steps(known)))))
 
@@ -75,12 +78,18 @@ def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> 
 
 
 def _values(caption: str, rows: Any) -> Markup:
-    made = [(row["name"].replace("_", " "), page.number(row["value"]), page.unit(row["unit"])) for row in rows]
+    made = [
+        (row["name"].replace("_", " "), page.number(row["value"]), page.unit(row["unit"]))
+        for row in rows
+    ]
     return page.table(caption, ("number", "value", "unit"), made, numbers=(1,))
 
 
 def _abilities(known: Mapping[str, Any], drive: Drive, entry: MotorEntry | None) -> Markup:
-    table = _values(f"At the output of its gear, past friction, at {drive.voltage_limit:g} V", known["abilities"])
+    table = _values(
+        f"At the output of its gear, past friction, at {drive.voltage_limit:g} V",
+        known["abilities"],
+    )
     if known["assumed"]:
         table += page.paragraph(f"{known['assumed']}.", "soft")
     try:
@@ -94,19 +103,27 @@ def _loop(name: str, drive: Drive) -> Markup:
     """The loop as it is, out of saturation, and at other sample rates, with and without delay."""
     parts = [loop_section({name: (drive, None)})]
     try:
-        parts += [page.heading("Out of saturation, by kind of anti-windup"), page.plots(recoveries(drive, step(drive)))]
+        parts += [
+            page.heading("Out of saturation, by kind of anti-windup"),
+            page.plots(recoveries(drive, step(drive))),
+        ]
     except ValueError as error:
         parts = [parts[0], page.note(str(error))]
     own = drive.controller.sample_rate, drive.controller.delayed
     rows = []
     for (rate, delayed), one in designs(drive).items():
-        name = f"{rate / 1e3:g} kHz, {'a sample' if delayed else 'no'} delay{' (as it is)' * ((rate, delayed) == own)}"
+        name = (
+            f"{rate / 1e3:g} kHz, {'a sample' if delayed else 'no'}"
+            f" delay{' (as it is)' * ((rate, delayed) == own)}"
+        )
         if isinstance(one, str):
             rows.append((name, "not possible: " + one, *[""] * 5))
         else:
             rows.append((name, *(page.number(_right(one, field)) for field, _, _ in _RIGHTS[3:])))
     columns = ("the loop at", *(f"{label} [{unit}]" for _, label, unit in _RIGHTS[3:]))
-    return page.joined((*parts, page.table("Other sample rates", columns, rows, numbers=range(1, 7), cards=True)))
+    return page.joined(
+        (*parts, page.table("Other sample rates", columns, rows, numbers=range(1, 7), cards=True))
+    )
 
 
 def _numbers(known: Mapping[str, Any]) -> Markup:
@@ -116,11 +133,19 @@ def _numbers(known: Mapping[str, Any]) -> Markup:
     rows = []
     for row in known["numbers"]:
         how = row["how"] + (" (estimated)" if row["name"] in known["estimated"] else "")
-        cells = row["name"].replace("_", " "), page.number(row["value"]), page.unit(row["unit"]), how, row["places"]
+        cells = (
+            row["name"].replace("_", " "),
+            page.number(row["value"]),
+            page.unit(row["unit"]),
+            how,
+            row["places"],
+        )
         rows.append(cells)
     columns = ("number", "value", "unit", "how it came about", "source")
     parts = [page.table("Numbers and where they are from", columns, rows, numbers=(1,), cards=True)]
-    parts.append(page.definitions((str(place), source) for place, source in enumerate(known["cited"], 1)))
+    parts.append(
+        page.definitions((str(place), source) for place, source in enumerate(known["cited"], 1))
+    )
     if known["estimated"]:
         parts += [page.heading("Estimated"), page.definitions(known["estimated"].items())]
     if known["unknown"]:

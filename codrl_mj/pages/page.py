@@ -1,6 +1,7 @@
 """The builder of every page: sections of text, tables, plots and films, in one file that asks nothing of any server.
 
-All text is escaped; what is to stand as markup is `markupsafe.Markup`, which only this builder makes.
+All text is escaped; what is to stand as markup is `markupsafe.Markup`, which only this builder
+makes.
 """
 
 import base64
@@ -20,8 +21,9 @@ from codrl_mj.runs.files import check_page, writing
 
 _HERE = Path(__file__).parent
 _POLICY = (
-    "default-src 'none'; img-src data: blob:; media-src data: blob:; style-src 'unsafe-inline'; "
-    "script-src 'unsafe-inline' blob:; worker-src blob:; frame-src data: blob:; connect-src data: blob:"
+    "default-src 'none'; img-src data: blob:; media-src data: blob:; style-src 'unsafe-inline';"
+    " script-src 'unsafe-inline' blob:; worker-src blob:; frame-src data: blob:; connect-src data:"
+    " blob:"
 )
 """What the browser itself holds the page to: nothing is fetched."""
 
@@ -38,7 +40,12 @@ class Section(NamedTuple):
 
 @functools.cache
 def _template(name: str) -> jinja2.Template:
-    options: Any = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    options: Any = {
+        "autoescape": True,
+        "undefined": jinja2.StrictUndefined,
+        "trim_blocks": True,
+        "lstrip_blocks": True,
+    }
     templates = jinja2.Environment(loader=jinja2.FileSystemLoader(_HERE), **options)
     templates.filters["data"] = _data
     return templates.get_template(name)
@@ -66,7 +73,8 @@ def page(title: str, kicker: str, top: Markup, sections: Sequence[Section]) -> s
         sections=[section for section in sections if section.body],
         policy=Markup(_POLICY),
         style=_text("uplot/uPlot.min.css") + _text("page.css"),
-        uplot=Markup("/* uPlot. {} */\n").format(_text("uplot/LICENSE").strip()) + _text("uplot/uPlot.iife.min.js"),
+        uplot=Markup("/* uPlot. {} */\n").format(_text("uplot/LICENSE").strip())
+        + _text("uplot/uPlot.iife.min.js"),
         script=_text("page.js"),
         version=__version__,
         made=time.strftime("%Y-%m-%d, %H:%M UTC", time.gmtime()),
@@ -103,7 +111,9 @@ def heading(text: Any) -> Markup:
 
 def definitions(entries: Iterable[tuple[Any, Any]]) -> Markup:
     """Names and what they are."""
-    return Markup("<dl>{}</dl>").format(joined(Markup("<dt>{}</dt><dd>{}</dd>").format(*entry) for entry in entries))
+    return Markup("<dl>{}</dl>").format(
+        joined(Markup("<dt>{}</dt><dd>{}</dd>").format(*entry) for entry in entries)
+    )
 
 
 def folded(summary: Any, body: Markup) -> Markup:
@@ -114,7 +124,9 @@ def folded(summary: Any, body: Markup) -> Markup:
 def judged(good: bool, text: Any, element: str = "strong", kind: str = "") -> Markup:
     """A word in a table, or a paragraph, said to be good or bad not by colour alone."""
     word, sign = ("good", "✓") if good else ("bad", "✗")
-    return Markup('<{0} class="{1}">{2} {3}</{0}>').format(element, f"{kind} {word}".strip(), sign, text)
+    return Markup('<{0} class="{1}">{2} {3}</{0}>').format(
+        element, f"{kind} {word}".strip(), sign, text
+    )
 
 
 def table(
@@ -127,7 +139,8 @@ def table(
 ) -> Markup:
     """A table of rows, which the first column names; some may have failed.
 
-    Columns at the places `numbers` hold numbers. With `cards` a phone shows each row as a card; otherwise it scrolls.
+    Columns at the places `numbers` hold numbers. With `cards` a phone shows each row as a card;
+    otherwise it scrolls.
     """
     return part("table", caption, columns, list(rows), cards, set(numbers), set(failed))
 
@@ -136,7 +149,9 @@ def plot(what: Plot, low: bool = False) -> Markup:
     """A plot; less high where it is `low`."""
     picture = _data(still(what, height=2.2 if low else 3.2).encode(), "image/svg+xml")
     axes = f"{what.y_label} over {what.x_label}" if what.clock else what.y_label
-    return part("plot", what.title, axes, description(what), Markup(as_json(what)), picture, what.clock, low)
+    return part(
+        "plot", what.title, axes, description(what), Markup(as_json(what)), picture, what.clock, low
+    )
 
 
 def plots(several: Iterable[Plot]) -> Markup:
@@ -151,8 +166,9 @@ def clocked(label: str, fragment: str, script: str) -> Markup:
     Args:
         label: what it is.
         fragment: its HTML, taken as it is.
-        script: JavaScript that defines a function `setTime(seconds)`, which shows that instant. It sees `element`, the
-            fragment's parent, and `seek(seconds)`, to be called when the fragment itself is scrubbed.
+        script: JavaScript that defines a function `setTime(seconds)`, which shows that instant. It
+            sees `element`, the fragment's parent, and `seek(seconds)`, to be called when the
+            fragment itself is scrubbed.
     """
     return part("clocked", label, Markup(fragment), Markup(script))
 
@@ -166,7 +182,8 @@ def number(value: Any, digits: int = 4) -> str:
     """A number as text, or a mean or a median with its interval; a dash where there is none."""
     if isinstance(value, Mapping):
         middle, low, high = (
-            number(one, digits) for one in (value.get("mean", value.get("median")), value.get("low"), value.get("high"))
+            number(one, digits)
+            for one in (value.get("mean", value.get("median")), value.get("low"), value.get("high"))
         )
         return f"{middle} [{low}, {high}]"
     if value is None or (isinstance(value, float) and math.isnan(value)):

@@ -123,7 +123,9 @@ def as_json(plot: Plot) -> str:
         x, y = (curve.x, curve.y) if curve.style == "trail" else thinned(curve.x, curve.y)
         drawn = {"label": curve.label, "x": stored(x), "y": stored(_drawable(y, plot.y_log))}
         drawn["style"] = "reference" if curve.reference else curve.style
-        drawn |= {name: getattr(curve, name) for name in ("dashed", "filled", "colour", "shared", "tags")}
+        drawn |= {
+            name: getattr(curve, name) for name in ("dashed", "filled", "colour", "shared", "tags")
+        }
         curves.append(drawn | ({"times": stored(curve.times)} if curve.times is not None else {}))
     content = {
         "title": plot.title,
@@ -136,7 +138,8 @@ def as_json(plot: Plot) -> str:
         "clock": plot.clock,
         "curves": curves,
         "shades": [
-            {"label": shade.label, "spans": stored(shade.spans.ravel()), "tags": shade.tags} for shade in plot.shades
+            {"label": shade.label, "spans": stored(shade.spans.ravel()), "tags": shade.tags}
+            for shade in plot.shades
         ],
     }
     content |= {"corners": plot.corners} if plot.corners else {}
@@ -155,7 +158,11 @@ def _drawable(values: np.ndarray, log: bool) -> np.ndarray:
 def _ceiling(plot: Plot) -> float | None:
     """The top of a logarithmic axis that references leave: a reference may leave the picture, a result may not."""
     results = [_drawable(curve.y, True) for curve in plot.curves if not curve.reference]
-    if not plot.y_log or len(results) == len(plot.curves) or not any(np.isfinite(one).any() for one in results):
+    if (
+        not plot.y_log
+        or len(results) == len(plot.curves)
+        or not any(np.isfinite(one).any() for one in results)
+    ):
         return None
     return 1e6 * max(float(np.nanmax(one)) for one in results if np.isfinite(one).any())
 
@@ -170,8 +177,13 @@ def description(plot: Plot) -> str:
         elif np.ptp(values) == 0.0:
             told.append(f"{curve.label}: {values[0]:.3g} throughout")
         else:
-            told.append(f"{curve.label}: {values.min():.3g} to {values.max():.3g}, at last {values[-1]:.3g}")
-    return f"{plot.y_label} over {plot.x_label}. {'; '.join(told[:12])}{'; and more' if len(told) > 12 else ''}."
+            told.append(
+                f"{curve.label}: {values.min():.3g} to {values.max():.3g}, at last {values[-1]:.3g}"
+            )
+    return (
+        f"{plot.y_label} over {plot.x_label}."
+        f" {'; '.join(told[:12])}{'; and more' if len(told) > 12 else ''}."
+    )
 
 
 def still(plot: Plot, height: float = 3.2) -> str:
@@ -180,7 +192,9 @@ def still(plot: Plot, height: float = 3.2) -> str:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "codrl_mj", "path.simplify_threshold": 0.5}):
+    with mpl.rc_context(
+        {"svg.fonttype": "none", "svg.hashsalt": "codrl_mj", "path.simplify_threshold": 0.5}
+    ):
         figure = Figure(figsize=(6.4, height))
         figure.subplots_adjust(0.13, 0.17, 0.985 if plot.scaled is None else 0.87, 0.97)
         FigureCanvasSVG(figure)
@@ -189,11 +203,15 @@ def still(plot: Plot, height: float = 3.2) -> str:
         if len(plot.curves) > 1:
             axes.legend(fontsize=8, frameon=False, labelcolor="#767c84")
         buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+        figure.savefig(
+            buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None}
+        )
     return buffer.getvalue()
 
 
-def save(several: Plot | Sequence[Plot], path: Path, size: tuple[float, float] | None = None) -> None:
+def save(
+    several: Plot | Sequence[Plot], path: Path, size: tuple[float, float] | None = None
+) -> None:
     """Write a plot, or some in two rows, column by column, as a PNG file on white, whole or not at all.
 
     Args:
@@ -206,13 +224,22 @@ def save(several: Plot | Sequence[Plot], path: Path, size: tuple[float, float] |
     drawn = [several] if isinstance(several, Plot) else several
     rows = min(2, len(drawn))
     columns = math.ceil(len(drawn) / rows)
-    figure = Figure(figsize=size or (8.0 if columns == 1 else 4.8 * columns, 2.0 + 3.2 * rows), layout="constrained")
+    figure = Figure(
+        figsize=size or (8.0 if columns == 1 else 4.8 * columns, 2.0 + 3.2 * rows),
+        layout="constrained",
+    )
     panels = figure.subplots(rows, columns, squeeze=False)
     for plot, axes in zip(drawn, panels.T.flat, strict=True):
         _draw(plot, axes, "#22313f", POINTS)
         axes.set_title(plot.title.replace("$", r"\$"), fontsize="medium", color="#22313f")
         beside = min(len(plot.curves), 3 if columns == 1 else 2)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=beside, fontsize="small", frameon=False)
+        axes.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.15),
+            ncols=beside,
+            fontsize="small",
+            frameon=False,
+        )
     with writing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=150)
 
@@ -221,7 +248,11 @@ def _draw(plot: Plot, axes: Any, ink: str, points: int) -> None:
     """Draw a plot's first twelve curves, each of at most so many points, on matplotlib's axes."""
     for index, curve in enumerate(plot.curves[:12]):
         label = curve.label.replace("$", r"\$")  # a name, and no formula
-        colour = ink if curve.reference else _PALETTE[(index if curve.colour is None else curve.colour) % 6]
+        colour = (
+            ink
+            if curve.reference
+            else _PALETTE[(index if curve.colour is None else curve.colour) % 6]
+        )
         x, y = thinned(curve.x, _drawable(curve.y, plot.y_log), points)
         dots = curve.style in ("dots", "trail")
         few = len(curve.x) <= _FEW and not curve.reference
@@ -238,7 +269,11 @@ def _draw(plot: Plot, axes: Any, ink: str, points: int) -> None:
         )
         if curve.filled:
             other = thinned(curve.x, _drawable(plot.curves[index - 1].y, plot.y_log), points)[1]
-            axes.fill_between(x, y, other, color=colour, alpha=0.12, linewidth=0) if len(other) == len(y) else None
+            (
+                axes.fill_between(x, y, other, color=colour, alpha=0.12, linewidth=0)
+                if len(other) == len(y)
+                else None
+            )
     for shade in plot.shades[:1]:
         for begin, end in shade.spans[:60]:
             axes.axvspan(begin, end, color=_PALETTE[4], alpha=0.2, linewidth=0)
@@ -258,11 +293,15 @@ def _draw(plot: Plot, axes: Any, ink: str, points: int) -> None:
     for axis in "xy":
         if getattr(axes, f"get_{axis}scale")() == "linear":
             axes.locator_params(axis=axis, nbins=5)
-    for place, text in zip(itertools.product((0.015, 0.985), (0.985, 0.015)), plot.corners, strict=False):
+    for place, text in zip(
+        itertools.product((0.015, 0.985), (0.985, 0.015)), plot.corners, strict=False
+    ):
         along, up = ("left", "right")[place[0] > 0.5], ("bottom", "top")[place[1] > 0.5]
         axes.text(*place, text, transform=axes.transAxes, color=ink, alpha=0.8, ha=along, va=up)
     if plot.scaled is not None:
         label, scale = plot.scaled
-        right = axes.secondary_yaxis("right", functions=(lambda value: scale * value, lambda value: value / scale))
+        right = axes.secondary_yaxis(
+            "right", functions=(lambda value: scale * value, lambda value: value / scale)
+        )
         right.set_ylabel(label, color=ink)
         right.tick_params(colors=ink)

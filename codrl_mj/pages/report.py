@@ -54,13 +54,17 @@ def report(
     Args:
         runs: run folders, at least one; also unfinished and damaged ones.
         out: the page, an .html file.
-        which: `last` or `best`: whose policy acts in the episode. An unfinished run has only its best so far.
-        seed: of the episode; None: that of the evaluated episode with the median return, or 0 where there is none.
-        trust: whether to import modules that a run folder names as its task, agent or actuator, which executes them.
+        which: `last` or `best`: whose policy acts in the episode. An unfinished run has only its
+            best so far.
+        seed: of the episode; None: that of the evaluated episode with the median return, or 0 where
+            there is none.
+        trust: whether to import modules that a run folder names as its task, agent or actuator,
+            which executes them.
         filmed: whether to film the episode.
-        certificate: a `certificate.json`, or the folder of one; None: that in a run folder, if there is one.
-        joined: (episodes) -> parts that follow the clock of film and plots, made by `codrl_mj.pages.page.clocked`;
-            `replays` shows them in three dimensions.
+        certificate: a `certificate.json`, or the folder of one; None: that in a run folder, if
+            there is one.
+        joined: (episodes) -> parts that follow the clock of film and plots, made by
+            `codrl_mj.pages.page.clocked`; `replays` shows them in three dimensions.
         on_part: called with what is being done.
 
     Returns:
@@ -68,7 +72,8 @@ def report(
 
     Raises:
         FileNotFoundError: a folder is no run folder, or there is no such certificate.
-        ValueError: no run, a seed below 0, `out` is no .html file, or the certificate that is given is damaged.
+        ValueError: no run, a seed below 0, `out` is no .html file, or the certificate that is given
+            is damaged.
     """
     if not runs:
         raise ValueError("runs: none was given; give one run folder or more")
@@ -83,8 +88,16 @@ def report(
     ]
     on_part("page")
     shown = [run for run in found if run.episode is not None]
-    notes = [page.note(f"No episode of {run.name}: {run.problem}", bad=True) for run in found if run.episode is None]
-    notes += [page.note(f"{run.name}: the policy of its best evaluation acts.") for run in found if run.best]
+    notes = [
+        page.note(f"No episode of {run.name}: {run.problem}", bad=True)
+        for run in found
+        if run.episode is None
+    ]
+    notes += [
+        page.note(f"{run.name}: the policy of its best evaluation acts.")
+        for run in found
+        if run.best
+    ]
     episode = episode_section(shown, joined(shown)) if shown else Markup()
     sections = [
         page.Section("learning", "Learning", _learning(found)),
@@ -120,13 +133,25 @@ def _run(
     policy = summary.path / BEST if best else summary.path
     if not (policy / "policy.json").is_file():
         yet = "best policy" if finished(summary.path) else "policy yet"
-        return Shown(name, env, None, None, f"the run has no {yet}: none was evaluated so far", seed, summary=summary)
+        return Shown(
+            name,
+            env,
+            None,
+            None,
+            f"the run has no {yet}: none was evaluated so far",
+            seed,
+            summary=summary,
+        )
     try:
         on_part(f"{name}: episode")
         shown = show(name, env, load_policy(policy, trust), seed, filmed)
-        return shown._replace(best=best, summary=summary, rank=rank(evaluation, shown.episode.total))
+        return shown._replace(
+            best=best, summary=summary, rank=rank(evaluation, shown.episode.total)
+        )
     except Exception as error:  # environments and actuators of others raise what they like
-        return Shown(name, env, None, None, f"{type(error).__name__}: {error}", seed, summary=summary)
+        return Shown(
+            name, env, None, None, f"{type(error).__name__}: {error}", seed, summary=summary
+        )
 
 
 def _top(runs: Sequence[Shown], shown: Sequence[Shown]) -> Markup:
@@ -143,11 +168,17 @@ def _top(runs: Sequence[Shown], shown: Sequence[Shown]) -> Markup:
             told.append(page.note("The training is not finished. Here is what there is so far."))
         if run.summary.state == "damaged":
             told.append(page.note(f"The run folder is damaged: {run.summary.problem}", bad=True))
-    told += [page.paragraph(_about(task), "soft") for task in dict.fromkeys(run.summary.task for run in runs) if task]
+    told += [
+        page.paragraph(_about(task), "soft")
+        for task in dict.fromkeys(run.summary.task for run in runs)
+        if task
+    ]
     for one in shown:
         if one.film is not None:
             picture = page.part("image", one.film.still, f"{one.env.task}: the scene of an episode")
-            return Markup('<div class="intro"><div>{}</div>{}</div>').format(page.joined(told), picture)
+            return Markup('<div class="intro"><div>{}</div>{}</div>').format(
+                page.joined(told), picture
+            )
     return page.joined(told)
 
 
@@ -157,8 +188,14 @@ def _sentence(run: RunSummary) -> str:
     steps = f", trained for {run.steps:,} environment steps" if run.steps else ", not trained yet"
     if run.steps and run.total_steps and run.state == "unfinished":
         steps += f" of {run.total_steps:,}"
-    named = {"ideal": "the ideal actuator", "custom": "an actuator of its own", "drive": "a motor behind a drive"}
-    actuator = named.get(run.actuator or "", f"the actuator{'s' * (', ' in (run.actuator or ''))} {run.actuator}")
+    named = {
+        "ideal": "the ideal actuator",
+        "custom": "an actuator of its own",
+        "drive": "a motor behind a drive",
+    }
+    actuator = named.get(
+        run.actuator or "", f"the actuator{'s' * (', ' in (run.actuator or ''))} {run.actuator}"
+    )
     text = f"{agent} on {run.task or 'an unknown task'} through {actuator}{steps}, seed {run.seed}."
     if run.evaluation is not None and run.evaluation_return is not None:
         returns, episodes = page.number(run.evaluation["returns"]), run.evaluation.get("episodes")
@@ -188,7 +225,10 @@ def _learning(runs: Sequence[Shown]) -> Markup:
     errors: list[Curve] = []
     for place, run in enumerate(runs):
         reports = read_reports(run.summary.path / PROGRESS, [])
-        columns = [[row.get(name, "nan") for row in reports] for name in ("steps", "evaluation_return", "torque_error")]
+        columns = [
+            [row.get(name, "nan") for row in reports]
+            for name in ("steps", "evaluation_return", "torque_error")
+        ]
         try:
             steps, evaluated, off = np.array(columns, dtype=np.float64)
         except ValueError:  # a cell is no number
@@ -199,7 +239,9 @@ def _learning(runs: Sequence[Shown]) -> Markup:
             episodes = np.empty((0, 4))
             notes.append(page.note(f"No curve of {run.name}'s training episodes: {error}"))
         known = np.isfinite(off)
-        off_torque = [Curve("torque error", steps[known], off[known], colour=4)] if known.any() else []
+        off_torque = (
+            [Curve("torque error", steps[known], off[known], colour=4)] if known.any() else []
+        )
         for curve in (*learning_curves(episodes, steps, evaluated), *off_torque):
             into = {"evaluations": evaluations, "torque error": errors}.get(curve.label, returns)
             if len(runs) == 1:
@@ -209,7 +251,9 @@ def _learning(runs: Sequence[Shown]) -> Markup:
                 into.append(dataclasses.replace(curve, label=label, colour=place, dashed=dashed))
     found = []
     if returns or evaluations:
-        found.append(Plot("Return while learning", "environment steps", "return", (*returns, *evaluations)))
+        found.append(
+            Plot("Return while learning", "environment steps", "return", (*returns, *evaluations))
+        )
     if any(np.any(curve.y) for curve in errors):
         title = "Torque asked for less torque delivered at the ends of environment steps, rms"
         found.append(Plot(title, "environment steps", "torque error [N·m]", tuple(errors)))
@@ -222,7 +266,9 @@ def _evaluation(runs: Sequence[Shown]) -> Markup:
     """Measures with their intervals."""
     known = [run for run in runs if run.summary.evaluation is not None]
     notes = [
-        page.note(f"{run.name} has no evaluation: its last policy is evaluated when the training ends.")
+        page.note(
+            f"{run.name} has no evaluation: its last policy is evaluated when the training ends."
+        )
         for run in runs
         if run.summary.evaluation is None
     ]
@@ -232,18 +278,34 @@ def _evaluation(runs: Sequence[Shown]) -> Markup:
     count = " and ".join(dict.fromkeys(str(one.get("episodes")) for one in every))
     names = [run.name if len(known) > 1 else "value" for run in known]
     table = _measures(
-        f"Last policy, {count} episodes; 95 % intervals in brackets", dict(zip(names, every, strict=True))
+        f"Last policy, {count} episodes; 95 % intervals in brackets",
+        dict(zip(names, every, strict=True)),
     )
     curves = []
     for place, (run, one) in enumerate(zip(known, every, strict=True)):
         returns = np.sort(np.array(one.get("episode_returns") or [], dtype=float))
         if len(returns) > 1:
             share = 100.0 * (np.arange(len(returns)) + 0.5) / len(returns)
-            curves.append(Curve(run.name if len(known) > 1 else "episodes", share, returns, colour=place, style="dots"))
+            curves.append(
+                Curve(
+                    run.name if len(known) > 1 else "episodes",
+                    share,
+                    returns,
+                    colour=place,
+                    style="dots",
+                )
+            )
     title = "Returns of the evaluation's episodes, in order"
-    beside = page.plots([Plot(title, "share of episodes below [%]", "return", tuple(curves))] if curves else [])
-    layout = '<div class="beside">{}{}</div>' if len(known) == 1 else "{}{}"  # a table of several needs the width
-    of_motors = [(f"{run.name}: motor by motor", one.get("motors")) for run, one in zip(known, every, strict=True)]
+    beside = page.plots(
+        [Plot(title, "share of episodes below [%]", "return", tuple(curves))] if curves else []
+    )
+    layout = (
+        '<div class="beside">{}{}</div>' if len(known) == 1 else "{}{}"
+    )  # a table of several needs the width
+    of_motors = [
+        (f"{run.name}: motor by motor", one.get("motors"))
+        for run, one in zip(known, every, strict=True)
+    ]
     folded = [
         page.folded(about, _measures(about, motors))
         for about, motors in of_motors
@@ -258,8 +320,16 @@ def _measures(caption: str, columns: Mapping[str, Mapping[str, Any]]) -> Markup:
     for name, field in MEASURES.items():
         values = [column.get(name) for column in columns.values()]
         if any(value is not None for value in values):
-            rows.append((field.metadata["label"], *map(page.number, values), page.unit(field.metadata["unit"])))
-    return page.table(caption, ("measure", *columns, "unit"), rows, numbers=range(1, 1 + len(columns)))
+            rows.append(
+                (
+                    field.metadata["label"],
+                    *map(page.number, values),
+                    page.unit(field.metadata["unit"]),
+                )
+            )
+    return page.table(
+        caption, ("measure", *columns, "unit"), rows, numbers=range(1, 1 + len(columns))
+    )
 
 
 def replays(shown: Sequence[Shown]) -> list[Markup]:
@@ -269,7 +339,11 @@ def replays(shown: Sequence[Shown]) -> list[Markup]:
     parts = [Markup("<script>{}</script>").format(Markup(library()))]
     for one in shown:
         fragment = replay(motion_of_episode(one.episode, one.env), one.name)
-        parts.append(Markup("<figure>{}</figure>").format(page.clocked(f"Replay: {one.name}", fragment, SCRIPT)))
+        parts.append(
+            Markup("<figure>{}</figure>").format(
+                page.clocked(f"Replay: {one.name}", fragment, SCRIPT)
+            )
+        )
     return parts
 
 
@@ -282,7 +356,13 @@ def _loop(runs: Sequence[Shown]) -> Markup:
     for run in runs:
         driven = run.env.driven if run.env is not None else {}
         for motor, actuator in driven.items():
-            name = motor if len(runs) == 1 else run.name if len(driven) == 1 else f"{run.name}, {motor}"
+            name = (
+                motor
+                if len(runs) == 1
+                else run.name
+                if len(driven) == 1
+                else f"{run.name}, {motor}"
+            )
             name = "motor" if name == ".*" else name
             timestep = run.episode.timestep if run.episode is not None else None
             if actuator.assumed:
@@ -296,9 +376,14 @@ def _loop(runs: Sequence[Shown]) -> Markup:
                     loops[name] = loop
                 continue
             if isinstance(actuator, Actuator):
-                why = "no gain on the error of the current, feed-forward alone: there is no loop to be judged."
+                why = (
+                    "no gain on the error of the current, feed-forward alone: there is no loop to"
+                    " be judged."
+                )
             else:
-                about = (type(actuator).__doc__ or type(actuator).__name__).strip().partition("\n")[0]
+                about = (
+                    (type(actuator).__doc__ or type(actuator).__name__).strip().partition("\n")[0]
+                )
                 why = f"{about} There is no current loop in it."
             without[f"{name}: {why}"] = None
             if timestep is None or isinstance(actuator, Ideal):
@@ -309,7 +394,10 @@ def _loop(runs: Sequence[Shown]) -> Markup:
     if len(loops) > _MOST_LOOPS:
         left = ", ".join(list(loops)[_MOST_LOOPS:])
         parts.append(
-            page.note(f"The first {_MOST_LOOPS} of {len(loops)} different loops are shown; not those of {left}")
+            page.note(
+                f"The first {_MOST_LOOPS} of {len(loops)} different loops are shown; not those of"
+                f" {left}"
+            )
         )
     if loops:
         parts.append(loop_section(dict(list(loops.items())[:_MOST_LOOPS])))

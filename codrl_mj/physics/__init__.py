@@ -1,13 +1,21 @@
 """Simulation of a task: in MuJoCo or on Gymnasium's analytic dynamics, behind one small interface, by name.
 
-Read `base`, then `mjcf` (actuators into the model), `stepping` (a step, compiled), `mujoco_single`; many simulations
-are rows in threads' hands: `rows`, `sharing`, `mujoco_batch`.
+Read `base`, then `mjcf` (actuators into the model), `stepping` (a step, compiled), `mujoco_single`;
+many simulations are rows in threads' hands: `rows`, `sharing`, `mujoco_batch`.
 """
 
 from collections.abc import Callable
 
 from codrl_mj.physics.analytic import AnalyticPhysics
-from codrl_mj.physics.base import PHYSICS, Physics, Plant, Signals, SimulationDivergedError, signal_names, trace_names
+from codrl_mj.physics.base import (
+    PHYSICS,
+    Physics,
+    Plant,
+    Signals,
+    SimulationDivergedError,
+    signal_names,
+    trace_names,
+)
 from codrl_mj.physics.mjcf import hills, install_callbacks, motors, needed_callbacks
 from codrl_mj.physics.mujoco_single import MujocoPhysics
 
@@ -25,7 +33,9 @@ def register_physics(name: str, make: Callable[[Plant], Physics]) -> None:
         ValueError: the name is taken by another.
     """
     if PHYSICS.setdefault(name, make) is not make:
-        raise ValueError(f"physics {name!r} is registered already, as {PHYSICS[name]!r}: choose another name")
+        raise ValueError(
+            f"physics {name!r} is registered already, as {PHYSICS[name]!r}: choose another name"
+        )
 
 
 __all__ = [

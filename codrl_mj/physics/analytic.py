@@ -16,19 +16,23 @@ class AnalyticPhysics(Physics):
         """Make the Gymnasium environment.
 
         Raises:
-            ValueError: something is added to the joint, which Gymnasium's equations have no place for; or the task has
-                no Gymnasium environment.
+            ValueError: something is added to the joint, which Gymnasium's equations have no place
+                for; or the task has no Gymnasium environment.
         """
         adding = [(f"the {type(one).__name__}'s ", one.additions) for one in plant.actuators]
         for whose, added in (*adding, ("joint.", plant.joint)):
             for name in ("armature", "damping", "friction"):
                 if value := getattr(added, name):
                     raise ValueError(
-                        f"{whose}{name} = {value:g}: the equations have no place for it; use physics='mujoco'"
+                        f"{whose}{name} = {value:g}: the equations have no place for it; use"
+                        " physics='mujoco'"
                     )
         task = plant.task
         if task.twin is None:
-            raise ValueError(f"physics = 'analytic': {task.name} rebuilds no environment of Gymnasium's; use 'mujoco'")
+            raise ValueError(
+                f"physics = 'analytic': {task.name} rebuilds no environment of Gymnasium's; use"
+                " 'mujoco'"
+            )
         super().__init__(plant)
         self.timestep = plant.timestep
         self.twin = task.twin()
@@ -43,7 +47,9 @@ class AnalyticPhysics(Physics):
         self._states = [rest] * len(self._actuators)
         self.time = 0.0
         self._key = key
-        self._disturber.reset(np.zeros(1, dtype=np.int64), key, self.plant.held(self.state[np.newaxis]))
+        self._disturber.reset(
+            np.zeros(1, dtype=np.int64), key, self.plant.held(self.state[np.newaxis])
+        )
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the actuators for others of their family; to be followed by a reset."""
@@ -70,7 +76,9 @@ class AnalyticPhysics(Physics):
         """Advance an actuator by one integration step: the force that it delivers, and its signals."""
         arm, parameters = self._actuators[number]
         at = self.plant.task.speeds[number]
-        position, speed = self.state[[self.plant.task.qpos[self.plant.task.qvel.index(at)], at]].tolist()
+        position, speed = self.state[
+            [self.plant.task.qpos[self.plant.task.qvel.index(at)], at]
+        ].tolist()
         inputs = Inputs(command * arm, position / arm, speed / arm, self.time, self._key + number)
         self._states[number], torque, signals = self.plant.family.advance(
             parameters, self.timestep, self._states[number], inputs
@@ -87,14 +95,17 @@ class AnalyticPhysics(Physics):
                     self.plant.family.Signals(*signals[2:-1].tolist()),
                     Inputs(0.0, 0.0, 0.0, self.time, self._key + number),
                 )
-                for number, ((_, parameters), signals) in enumerate(zip(self._actuators, row, strict=True))
+                for number, ((_, parameters), signals) in enumerate(
+                    zip(self._actuators, row, strict=True)
+                )
             ]
         )
 
     def snapshot(self) -> np.ndarray:
         """State, actuators, time and key as a vector, shape (k,), float64.
 
-        `memory` and what `set_actuators` changed are not in it. Gymnasium's environment remembers nothing else.
+        `memory` and what `set_actuators` changed are not in it. Gymnasium's environment remembers
+        nothing else.
         """
         states = [value for state in self._states for value in state]
         return np.array([*self.state, *states, self.time, self._key], dtype=np.float64)
@@ -105,4 +116,6 @@ class AnalyticPhysics(Physics):
         self.state = snapshot[:size].copy()
         *values, self.time, self._key = snapshot[size:].tolist()
         count = len(kind._fields)  # type: ignore[attr-defined]
-        self._states = [kind(*values[at * count : (at + 1) * count]) for at in range(len(self._actuators))]
+        self._states = [
+            kind(*values[at * count : (at + 1) * count]) for at in range(len(self._actuators))
+        ]

@@ -14,17 +14,18 @@ from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
 
 Signals = dict[str, Any]
-"""What the actuators did during one environment step, by name: `desired_force` and `actual_force` [N or N*m], the
-family's signals at the end of the last integration step, and `saturated`. Numbers for a task with one actuator; arrays
-(n,) for one with several; in a batch one axis more, the first."""
+"""What the actuators did during one environment step, by name: `desired_force` and `actual_force`
+[N or N*m], the family's signals at the end of the last integration step, and `saturated`. Numbers
+for a task with one actuator; arrays (n,) for one with several; in a batch one axis more, the first.
+"""
 
 
 def trace_names(family: Family) -> tuple[str, ...]:
     """Columns of `Physics.trace`.
 
-    The force [N or N*m] asked of the actuator in an integration step (after whatever disturbs commands on their way)
-    and delivered in it, the family's signals at its end, and the velocity of the actuated joint [m/s or rad/s] at its
-    end.
+    The force [N or N*m] asked of the actuator in an integration step (after whatever disturbs
+    commands on their way) and delivered in it, the family's signals at its end, and the velocity of
+    the actuated joint [m/s or rad/s] at its end.
     """
     return ("desired_force", "actual_force", *family.Signals._fields, "speed")
 
@@ -38,17 +39,22 @@ def signal_names(family: Family) -> tuple[str, ...]:
 def namer(names: tuple[str, ...]) -> Callable[[Any], Signals]:
     """What names the first columns, numbers of one actuator or arrays of several; `saturated`, a flag, is the last.
 
-    It is false, in the columns' shape, of a family that has none. Written out, as `namedtuple` is: with a loop it would
-    take a tenth of an environment's step.
+    It is false, in the columns' shape, of a family that has none. Written out, as `namedtuple` is:
+    with a loop it would take a tenth of an environment's step.
     """
     entries = [f"{name!r}: columns[{at}]" for at, name in enumerate(names) if name != "saturated"]
-    flag = f"columns[{names.index('saturated')}] > 0.0" if "saturated" in names else "columns[0] < columns[0]"
+    flag = (
+        f"columns[{names.index('saturated')}] > 0.0"
+        if "saturated" in names
+        else "columns[0] < columns[0]"
+    )
     return eval(f"lambda columns: {{{', '.join(entries)}, 'saturated': {flag}}}")
 
 
 LARGEST = 1e10
-"""Largest magnitude of a state entry: MuJoCo's `mjMAXVAL`, beyond which it warns and discards forces. A diverging motor
-need not reach infinity there."""
+"""Largest magnitude of a state entry: MuJoCo's `mjMAXVAL`, beyond which it warns and discards
+forces. A diverging motor need not reach infinity there.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -111,7 +117,8 @@ class Plant:
 class Physics(abc.ABC):
     """One simulation of a plant.
 
-    Somebody's own is given to `codrl_mj.physics.register_physics`. What it cannot simulate it refuses when it is made.
+    Somebody's own is given to `codrl_mj.physics.register_physics`. What it cannot simulate it
+    refuses when it is made.
     """
 
     stepping: Any = None
@@ -124,8 +131,9 @@ class Physics(abc.ABC):
     """The `mujoco.MjModel` and `mujoco.MjData` that it runs on; None where there are none."""
 
     state: np.ndarray
-    """The mechanical state in the task's order, shape (n,), float64; not changed by later steps. Set, it moves the
-    simulation there, the motor left as it is."""
+    """The mechanical state in the task's order, shape (n,), float64; not changed by later steps.
+    Set, it moves the simulation there, the motor left as it is.
+    """
     time: float
     """Since the start of the episode [s]."""
 
@@ -133,10 +141,16 @@ class Physics(abc.ABC):
         """Take what is simulated, and make what one of it needs on any physics."""
         self.plant = plant
         """What is simulated."""
-        self.trace = np.zeros((plant.inner_steps, len(plant.actuators), len(trace_names(plant.family))))
-        """What each actuator did in each integration step of the last environment step, shape (inner_steps, actuators,
-        columns), float64; columns as in `trace_names`. A live array: the next step overwrites it."""
-        self._disturber = Disturber(plant.disturbances, plant.timestep, plant.max_forces, 1, plant.holds)
+        self.trace = np.zeros(
+            (plant.inner_steps, len(plant.actuators), len(trace_names(plant.family)))
+        )
+        """What each actuator did in each integration step of the last environment step, shape
+        (inner_steps, actuators, columns), float64; columns as in `trace_names`. A live array: the
+        next step overwrites it.
+        """
+        self._disturber = Disturber(
+            plant.disturbances, plant.timestep, plant.max_forces, 1, plant.holds
+        )
 
     @abc.abstractmethod
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
@@ -149,12 +163,16 @@ class Physics(abc.ABC):
         """Change fields of the model, as `codrl_mj.physics.variation.Variation.fields` has them; then a reset follows.
 
         Raises:
-            ValueError: it has no such fields, because it is not on a MuJoCo model; none at all is never refused.
+            ValueError: it has no such fields, because it is not on a MuJoCo model; none at all is
+                never refused.
         """
         if fields:
-            own = next((name for name, make in PHYSICS.items() if make is type(self)), type(self).__name__)
+            own = next(
+                (name for name, make in PHYSICS.items() if make is type(self)), type(self).__name__
+            )
             raise ValueError(
-                f"fields = {', '.join(fields)}: they are a MuJoCo model's, which {own!r} has not; use 'mujoco'"
+                f"fields = {', '.join(fields)}: they are a MuJoCo model's, which {own!r} has not;"
+                " use 'mujoco'"
             )
 
     @abc.abstractmethod
@@ -210,7 +228,9 @@ class Physics(abc.ABC):
         fine = np.abs(state) <= LARGEST
         if fine.all():
             return
-        broken = ", ".join(f"{n} = {v:g}" for n, v, ok in zip(task.state_names, state, fine, strict=True) if not ok)
+        broken = ", ".join(
+            f"{n} = {v:g}" for n, v, ok in zip(task.state_names, state, fine, strict=True) if not ok
+        )
         raise diverged(task.name, self.time, broken)
 
     def show(self, state: np.ndarray) -> None:
@@ -226,9 +246,11 @@ class SimulationDivergedError(ArithmeticError):
     """A simulation left the finite numbers, or the range in which MuJoCo trusts its own."""
 
 
-def diverged(who: str, time: float, broken: str, step: str = "inner_steps") -> SimulationDivergedError:
+def diverged(
+    who: str, time: float, broken: str, step: str = "inner_steps"
+) -> SimulationDivergedError:
     """The error of an environment whose simulation broke down at a time [s], with what sets its integration step."""
     return SimulationDivergedError(
-        f"{who}: the simulation diverged at t = {time:g} s: {broken}. Reset the environment; if this repeats, "
-        f"shorten the integration step ({step}) or lower the gains"
+        f"{who}: the simulation diverged at t = {time:g} s: {broken}. Reset the environment; if"
+        f" this repeats, shorten the integration step ({step}) or lower the gains"
     )

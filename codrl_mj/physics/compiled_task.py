@@ -1,7 +1,8 @@
 """A task's functions, compiled, once a process: what it makes of its states, their bounds and their order.
 
-There is one compiled form of observation, reward and end, and every face calls it: a library's cosine may differ from
-another's in the last bit. What has to do with MuJoCo's `qpos` and `qvel` takes them as pointers or as arrays.
+There is one compiled form of observation, reward and end, and every face calls it: a library's
+cosine may differ from another's in the last bit. What has to do with MuJoCo's `qpos` and `qvel`
+takes them as pointers or as arrays.
 """
 
 import functools
@@ -37,17 +38,22 @@ def compiled_reader(positions: tuple[int, ...], velocities: tuple[int, ...]) -> 
 
 @functools.cache
 def compiled_constrain(
-    constrain: Compiled | None, names: tuple[str, ...], positions: tuple[int, ...], velocities: tuple[int, ...]
+    constrain: Compiled | None,
+    names: tuple[str, ...],
+    positions: tuple[int, ...],
+    velocities: tuple[int, ...],
 ) -> Compiled | None:
     """(qpos, qvel, scratch (n,), integration step [s]) -> nothing: a task's `constrain`, applied in place.
 
-    None for a task without bounds. A state beyond `LARGEST` becomes NaN in all its entries, to be noticed: within its
-    bounds it would look like any other.
+    None for a task without bounds. A state beyond `LARGEST` becomes NaN in all its entries, to be
+    noticed: within its bounds it would look like any other.
     """
     if constrain is None:
         return None
     fill, entries = compiled_reader(positions, velocities), entries_type(len(names))
-    bounded = compiled_function(constrain, names, "Task.state_names", tuple_of(entries), types.float64)
+    bounded = compiled_function(
+        constrain, names, "Task.state_names", tuple_of(entries), types.float64
+    )
 
     @njit(nogil=True, error_model="numpy")
     def keep(qpos: Any, qvel: Any, state: np.ndarray, timestep: float) -> None:
@@ -75,8 +81,8 @@ def is_fine(state: np.ndarray) -> bool:
 class Outcomes(NamedTuple):
     """Compiled functions.
 
-    States are float64 arrays (n,). Observations are float32 arrays (k,); entries beyond the task's own are left alone.
-    `options` is the vector of the task's options.
+    States are float64 arrays (n,). Observations are float32 arrays (k,); entries beyond the task's
+    own are left alone. `options` is the vector of the task's options.
     """
 
     observe: Compiled
@@ -108,7 +114,9 @@ def _compiled(
     options_count, entries = len(options_type._fields), entries_type(size)
     state, force = tuple_of(entries), types.float64[::1] if several else types.float64
     observation_of = compiled_function(observation, names, "Task.observation_names", state)
-    reward_of = compiled_function(reward, "", "Task.reward", state, force, state, tuple_of(options_type))
+    reward_of = compiled_function(
+        reward, "", "Task.reward", state, force, state, tuple_of(options_type)
+    )
     terminated_at = compiled_function(terminated, "", "Task.terminated", state)
 
     @compiled
@@ -120,7 +128,9 @@ def _compiled(
     @compiled
     def rewarded(before: np.ndarray, force: Any, after: np.ndarray, options: np.ndarray) -> float:
         options_given = options_type(*to_fixed_tuple(options, options_count))
-        return float(reward_of(row_as(before, entries), force, row_as(after, entries), options_given))
+        return float(
+            reward_of(row_as(before, entries), force, row_as(after, entries), options_given)
+        )
 
     @compiled
     def ended(state: np.ndarray) -> bool:

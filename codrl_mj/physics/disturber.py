@@ -55,9 +55,9 @@ _AFTER_HISTORY = 1 + len(PULSE_NAMES)
 class Disturber:
     """What happens between the command and the physics, and the loads on the joint, once per integration step.
 
-    All it remembers is the array `memory`, a row for each actuator of each simulation: commands on their way (newest
-    first), the last command that arrived, and the pulses'. What it does is `numbers`, a row as in `Numbers` for each
-    actuator of a simulation.
+    All it remembers is the array `memory`, a row for each actuator of each simulation: commands on
+    their way (newest first), the last command that arrived, and the pulses'. What it does is
+    `numbers`, a row as in `Numbers` for each actuator of a simulation.
     """
 
     def __init__(
@@ -70,8 +70,9 @@ class Disturber:
     ) -> None:
         """Start with nothing remembered, for a number of simulations at a timestep [s].
 
-        `limits`, shape (n,), are the largest forces [N or N*m] of the actuators of one, `holds`, likewise, as in
-        `Numbers`. Where all is off, commands arrive as they are, there are no loads, and rows are empty.
+        `limits`, shape (n,), are the largest forces [N or N*m] of the actuators of one, `holds`,
+        likewise, as in `Numbers`. Where all is off, commands arrive as they are, there are no
+        loads, and rows are empty.
         """
         self.on = disturbances != OFF
         whole, fraction = whole_and_fraction(disturbances.command_delay, timestep)
@@ -88,7 +89,9 @@ class Disturber:
                 disturbances.pulse_interval,
                 hold,
             )
-            for limit, hold in zip(limits.tolist(), np.zeros(len(limits)) if holds is None else holds, strict=True)
+            for limit, hold in zip(
+                limits.tolist(), np.zeros(len(limits)) if holds is None else holds, strict=True
+            )
         ]
         self.numbers = np.array(rows) if self.on else np.empty((len(rows), 0))
         length = whole + 1 + (fraction > 0.0) + _AFTER_HISTORY if self.on else 0
@@ -111,7 +114,9 @@ class Disturber:
         arrived, loads = desired, np.zeros(desired.shape)
         if self.on:
             arrived, plain = np.empty(desired.shape), np.ascontiguousarray(desired)
-            _disturb_each(self.numbers, self.memory, *(one.reshape(-1) for one in (plain, arrived, loads)))
+            _disturb_each(
+                self.numbers, self.memory, *(one.reshape(-1) for one in (plain, arrived, loads))
+            )
         return arrived, loads
 
 
@@ -138,13 +143,19 @@ def disturb(numbers: Numbers, memory: np.ndarray, force: float) -> tuple[float, 
     if numbers.pulse_force == 0.0:
         return arrived, 0.0
     own = memory[len(memory) - len(PULSE_NAMES) :]
-    load = _pulses(own, numbers.timestep, numbers.pulse_force, numbers.pulse_duration, numbers.pulse_interval)
+    load = _pulses(
+        own, numbers.timestep, numbers.pulse_force, numbers.pulse_duration, numbers.pulse_interval
+    )
     return arrived, load
 
 
 @njit(nogil=True, error_model="numpy")
 def _disturb_each(
-    numbers: np.ndarray, memory: np.ndarray, forces: np.ndarray, commands: np.ndarray, loads: np.ndarray
+    numbers: np.ndarray,
+    memory: np.ndarray,
+    forces: np.ndarray,
+    commands: np.ndarray,
+    loads: np.ndarray,
 ) -> None:
     for row in range(len(memory)):
         own = row_as(numbers[row % len(numbers)], Numbers)

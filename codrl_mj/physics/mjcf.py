@@ -15,8 +15,8 @@ from codrl_mj.tasks.base import INTEGRATORS
 def drive(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float | None) -> None:
     """Make an actuator of an `MjSpec` one of ours, at the control callback's door; an ideal one is a plain `<motor>`.
 
-    Its gear, control, dynamics, gain and bias are overwritten. `max_force` limits the desired force [N] or torque [N*m]
-    at the joint.
+    Its gear, control, dynamics, gain and bias are overwritten. `max_force` limits the desired force
+    [N] or torque [N*m] at the joint.
     """
     ideal, family, arm = isinstance(actuator, Ideal), type(actuator), actuator.arm_radius
     target.gear = [1.0 / arm, 0, 0, 0, 0, 0]
@@ -43,8 +43,14 @@ def hills(model: mujoco.MjModel) -> list[int]:
             continue
         name = model.joint(index).name or f"joint {index}"
         if len(user) < len(HILL_NAMES):
-            raise ValueError(f"{name}: user = {list(user)}: a hill of codrl_mj needs {', '.join(HILL_NAMES)}")
-        if model.jnt_type[index] != mujoco.mjtJoint.mjJNT_SLIDE or list(model.jnt_axis[index]) != [1.0, 0.0, 0.0]:
+            raise ValueError(
+                f"{name}: user = {list(user)}: a hill of codrl_mj needs {', '.join(HILL_NAMES)}"
+            )
+        if model.jnt_type[index] != mujoco.mjtJoint.mjJNT_SLIDE or list(model.jnt_axis[index]) != [
+            1.0,
+            0.0,
+            0.0,
+        ]:
             raise ValueError(f'{name}: a hill of codrl_mj needs type="slide" and axis="1 0 0"')
         found.append(index)
     return found
@@ -56,7 +62,9 @@ def needed_callbacks(model: mujoco.MjModel) -> tuple[str, ...]:
     Raises:
         ValueError: an actuator or joint carries our signature but not our layout.
     """
-    called = [index for index in motors(model) if model.actuator_plugin[index] < 0]  # the others are plugins
+    called = [
+        index for index in motors(model) if model.actuator_plugin[index] < 0
+    ]  # the others are plugins
     return tuple(part for part, needed in (("motor", called), ("hill", hills(model))) if needed)
 
 
@@ -80,8 +88,8 @@ def install_callbacks(model: mujoco.MjModel) -> None:
 def task_model(plant: Plant) -> mujoco.MjModel:
     """Compile a plant's model.
 
-    A diverging simulation is left to diverge, so that it can be reported, instead of being reset by the engine. Where
-    the Euler integrator is made explicit, joint damping is explicit too.
+    A diverging simulation is left to diverge, so that it can be reported, instead of being reset by
+    the engine. Where the Euler integrator is made explicit, joint damping is explicit too.
     """
     task = plant.task
     try:
@@ -91,19 +99,27 @@ def task_model(plant: Plant) -> mujoco.MjModel:
     if other := [name for name in task.integrators if INTEGRATORS[name] != spec.option.integrator]:
         kind = mujoco.mjtIntegrator(spec.option.integrator).name.removeprefix("mjINT_")
         raise ValueError(
-            f"{task.asset}: its <option> has integrator {kind}, so Task.integrators cannot have {', '.join(other)}"
+            f"{task.asset}: its <option> has integrator {kind}, so Task.integrators cannot have"
+            f" {', '.join(other)}"
         )
     spec.option.timestep = plant.timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if plant.integrator == "euler":
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     joint = JointAdditions(plant.joint.armature, plant.joint.damping, plant.joint.friction)
-    for name, actuator, limit in zip(task.motors, plant.actuators, plant.max_forces.tolist(), strict=True):
+    for name, actuator, limit in zip(
+        task.motors, plant.actuators, plant.max_forces.tolist(), strict=True
+    ):
         motor = spec.actuator(name)
         if motor is None:
             there = ", ".join(repr(a.name) for a in spec.actuators) or "none"
-            raise ValueError(f"{task.asset} has no actuator {name!r}; there are {there}: rename it, or set Task.motors")
-        joint_driven = spec.joint(motor.target) if motor.trntype == mujoco.mjtTrn.mjTRN_JOINT else None
+            raise ValueError(
+                f"{task.asset} has no actuator {name!r}; there are {there}: rename it, or set"
+                " Task.motors"
+            )
+        joint_driven = (
+            spec.joint(motor.target) if motor.trntype == mujoco.mjtTrn.mjTRN_JOINT else None
+        )
         if joint_driven is None or joint_driven.type not in _ALONG:
             raise ValueError(f"{task.asset}: actuator {name!r} must drive a hinge or a slide joint")
         _check_plain(task.asset, spec.option, motor, joint_driven)
@@ -116,21 +132,28 @@ def task_model(plant: Plant) -> mujoco.MjModel:
                 spec.option.disableflags = flags_with_friction(spec.option.disableflags)
     if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
         kind, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
-        sky = spec.add_texture(type=kind, builtin=gradient, width=64, height=64)  # ours: it would be drawn on black
+        sky = spec.add_texture(
+            type=kind, builtin=gradient, width=64, height=64
+        )  # ours: it would be drawn on black
         sky.rgb1, sky.rgb2 = [0.93, 0.95, 0.97], [0.76, 0.82, 0.88]
     model = spec.compile()
     if (model.nq, model.nv) != (len(task.qpos), len(task.qvel)):
         raise ValueError(
-            f"{task.asset} has {model.nq} positions and {model.nv} velocities, and {task.name}'s state_names have "
-            f"{len(task.qpos)} and {len(task.qvel)} of them: {', '.join(task.state_names)}"
+            f"{task.asset} has {model.nq} positions and {model.nv} velocities, and {task.name}'s"
+            f" state_names have {len(task.qpos)} and {len(task.qvel)} of them:"
+            f" {', '.join(task.state_names)}"
         )
     return model
 
 
-def _check_plain(asset: str, option: mujoco.MjOption, motor: mujoco.MjsActuator, joint: mujoco.MjsJoint) -> None:
+def _check_plain(
+    asset: str, option: mujoco.MjOption, motor: mujoco.MjsActuator, joint: mujoco.MjsJoint
+) -> None:
     """Refuse what stands between a motor's force and the joint without being the actuator's: it would go unreported."""
     between = {
-        "its gear": list(motor.gear) != [1, 0, 0, 0, 0, 0] and tuple(motor.userdata)[:2] != SIGNATURE,
+        "its gear": (
+            list(motor.gear) != [1, 0, 0, 0, 0, 0] and tuple(motor.userdata)[:2] != SIGNATURE
+        ),
         "its forcerange": any(motor.forcerange),
         "its delay": motor.delay,
         "its group, which <option> disables": option.disableactuator >> motor.group & 1,
@@ -138,8 +161,8 @@ def _check_plain(asset: str, option: mujoco.MjOption, motor: mujoco.MjsActuator,
     }
     for what in (what for what, there in between.items() if there):
         raise ValueError(
-            f"{asset}: actuator {motor.name!r}: leave out {what}; gear and limits are the actuator's, such as "
-            "gear_ratio, arm_radius and max_current, and Task.max_force"
+            f"{asset}: actuator {motor.name!r}: leave out {what}; gear and limits are the"
+            " actuator's, such as gear_ratio, arm_radius and max_current, and Task.max_force"
         )
 
 
@@ -149,7 +172,9 @@ _ALONG = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 def flags_with_friction(flags: int) -> int:
     """The `disableflags` of a model whose joints have friction, from those of one whose joints have none.
 
-    Friction is a constraint of MuJoCo's: for it the solver, which the models switch off, is switched on, and starts
-    from nothing at each step, so that a step depends on the state alone.
+    Friction is a constraint of MuJoCo's: for it the solver, which the models switch off, is
+    switched on, and starts from nothing at each step, so that a step depends on the state alone.
     """
-    return flags & ~int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
+    return flags & ~int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) | int(
+        mujoco.mjtDisableBit.mjDSBL_WARMSTART
+    )

@@ -31,7 +31,9 @@ class MujocoBatchPhysics:
     Every simulation has its own actuators: parameters are per-simulation model fields.
     """
 
-    def __init__(self, plant: Plant, actuators: Sequence[Sequence[ActuatorModel]], num_threads: int = 0) -> None:
+    def __init__(
+        self, plant: Plant, actuators: Sequence[Sequence[ActuatorModel]], num_threads: int = 0
+    ) -> None:
         """Compile the model and make the rows, one for each of N tuples of `actuators` in place of the plant's.
 
         They are of its family; `num_threads` may be 0, for every CPU.
@@ -39,7 +41,9 @@ class MujocoBatchPhysics:
         self.plant, task = plant, plant.task
         self.num_envs, self._num_threads = len(actuators), num_threads
         self._nominal = MujocoPhysics(plant)
-        self._disturber = Disturber(plant.disturbances, plant.timestep, plant.max_forces, self.num_envs, plant.holds)
+        self._disturber = Disturber(
+            plant.disturbances, plant.timestep, plant.max_forces, self.num_envs, plant.holds
+        )
         self._wiring = self._nominal.wiring
         self._positions, self._velocities = np.array(task.qpos), np.array(task.qvel)
         self._fields: dict[str, np.ndarray] = {}
@@ -49,8 +53,12 @@ class MujocoBatchPhysics:
         self._bind()
         every, (arms, additions) = np.arange(self.num_envs), mounting_of(actuators)
         self._arms[:] = arms
-        if any(tuple(each) != plant.actuators for each in actuators):  # else the model has them, and no row needs to
-            self.set_parameters(every, np.array([[one.numbers for one in each] for each in actuators]), arms)
+        if any(
+            tuple(each) != plant.actuators for each in actuators
+        ):  # else the model has them, and no row needs to
+            self.set_parameters(
+                every, np.array([[one.numbers for one in each] for each in actuators]), arms
+            )
         if (additions != additions[0]).any():
             indices = [int(one.actuator) for one in self._wiring]
             mounting = Variation(bare_model(task.name, plant.joint), motors=indices, mounting=True)
@@ -64,9 +72,13 @@ class MujocoBatchPhysics:
         self.stepping = self._nominal.stepping
         self._lanes: list[tuple[Any, ...]] = []
         parts = {name: part(self.model, name) for name in ("time", "qpos", "qvel", "act")}
-        self._time, self._qpos, self._qvel, self._act = (self._states[:, one] for one in parts.values())
+        self._time, self._qpos, self._qvel, self._act = (
+            self._states[:, one] for one in parts.values()
+        )
         memory = self._disturber.memory
-        self._rows = tuple(Rows(self._states, self._arms, memory.reshape(*self._arms.shape, memory.shape[1])))
+        self._rows = tuple(
+            Rows(self._states, self._arms, memory.reshape(*self._arms.shape, memory.shape[1]))
+        )
 
     def _lane(self) -> tuple[Any, ...]:
         """The first thread's lane, when all are made for the fields of the models that differ at present."""
@@ -100,7 +112,9 @@ class MujocoBatchPhysics:
         """
         if not self.plant.motorised:
             return
-        user, gear, limits = map(self.field, ("actuator_user", "actuator_gear", "actuator_ctrlrange"))
+        user, gear, limits = map(
+            self.field, ("actuator_user", "actuator_gear", "actuator_ctrlrange")
+        )
         for at, (one, limit) in enumerate(zip(self._wiring, self.plant.max_forces, strict=True)):
             index, arm = int(one.actuator), arms[:, at]
             user[rows, index, HEAD : HEAD + numbers.shape[2]] = numbers[:, at]
@@ -158,7 +172,9 @@ class MujocoBatchPhysics:
         if steps is not self._steps:  # who helps goes on with what it was first given
             self._steps, self._board = steps, new_board()
         arguments = self._rows, tuple(steps)
-        return share(kernel, self._board, self._lanes, self.num_envs, self.plant.inner_steps, *arguments)
+        return share(
+            kernel, self._board, self._lanes, self.num_envs, self.plant.inner_steps, *arguments
+        )
 
     def observe(self, kernel: Any, rows: np.ndarray, observations: np.ndarray) -> None:
         """Observe simulations where episodes start; `kernel` is `Kernels.observe_rows`."""
@@ -179,9 +195,9 @@ class MujocoBatchPhysics:
         entry = self.plant.task.state_names[int(np.argmin(fine[first]))]
         value = states[first][np.argmin(fine[first])]
         raise SimulationDivergedError(
-            f"{self.plant.task.name}: {len(broken)} of {len(states)} simulations diverged; environment {first} at "
-            f"t = {self._time[first, 0]:g} s: {entry} = {value:g}. Reset them; if this repeats, shorten the "
-            "integration step (inner_steps) or lower the gains"
+            f"{self.plant.task.name}: {len(broken)} of {len(states)} simulations diverged;"
+            f" environment {first} at t = {self._time[first, 0]:g} s: {entry} = {value:g}. Reset"
+            " them; if this repeats, shorten the integration step (inner_steps) or lower the gains"
         )
 
     def snapshot(self) -> np.ndarray:

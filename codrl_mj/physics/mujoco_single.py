@@ -20,9 +20,10 @@ ARM = Wiring._fields.index("arm")
 class MujocoPhysics(Physics):
     """A task's MJCF model and its data.
 
-    One `mj_step` is one integration step. With CartPole's explicit Euler integrator the positions are then moved by the
-    old velocity instead of the new one, which for slide and hinge joints is exactly Gymnasium's update. Where the task
-    has bounds (`Task.constrain`), the state is put back inside them after every integration step.
+    One `mj_step` is one integration step. With CartPole's explicit Euler integrator the positions
+    are then moved by the old velocity instead of the new one, which for slide and hinge joints is
+    exactly Gymnasium's update. Where the task has bounds (`Task.constrain`), the state is put back
+    inside them after every integration step.
     """
 
     def __init__(self, plant: Plant) -> None:
@@ -40,8 +41,14 @@ class MujocoPhysics(Physics):
             joint = self.model.actuator_trnid[index, 0]
             dof, qpos = self.model.jnt_dofadr[joint], self.model.jnt_qposadr[joint]
             first = max(self.model.actuator_actadr[index], 0)
-            self.wiring.append(Wiring(index, self.model.actuator_ctrladr[index], first, dof, actuator.arm_radius, qpos))
-        self.settings = np.hstack([np.array(self.wiring, dtype=np.float64), self._disturber.numbers])
+            self.wiring.append(
+                Wiring(
+                    index, self.model.actuator_ctrladr[index], first, dof, actuator.arm_radius, qpos
+                )
+            )
+        self.settings = np.hstack(
+            [np.array(self.wiring, dtype=np.float64), self._disturber.numbers]
+        )
         """See `codrl_mj.physics.stepping`, where `places` and `where`, too, are explained."""
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
@@ -68,7 +75,9 @@ class MujocoPhysics(Physics):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, in this or another process."""
         self.__dict__.update(state)
-        self.model = self.data.model  # the one model of the copy: whoever changes either changes the simulation
+        self.model = (
+            self.data.model
+        )  # the one model of the copy: whoever changes either changes the simulation
         self._bind()
 
     @property
@@ -121,7 +130,9 @@ class MujocoPhysics(Physics):
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
-        mujoco.mj_passive(self.model, self.data)  # where there is a hill, its callback puts the car on it
+        mujoco.mj_passive(
+            self.model, self.data
+        )  # where there is a hill, its callback puts the car on it
 
     def step(self, desired_force: Any) -> None:
         """See `Physics.step`."""

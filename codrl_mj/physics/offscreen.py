@@ -20,15 +20,17 @@ class RenderingUnavailableError(RuntimeError):
 
 
 _open: "weakref.WeakSet[OffscreenRenderer]" = weakref.WeakSet()
-_fatal: list[mujoco.FatalError] = []  # why there is no OpenGL in this process: another attempt would end it
+_fatal: list[
+    mujoco.FatalError
+] = []  # why there is no OpenGL in this process: another attempt would end it
 
 
 @functools.cache
 def _watch_process() -> None:
     """At exit free the contexts that nobody closed, while the OpenGL library is still there: later it complains.
 
-    To be called after the first context is made: the library registers its own shutdown then, and the last one
-    registered runs first. In a process forked off, contexts are made anew.
+    To be called after the first context is made: the library registers its own shutdown then, and
+    the last one registered runs first. In a process forked off, contexts are made anew.
     """
 
     @atexit.register
@@ -43,7 +45,8 @@ def _watch_process() -> None:
 def _leave_to_parent() -> None:
     """Let go of contexts and display after a fork: a software renderer's threads stayed behind, waiting for them hangs.
 
-    A display on another platform has threads of its own. Where there is none, the inherited one has to do.
+    A display on another platform has threads of its own. Where there is none, the inherited one has
+    to do.
     """
     egl: Any = sys.modules.get("mujoco.egl")
     if egl is None:
@@ -53,7 +56,10 @@ def _leave_to_parent() -> None:
         _abandon(renderer._renderer)
         renderer._renderer = None
     try:
-        egl.EGL_DISPLAY = egl.EGL.eglGetPlatformDisplayEXT(_EGL_PLATFORM_SURFACELESS, None, None) or egl.EGL_DISPLAY
+        egl.EGL_DISPLAY = (
+            egl.EGL.eglGetPlatformDisplayEXT(_EGL_PLATFORM_SURFACELESS, None, None)
+            or egl.EGL_DISPLAY
+        )
     except Exception:  # of PyOpenGL, which only the EGL backend needs
         return
 
@@ -64,8 +70,9 @@ _EGL_PLATFORM_SURFACELESS = 0x31DD
 class OffscreenRenderer:
     """Draws a model into RGB arrays.
 
-    By default shadows, reflections and multisampling are off: on a CPU renderer they cost ten times the rest. What is
-    left goes for the larger part into the sky, which is drawn once for each pose of the camera.
+    By default shadows, reflections and multisampling are off: on a CPU renderer they cost ten times
+    the rest. What is left goes for the larger part into the sky, which is drawn once for each pose
+    of the camera.
     """
 
     def __init__(
@@ -107,21 +114,27 @@ class OffscreenRenderer:
         limits, (width, height) = self._model.vis.global_, self._size
         largest = limits.offwidth, limits.offheight
         try:
-            if egl is not None and egl.EGL_DISPLAY:  # MuJoCo makes it once, but SDL (pygame) ends it with its window
+            if (
+                egl is not None and egl.EGL_DISPLAY
+            ):  # MuJoCo makes it once, but SDL (pygame) ends it with its window
                 egl.EGL.eglInitialize(egl.EGL_DISPLAY, None, None)
             limits.offwidth, limits.offheight = self._size
             if _fatal:
                 raise _fatal[0]
             return mujoco.Renderer(self._model, height=height, width=width)
         except Exception as error:  # each backend raises its own kind, most of them not exported
-            if not _fatal and isinstance(error, mujoco.FatalError) and "platform library" in str(error):
+            if (
+                not _fatal
+                and isinstance(error, mujoco.FatalError)
+                and "platform library" in str(error)
+            ):
                 _fatal.append(error)
             backend = os.environ.get("MUJOCO_GL", "not set")
             raise RenderingUnavailableError(
-                f"cannot make an OpenGL context (MUJOCO_GL is {backend}): {type(error).__name__}: {error}. Without a "
-                "display, install a software renderer (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri) and "
-                "set MUJOCO_GL=egl before mujoco is first imported: in the shell, or by importing codrl_mj before "
-                "mujoco"
+                f"cannot make an OpenGL context (MUJOCO_GL is {backend}): {type(error).__name__}:"
+                f" {error}. Without a display, install a software renderer (Debian, Ubuntu: apt-get"
+                " install libegl1 libgl1-mesa-dri) and set MUJOCO_GL=egl before mujoco is first"
+                " imported: in the shell, or by importing codrl_mj before mujoco"
             ) from error
         finally:
             limits.offwidth, limits.offheight = largest
@@ -145,7 +158,9 @@ class OffscreenRenderer:
         if not self._sky_apart:
             return self._renderer.render()
         scene = self._renderer.scene
-        view = bytes(np.concatenate([np.append(camera.forward, camera.up) for camera in scene.camera]))
+        view = bytes(
+            np.concatenate([np.append(camera.forward, camera.up) for camera in scene.camera])
+        )
         if view != self._sky[0]:  # what the camera sees where there is nothing
             scene.ngeom, count = 0, scene.ngeom
             self._sky = view, self._renderer.render()
@@ -215,12 +230,18 @@ def check_view(model: mujoco.MjModel, width: int, height: int, camera: str) -> N
         ("width", width, model.vis.global_.offwidth),
         ("height", height, model.vis.global_.offheight),
     ):
-        if isinstance(value, bool) or not isinstance(value, numbers.Integral) or not 1 <= value <= largest:
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, numbers.Integral)
+            or not 1 <= value <= largest
+        ):
             raise ValueError(f"{name} = {value!r}: must be an integer from 1 to {largest} [px]")
     names = [model.camera(index).name for index in range(model.ncam)]
     if camera not in names:
         hint = did_you_mean(camera, names)
-        raise ValueError(f"camera = {camera!r}: {hint}The model's cameras are {', '.join(names) or 'none'}")
+        raise ValueError(
+            f"camera = {camera!r}: {hint}The model's cameras are {', '.join(names) or 'none'}"
+        )
 
 
 class Window:
@@ -231,7 +252,9 @@ class Window:
         try:
             import pygame
         except ImportError:
-            raise DependencyNotInstalled("render_mode = 'human' needs pygame: pip install pygame-ce") from None
+            raise DependencyNotInstalled(
+                "render_mode = 'human' needs pygame: pip install pygame-ce"
+            ) from None
         self._pygame: Any = pygame
         pygame.display.init()
         self._screen = pygame.display.set_mode((width, height))

@@ -1,8 +1,8 @@
 """Rows of states that threads put, one after the other, into simulations of their own.
 
-What differs between two simulations of a task is a row of arrays: the engine's state, fields of the model, the arms and
-the disturbances' memory. A thread has one simulation (`Lane`); it loads a row, does to it what is to be done to any
-simulation, and stores the row again.
+What differs between two simulations of a task is a row of arrays: the engine's state, fields of the
+model, the arms and the disturbances' memory. A thread has one simulation (`Lane`); it loads a row,
+does to it what is to be done to any simulation, and stores the row again.
 """
 
 from collections.abc import Mapping
@@ -50,8 +50,9 @@ class Lane(NamedTuple):
     """A thread's simulation, and what of a row goes where in it."""
 
     fields: np.ndarray
-    """For each field of the model that the rows have: its address, that of the first row's value, bytes from row to row
-    and bytes of a value; shape (f, 4)."""
+    """For each field of the model that the rows have: its address, that of the first row's value,
+    bytes from row to row and bytes of a value; shape (f, 4).
+    """
     parts: np.ndarray
     """For each part of the state: its address in the data, its first entry in a row, its length; shape (p, 3)."""
     places: np.ndarray

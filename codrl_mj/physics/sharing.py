@@ -1,7 +1,8 @@
 """Threads that share the rows of a batch, step after step.
 
-One thread leads: it begins a turn, takes part in it and ends it. Others help: they look out for turns in compiled code,
-where none of them needs the interpreter, and sleep when none has begun for a while. They meet at a board of the batch.
+One thread leads: it begins a turn, takes part in it and ends it. Others help: they look out for
+turns in compiled code, where none of them needs the interpreter, and sleep when none has begun for
+a while. They meet at a board of the batch.
 """
 
 import atexit
@@ -23,16 +24,19 @@ from codrl_mj.physics.compiled_task import Compiled
 _WORTH_WAKING = 64
 """Integration steps of a thread's that are worth waking it."""
 _PATIENCE, _AT_ONCE = 1000, 500
-"""How often a thread looks for the next turn before it sleeps: about a millisecond; and before it offers its CPU to
-those who have none."""
+"""How often a thread looks for the next turn before it sleeps: about a millisecond; and before it
+offers its CPU to those who have none.
+"""
 _offer_cpu = external(
     "offer_cpu",
     ctypes.windll.kernel32.SwitchToThread if os.name == "nt" else ctypes.CDLL(None).sched_yield,  # type: ignore[attr-defined]
     types.int32(),
 )
 CLAIMED, BROKEN, TURN, HELPING = range(0, 32, 8)
-"""What a board counts, a cache line each: rows that were taken, simulations no longer of numbers, turns that began and
-that ended (so it is odd while one goes on), and threads that help in the present one."""
+"""What a board counts, a cache line each: rows that were taken, simulations no longer of numbers,
+turns that began and that ended (so it is odd while one goes on), and threads that help in the
+present one.
+"""
 
 
 def cpus() -> int:
@@ -101,9 +105,10 @@ def _joined(board: np.ndarray, last: int) -> int:
 def shared(do: Compiled) -> Compiled:
     """What shares rows: (whether it leads, board, rows, threads, lane, arguments) -> nothing.
 
-    It leads one turn; or it helps in turns as they come, until none has begun in a short while. `do` is a compiled
-    function (first row, last and past it, lane, *arguments) -> simulations no longer of numbers. Threads claim rows
-    until there are none left, fewer the fewer are left: nobody waits long for another, or at all for one that is late.
+    It leads one turn; or it helps in turns as they come, until none has begun in a short while.
+    `do` is a compiled function (first row, last and past it, lane, *arguments) -> simulations no
+    longer of numbers. Threads claim rows until there are none left, fewer the fewer are left:
+    nobody waits long for another, or at all for one that is late.
     """
 
     @internal
@@ -117,7 +122,9 @@ def shared(do: Compiled) -> Compiled:
                 _counted(board, BROKEN, do(first, min(first + more, count), lane, *arguments))
 
     @njit(nogil=True, error_model="numpy")
-    def take_part(leads: bool, board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any) -> None:
+    def take_part(
+        leads: bool, board: np.ndarray, count: int, threads: int, lane: Any, arguments: Any
+    ) -> None:
         turn = _begun(board) if leads else _joined(board, 0)
         while turn:
             work(board, count, threads, lane, arguments)
@@ -162,18 +169,27 @@ def _dismiss() -> None:
         worker.thread.join(1.0)
 
 
-def share(function: Compiled, board: np.ndarray, lanes: Sequence[Any], count: int, steps: int, *arguments: Any) -> bool:
+def share(
+    function: Compiled,
+    board: np.ndarray,
+    lanes: Sequence[Any],
+    count: int,
+    steps: int,
+    *arguments: Any,
+) -> bool:
     """Do what is `shared` to so many rows, of `steps` integration steps each, on as many threads as there are lanes.
 
-    Whoever has a board gives the same lanes and arguments with it each time. Returns whether a simulation is no longer
-    one of numbers.
+    Whoever has a board gives the same lanes and arguments with it each time. Returns whether a
+    simulation is no longer one of numbers.
     """
     threads = min(len(lanes), 1 + count * steps // _WORTH_WAKING)
     for at in range(threads - 1):
         if at == len(_WORKERS):
             _WORKERS.append(_Worker())
         worker = _WORKERS[at]
-        if worker.board is not board and worker.tasks.empty():  # it helps one batch of several that take turns
+        if (
+            worker.board is not board and worker.tasks.empty()
+        ):  # it helps one batch of several that take turns
             worker.board = board
             worker.tasks.put((function, board, count, threads, lanes[at + 1], arguments))
     function(True, board, count, threads, lanes[0], arguments)

@@ -1,9 +1,10 @@
 """One environment step of one simulation in MuJoCo, compiled: the engine's step with what comes before and after it.
 
-A compiled function knows a simulation by one number, `where`: the address of its `Places`. `settings` has a row for
-each actuator, a `Wiring` and then a disturber's `Numbers`; `memory` is a disturber's, a row for each actuator; `trace`
-that of `Physics`. They are live: what changes them changes the simulation. What an environment has beside it, options
-and observation, is for `codrl_mj.envs.compiled`.
+A compiled function knows a simulation by one number, `where`: the address of its `Places`.
+`settings` has a row for each actuator, a `Wiring` and then a disturber's `Numbers`; `memory` is a
+disturber's, a row for each actuator; `trace` that of `Physics`. They are live: what changes them
+changes the simulation. What an environment has beside it, options and observation, is for
+`codrl_mj.envs.compiled`.
 """
 
 import functools
@@ -79,7 +80,9 @@ def places_of(data: Any, settings: np.ndarray, memory: np.ndarray, trace: np.nda
 def simulation_at(where: int) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
     """Addresses of model and data of the simulation at an address, settings, memory and trace."""
     at = i64(where)
-    found = Places(at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7], at[8], at[9], at[10], at[11])
+    found = Places(
+        at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7], at[8], at[9], at[10], at[11]
+    )
     settings = numba.carray(f64(found.settings), (found.actuators, found.of_settings))
     memory = numba.carray(f64(found.memory), (found.actuators, found.of_memory))
     trace = numba.carray(f64(found.trace), (found.inner_steps, found.actuators, found.columns))
@@ -93,8 +96,10 @@ class Stepping(NamedTuple):
     """Compiled functions; `where` is that of the module's docstring."""
 
     step: Compiled
-    """(force, where) -> whether the state is still one of numbers within `LARGEST`: takes one environment step
-    under a desired force [N or N*m], or under several, an array (n,). What the actuators did is in `trace`."""
+    """(force, where) -> whether the state is still one of numbers within `LARGEST`: takes one
+    environment step under a desired force [N or N*m], or under several, an array (n,). What the
+    actuators did is in `trace`.
+    """
     start: Compiled
     """(state (n,), key, where) -> nothing: starts an episode, as `Physics.reset` does."""
     read: Compiled
@@ -110,7 +115,9 @@ def compiled_stepping(plant: Plant) -> Stepping:
         load_family(plant.family)
     order, explicit = (task.qpos, task.qvel), plant.integrator == "euler"
     kept = compiled_constrain(task.constrain, task.state_names, *order)
-    return _stepping(kept, compiled_reader(*order), *order, explicit, disturbed, plant.family, plant.motorised)
+    return _stepping(
+        kept, compiled_reader(*order), *order, explicit, disturbed, plant.family, plant.motorised
+    )
 
 
 def force_of(forces: Any, actuator: int) -> float:
@@ -153,7 +160,9 @@ def _stepping(
                 command = force_of(force, actuator)
                 if disturbed:
                     numbers = row_as(settings[actuator, WIRING:], Numbers)
-                    command, DATA.qfrc_applied(data)[int(wiring.dof)] = disturb(numbers, memory[actuator], command)
+                    command, DATA.qfrc_applied(data)[int(wiring.dof)] = disturb(
+                        numbers, memory[actuator], command
+                    )
                 ctrl[int(wiring.ctrl)] = command * wiring.arm
                 trace[inner, actuator, 0] = command
             if explicit:
@@ -190,12 +199,16 @@ def _stepping(
             qvel[entry] = state[velocities[entry]]
         for actuator in range(len(settings)):
             if motorised:
-                DATA.act(data)[int(row_as(settings[actuator], Wiring).act) + NOISE_KEY] = key + actuator
+                DATA.act(data)[int(row_as(settings[actuator], Wiring).act) + NOISE_KEY] = (
+                    key + actuator
+                )
             if disturbed:
                 hold = row_as(settings[actuator, WIRING:], Numbers).hold
                 position = qpos[int(row_as(settings[actuator], Wiring).qpos)]
                 memory[actuator] = 0.0
-                memory[actuator, : memory.shape[1] + KEY_COLUMN] = hold * position if hold != 0.0 else 0.0
+                memory[actuator, : memory.shape[1] + KEY_COLUMN] = (
+                    hold * position if hold != 0.0 else 0.0
+                )
                 memory[actuator, memory.shape[1] + KEY_COLUMN] = key + actuator
 
     @njit(nogil=True, error_model="numpy")

@@ -32,7 +32,8 @@ def _fill(addresses: np.ndarray, drawn: np.ndarray) -> None:
 class Streams:
     """N independent `numpy.random.Generator`s; stream i draws what the i-th generator alone would draw.
 
-    The draws are NumPy's own: its `next_double` is called on each generator's state from compiled code.
+    The draws are NumPy's own: its `next_double` is called on each generator's state from compiled
+    code.
     """
 
     def __init__(self, size: int) -> None:
@@ -81,9 +82,18 @@ def words_of(generator: np.random.Generator) -> np.ndarray:
     """Where a generator stands, shape (6,), uint64."""
     pcg: Any = generator.bit_generator.state
     if pcg["bit_generator"] != "PCG64":
-        raise ValueError(f"np_random is a {pcg['bit_generator']}: must be a PCG64, as Gymnasium's reset makes it")
+        raise ValueError(
+            f"np_random is a {pcg['bit_generator']}: must be a PCG64, as Gymnasium's reset makes it"
+        )
     state, increment = pcg["state"]["state"], pcg["state"]["inc"]
-    words = [state >> 64, state & _LOW, increment >> 64, increment & _LOW, pcg["has_uint32"], pcg["uinteger"]]
+    words = [
+        state >> 64,
+        state & _LOW,
+        increment >> 64,
+        increment & _LOW,
+        pcg["has_uint32"],
+        pcg["uinteger"],
+    ]
     return np.array(words, dtype=np.uint64)
 
 

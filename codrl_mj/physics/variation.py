@@ -23,7 +23,9 @@ _FIELDS = {
     "damping": ("dof_damping",),
     "gravity": ("opt.gravity", "jnt_user"),
 }
-VARIED = tuple(dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in SHOWN))
+VARIED = tuple(
+    dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in SHOWN)
+)
 """Fields that the dynamics depend on."""
 
 
@@ -41,7 +43,8 @@ class Mount(NamedTuple):
 def mounts_of(model: mujoco.MjModel, index: int) -> tuple[Mount | None, ...]:
     """Where an actuator's additions go, entries as in `JointAdditions`; None where the model has no place for them.
 
-    Those of a motor in the control callback are its joint's; a plugin keeps gear, inertia and damping to itself.
+    Those of a motor in the control callback are its joint's; a plugin keeps gear, inertia and
+    damping to itself.
     """
     kind, driven = mujoco.mjtTrn(model.actuator_trntype[index]), int(model.actuator_trnid[index, 0])
     rubs: Mount | None = None
@@ -49,7 +52,9 @@ def mounts_of(model: mujoco.MjModel, index: int) -> tuple[Mount | None, ...]:
     if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
         dof = int(model.jnt_dofadr[driven])
         if model.actuator_plugin[index] < 0:
-            return tuple(Mount(f"dof_{name}", dof, 1.0) for name in ("armature", "damping", "frictionloss"))
+            return tuple(
+                Mount(f"dof_{name}", dof, 1.0) for name in ("armature", "damping", "frictionloss")
+            )
         rubs = Mount("dof_frictionloss", dof, scale)
     elif kind == mujoco.mjtTrn.mjTRN_TENDON:
         rubs = Mount("tendon_frictionloss", driven, scale)
@@ -80,7 +85,9 @@ def mounting_of(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, 
 
 def variable(model: mujoco.MjModel) -> tuple[str, ...]:
     """Names of what can be varied of a model."""
-    bodies = {body: model.body(body).name for body in range(1, model.nbody) if model.body(body).name}
+    bodies = {
+        body: model.body(body).name for body in range(1, model.nbody) if model.body(body).name
+    }
     joints = [model.joint(joint).name for joint in range(model.njnt)]
     names = [f"model.mass.{name}" for name in bodies.values()]
     names += [f"model.length.{name}" for body, name in bodies.items() if _has_length(model, body)]
@@ -92,38 +99,57 @@ def _has_length(model: mujoco.MjModel, body: int) -> bool:
     """Whether a body turns about its joint, has its centre of mass on the z axis from there, and touches nothing."""
     joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
     turns = all(
-        model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_pos[joint].any() for joint in joints
+        model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_pos[joint].any()
+        for joint in joints
     )
     flags = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
-    touches = (model.geom_contype | model.geom_conaffinity).any() and not model.opt.disableflags & flags
+    touches = (
+        model.geom_contype | model.geom_conaffinity
+    ).any() and not model.opt.disableflags & flags
     held = touches or model.ntendon or model.neq
     x, y, z = model.body_ipos[body]
-    return turns and bool(z) and x == y == 0.0 and list(model.body_iquat[body]) == [1.0, 0.0, 0.0, 0.0] and not held
+    return (
+        turns
+        and bool(z)
+        and x == y == 0.0
+        and list(model.body_iquat[body]) == [1.0, 0.0, 0.0, 0.0]
+        and not held
+    )
 
 
 class Variation:
     """How numbers change the fields of a compiled model.
 
-    `model.mass.BODY` multiplies a body's mass and inertia, `model.length.BODY` all distances along it (its centre of
-    mass, what hangs on it, what is drawn of it) and, squared, its inertia about the axes across it, `model.gravity`
-    gravity and the force of a hill; `model.damping.JOINT` is the damping [N*s/m or N*m*s/rad] added to a joint.
+    `model.mass.BODY` multiplies a body's mass and inertia, `model.length.BODY` all distances along
+    it (its centre of mass, what hangs on it, what is drawn of it) and, squared, its inertia about
+    the axes across it, `model.gravity` gravity and the force of a hill; `model.damping.JOINT` is
+    the damping [N*s/m or N*m*s/rad] added to a joint.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, names: Sequence[str] = (), motors: Sequence[int] = (), mounting: bool = False
+        self,
+        model: mujoco.MjModel,
+        names: Sequence[str] = (),
+        motors: Sequence[int] = (),
+        mounting: bool = False,
     ) -> None:
         """Find the fields of what is varied, names of `variable(model)`.
 
-        `motors` are the indices of actuators whose additions are not in the model; `mounting` varies these, too.
+        `motors` are the indices of actuators whose additions are not in the model; `mounting`
+        varies these, too.
         """
         self.names = tuple(names)
         self._mounts = [mounts_of(model, index) for index in motors]
         fields = [field for name in names for field in _FIELDS[name.split(".")[1]]]
-        fields += [mount.field for mounts in self._mounts for mount in mounts if mount is not None] * mounting
+        fields += [
+            mount.field for mounts in self._mounts for mount in mounts if mount is not None
+        ] * mounting
         self._nominal = {field: field_of(model, field).copy() for field in fields}
         self._neutral = np.array([float(not name.startswith("model.damping.")) for name in names])
         self._bodies = {model.body(body).name: body for body in range(model.nbody)}
-        self._dofs = {model.joint(joint).name: model.dof_jntid == joint for joint in range(model.njnt)}
+        self._dofs = {
+            model.joint(joint).name: model.dof_jntid == joint for joint in range(model.njnt)
+        }
         self._parents = model.body_parentid.copy()
         self._geom_bodies = model.geom_bodyid.copy()
         self._geoms_along = _along(model)
@@ -134,15 +160,18 @@ class Variation:
     ) -> dict[str, np.ndarray]:
         """The varied fields of the model, by name (`opt.` before an option's), shape (m, ...).
 
-        `values`, shape (m, k), has a column for each of `names`, NaN where it is as it was; `additions` are as
-        `mounting_of` has them; `shown` includes the fields that only pictures depend on.
+        `values`, shape (m, k), has a column for each of `names`, NaN where it is as it was;
+        `additions` are as `mounting_of` has them; `shown` includes the fields that only pictures
+        depend on.
         """
         fields = {
             field: np.repeat(nominal[np.newaxis], len(values), axis=0)
             for field, nominal in self._nominal.items()
             if shown or field not in SHOWN
         }
-        for name, column in zip(self.names, np.where(np.isnan(values), self._neutral, values).T, strict=True):
+        for name, column in zip(
+            self.names, np.where(np.isnan(values), self._neutral, values).T, strict=True
+        ):
             kind, _, target = name.removeprefix("model.").partition(".")
             body, each = self._bodies.get(target), column[:, np.newaxis]
             if kind == "mass":
@@ -152,7 +181,11 @@ class Variation:
                 fields["body_ipos"][:, body] *= each
                 fields["body_inertia"][:, body, :2] *= each**2
                 fields["body_pos"][:, self._parents == body] *= each[:, np.newaxis]
-                for geom in np.flatnonzero(self._geom_bodies == body).tolist() if "geom_pos" in fields else ():
+                for geom in (
+                    np.flatnonzero(self._geom_bodies == body).tolist()
+                    if "geom_pos" in fields
+                    else ()
+                ):
                     fields["geom_pos"][:, geom, 2] *= column
                     if geom in self._geoms_along:
                         fields["geom_size"][:, geom, self._geoms_along[geom]] *= column
@@ -172,7 +205,11 @@ class Variation:
 def _along(model: mujoco.MjModel) -> dict[int, int]:
     """Geoms with a length along their body's z axis, each with the entry of its size that is half that length."""
     kinds = mujoco.mjtGeom
-    entries = {int(kinds.mjGEOM_CAPSULE): 1, int(kinds.mjGEOM_CYLINDER): 1, int(kinds.mjGEOM_BOX): 2}
+    entries = {
+        int(kinds.mjGEOM_CAPSULE): 1,
+        int(kinds.mjGEOM_CYLINDER): 1,
+        int(kinds.mjGEOM_BOX): 2,
+    }
     found = {}
     for geom in range(model.ngeom):
         matrix = np.empty(9)
@@ -191,4 +228,6 @@ def field_of(model: mujoco.MjModel, name: str) -> np.ndarray:
 def write_fields(model: mujoco.MjModel, fields: Mapping[str, np.ndarray], row: int = 0) -> None:
     """Write one row of varied fields into a model; what the engine derives from them is not changed."""
     for name, values in fields.items():
-        setattr(model.opt if name.startswith("opt.") else model, name.removeprefix("opt."), values[row])
+        setattr(
+            model.opt if name.startswith("opt.") else model, name.removeprefix("opt."), values[row]
+        )

@@ -17,12 +17,14 @@ from codrl_mj.runs.files import check_page, writing
 
 _HERE = Path(__file__).parent
 _POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; connect-src blob:"
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
+    " blob:; connect-src blob:"
 )
 """What the browser itself holds the page to: nothing is fetched."""
 SCRIPT = "const setTime = codrlReplay(element);"
-"""JavaScript that defines `setTime(seconds)`, which shows that instant; it needs `library` before it in the page, and
-sees `element`, which a replay stands in. It follows a clock, and moves none."""
+"""JavaScript that defines `setTime(seconds)`, which shows that instant; it needs `library` before
+it in the page, and sees `element`, which a replay stands in. It follows a clock, and moves none.
+"""
 _MOST_PER_SECOND = 30
 """Instants; between them a viewer goes straight, and turns evenly."""
 
@@ -64,17 +66,22 @@ def motion(
         show: brings a simulation of the model into a state.
 
     Raises:
-        ValueError: `states` and `time` do not fit each other or the model, `time` does not ascend, or the model has no
-            such camera.
+        ValueError: `states` and `time` do not fit each other or the model, `time` does not ascend,
+            or the model has no such camera.
     """
     time = np.asarray(time, dtype=float)
     if len(states) != len(time) or not len(time):
-        raise ValueError(f"states: there are {len(states)} for {len(time)} instants: must be one for each, and some")
+        raise ValueError(
+            f"states: there are {len(states)} for {len(time)} instants: must be one for each, and"
+            " some"
+        )
     if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
         raise ValueError("time: must be finite, and ascend from each instant to the next")
     cameras = [model.camera(index).name for index in range(model.ncam)]
     if camera is not None and camera not in cameras:
-        raise ValueError(f"camera = {camera!r}: the model's cameras are {', '.join(cameras) or 'none'}")
+        raise ValueError(
+            f"camera = {camera!r}: the model's cameras are {', '.join(cameras) or 'none'}"
+        )
     if show is None and np.shape(states)[-1] < model.nq:
         have = f"a row has {np.shape(states)[-1]} entries"
         raise ValueError(f"states: {have}: must begin with the model's {model.nq} of qpos")
@@ -88,15 +95,21 @@ def motion(
     seen, show, time = shapes(model), show or by_positions, time - time[0]
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     stride = max(1, int(1.0 / (_MOST_PER_SECOND * step) + 1e-9))
-    chosen = np.unique([*range(0, len(time), stride), len(time) - 1])  # the last, and as many others as are needed
+    chosen = np.unique(
+        [*range(0, len(time), stride), len(time) - 1]
+    )  # the last, and as many others as are needed
     poses = np.empty((len(chosen), model.nbody, 7))
     for row, index in zip(poses, chosen, strict=True):
         read_poses(show(states[index]), seen, row)
     spread = np.ptp(poses, axis=0).max(axis=1)
-    bodies = np.array([body for body in sorted({one.body for one in seen}) if spread[body] > 1e-9], dtype=int)
+    bodies = np.array(
+        [body for body in sorted({one.body for one in seen}) if spread[body] > 1e-9], dtype=int
+    )
     moved = poses[:, bodies]
     for before, after in zip(moved[:-1, :, 3:], moved[1:, :, 3:], strict=True):
-        after[(before * after).sum(axis=1) < 0] *= -1  # a quaternion and its negative are one turn: no jumps
+        after[
+            (before * after).sum(axis=1) < 0
+        ] *= -1  # a quaternion and its negative are one turn: no jumps
     return Motion(model, seen, time[chosen], bodies, moved.astype(np.float32), poses[0], camera)
 
 
@@ -116,11 +129,14 @@ def replay(what: Motion, label: str) -> str:
     data = json.dumps(_content(what)).replace("<", "\\u003c")
     return (
         f"<style>{_text('replay.css')}</style>\n"
-        f'<div class="replay"><canvas tabindex="0" role="img" aria-label="{html.escape(label)}: three-dimensional, '
-        'drag to turn, wheel to zoom, right button to move; keys R: view from the beginning, F: follow"></canvas>\n'
+        f'<div class="replay"><canvas tabindex="0" role="img" aria-label="{html.escape(label)}:'
+        " three-dimensional, "
+        "drag to turn, wheel to zoom, right button to move; keys R: view from the beginning, F:"
+        ' follow"></canvas>\n'
         f'<p class="replay-none" hidden>This browser shows no WebGL, which a replay needs.</p>\n'
         '<div class="replay-view"><button type="button" data-do="reset" title="R">view</button>'
-        '<button type="button" data-do="follow" title="F" aria-pressed="false">follow</button></div>\n'
+        '<button type="button" data-do="follow" title="F"'
+        ' aria-pressed="false">follow</button></div>\n'
         f'<script type="application/json">{data}</script></div>'
     )
 
@@ -152,7 +168,9 @@ def write_replay(what: Motion, path: Path, title: str) -> Path:
     }
     text = _text("page.html")
     before, *rest = text.split("{{")
-    filled = before + "".join(entries[name] + after for name, after in (one.split("}}", 1) for one in rest))
+    filled = before + "".join(
+        entries[name] + after for name, after in (one.split("}}", 1) for one in rest)
+    )
     with writing(path) as temporary:
         temporary.write_text(filled, encoding="utf-8")
     return path
@@ -182,7 +200,11 @@ def _content(what: Motion) -> dict[str, Any]:
                 "at": _rounded([*one.position, *one.orientation]),
                 "chequered": one.chequered,
                 **({"mesh": used.index(one.mesh)} if one.mesh is not None else {}),
-                **({"body": places[one.body]} if one.body in places else {"frame": _rounded(what.still[one.body])}),
+                **(
+                    {"body": places[one.body]}
+                    if one.body in places
+                    else {"frame": _rounded(what.still[one.body])}
+                ),
             }
             for one in what.shapes
         ],
@@ -195,7 +217,9 @@ def _meshes(model: mujoco.MjModel, used: list[tuple[str, int]]) -> list[dict[str
     total = sum(len(triangles) for _, triangles in whole)
     made = []
     for vertices, triangles in whole:
-        few, corners = thinned(vertices, triangles, max(32, int(TRIANGLES * len(triangles) / max(total, 1))))
+        few, corners = thinned(
+            vertices, triangles, max(32, int(TRIANGLES * len(triangles) / max(total, 1)))
+        )
         low, span = few.min(axis=0), max(float(np.ptp(few, axis=0).max()), 1e-12)
         grid = np.round((few - low) / span * 65535).astype(np.uint16)
         index = corners.astype(np.uint16 if len(few) < 65536 else np.uint32)
@@ -212,7 +236,9 @@ def _meshes(model: mujoco.MjModel, used: list[tuple[str, int]]) -> list[dict[str
 
 
 def _packed(values: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()  # little-endian, as browsers are
+    return base64.b64encode(
+        np.ascontiguousarray(values).tobytes()
+    ).decode()  # little-endian, as browsers are
 
 
 def _rounded(values: Any) -> list[float]:

@@ -65,13 +65,29 @@ def shapes(model: mujoco.MjModel) -> list[Shape]:
             name = _NAMES.get(int(one["type"]))
             if name is None or colour[3] == 0.0 or one["group"] >= _SHOWN_GROUPS:
                 continue
-            size = np.repeat(one["size"][:1], 3) if one["type"] == _GEOM.mjGEOM_SPHERE else one["size"]
+            size = (
+                np.repeat(one["size"][:1], 3) if one["type"] == _GEOM.mjGEOM_SPHERE else one["size"]
+            )
             mesh = None
             if name == "mesh":
-                mesh = "hfield" if one["type"] == _GEOM.mjGEOM_HFIELD else "mesh", int(model.geom_dataid[index])
+                mesh = (
+                    "hfield" if one["type"] == _GEOM.mjGEOM_HFIELD else "mesh",
+                    int(model.geom_dataid[index]),
+                )
             geom = index if kind == "geom" else None
             place = one["pos"].copy(), one["quat"].copy()
-            found.append(Shape(name, tuple(size.tolist()), colour, int(one["bodyid"]), *place, geom, mesh, pictured))
+            found.append(
+                Shape(
+                    name,
+                    tuple(size.tolist()),
+                    colour,
+                    int(one["bodyid"]),
+                    *place,
+                    geom,
+                    mesh,
+                    pictured,
+                )
+            )
     return found
 
 
@@ -113,7 +129,9 @@ def mesh(model: mujoco.MjModel, kind: str, index: int) -> tuple[np.ndarray, np.n
     )
 
 
-def thinned(vertices: np.ndarray, triangles: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+def thinned(
+    vertices: np.ndarray, triangles: np.ndarray, most: int
+) -> tuple[np.ndarray, np.ndarray]:
     """A mesh of at most some number of triangles: vertices that share a cell of a grid become one, in their midst.
 
     (Rossignac and Borrel, Multi-resolution 3D approximations for rendering complex scenes, 1993.)
@@ -122,7 +140,9 @@ def thinned(vertices: np.ndarray, triangles: np.ndarray, most: int) -> tuple[np.
     while len(triangles) > most and cells > 2:
         low, span = vertices.min(axis=0), max(float(np.ptp(vertices, axis=0).max()), 1e-12)
         grid = np.minimum((vertices - low) * (cells / span), cells - 1).astype(np.int64)
-        _, places, counts = np.unique(grid @ [1, cells, cells**2], return_inverse=True, return_counts=True)
+        _, places, counts = np.unique(
+            grid @ [1, cells, cells**2], return_inverse=True, return_counts=True
+        )
         middles = np.stack([np.bincount(places, column) / counts for column in vertices.T], axis=1)
         merged = places[triangles]
         whole = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
@@ -135,7 +155,8 @@ def thinned(vertices: np.ndarray, triangles: np.ndarray, most: int) -> tuple[np.
 def read_poses(data: mujoco.MjData, seen: list[Shape], poses: np.ndarray) -> None:
     """Fill `poses` (positions and quaternions, shape (bodies, 7)) with where the bodies that are seen are.
 
-    The kinematics are up to date. A body is where its first geom is, which may have been moved along a hill.
+    The kinematics are up to date. A body is where its first geom is, which may have been moved
+    along a hill.
     """
     poses[:, :3], poses[:, 3:] = data.xpos, data.xquat
     first = {one.body: one for one in reversed(seen) if one.geom is not None and one.body != 0}
@@ -143,7 +164,9 @@ def read_poses(data: mujoco.MjData, seen: list[Shape], poses: np.ndarray) -> Non
         turned, back, back_turned = np.empty(4), np.empty(3), np.empty(4)
         mujoco.mju_mat2Quat(turned, data.geom_xmat[one.geom])
         mujoco.mju_negPose(back, back_turned, one.position, one.orientation)
-        mujoco.mju_mulPose(poses[body, :3], poses[body, 3:], data.geom_xpos[one.geom], turned, back, back_turned)
+        mujoco.mju_mulPose(
+            poses[body, :3], poses[body, 3:], data.geom_xpos[one.geom], turned, back, back_turned
+        )
 
 
 class Viewpoint(NamedTuple):
@@ -160,7 +183,11 @@ class Viewpoint(NamedTuple):
 
 
 def first_view(
-    model: mujoco.MjModel, shapes: list[Shape], poses: np.ndarray, moving: Collection[int], camera: str | None
+    model: mujoco.MjModel,
+    shapes: list[Shape],
+    poses: np.ndarray,
+    moving: Collection[int],
+    camera: str | None,
 ) -> Viewpoint:
     """A named camera of the model; else MuJoCo's free one, near enough to the bodies that move.
 
@@ -188,5 +215,11 @@ def first_view(
     free = model.vis.global_
     down = _ELEVATION if free.elevation == _MUJOCO_ELEVATION else free.elevation
     azimuth, elevation = np.radians([free.azimuth, down])
-    forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    forward = np.array(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
     return Viewpoint(centre - 2.6 * extent * forward, centre, 45.0, extent)

@@ -12,14 +12,17 @@ from pathlib import Path
 from typing import Any
 
 _SEAL = "sha256"
-_TEMPORARY = re.compile(r"\.(.+)-[a-z0-9_]{8}(\.[^.]+)?")  # what tempfile makes of the names that `writing` asks for
+_TEMPORARY = re.compile(
+    r"\.(.+)-[a-z0-9_]{8}(\.[^.]+)?"
+)  # what tempfile makes of the names that `writing` asks for
 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` that becomes `path` when the block ends, and disappears if it raises.
 
-    The folder is made if it is missing. The temporary name keeps the suffix, which some encoders go by.
+    The folder is made if it is missing. The temporary name keeps the suffix, which some encoders go
+    by.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
@@ -71,7 +74,9 @@ def check_writable(folder: Path) -> None:
     if not present.is_dir():
         raise NotADirectoryError(f"cannot write to {folder}: {present} is not a folder")
     try:
-        tempfile.TemporaryFile(dir=present).close()  # has no name; not even root may write everywhere
+        tempfile.TemporaryFile(
+            dir=present
+        ).close()  # has no name; not even root may write everywhere
     except OSError as error:
         raise PermissionError(
             f"cannot write to {folder}: no permission to write in {present} ({error.strerror})"
@@ -81,14 +86,18 @@ def check_writable(folder: Path) -> None:
 def check_file(path: Path) -> None:
     """Find out before hours of work whether the file `path` can be written; makes nothing."""
     if path.is_dir():
-        raise IsADirectoryError(f"cannot write {path}: it is a folder: name a file, such as {path}/NAME")
+        raise IsADirectoryError(
+            f"cannot write {path}: it is a folder: name a file, such as {path}/NAME"
+        )
     check_writable(path.parent)
 
 
 def check_page(path: Path) -> None:
     """Refuse a page's file by its suffix, or where it cannot be written."""
     if path.suffix not in (".html", ".htm"):
-        raise ValueError(f"page {path}: the suffix is {path.suffix!r}, must be .html; write {path.stem}.html")
+        raise ValueError(
+            f"page {path}: the suffix is {path.suffix!r}, must be .html; write {path.stem}.html"
+        )
     check_file(path)
 
 
@@ -100,7 +109,9 @@ def write_json(path: Path, content: Any) -> None:
 
 def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
     """The content and, as its entry `sha256`, a digest of all the rest, which `read_json` checks and takes off."""
-    plain = json.loads(json.dumps(content))  # what a reader will see: names that are text, lists for tuples
+    plain = json.loads(
+        json.dumps(content)
+    )  # what a reader will see: names that are text, lists for tuples
     return {_SEAL: hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest(), **plain}
 
 
@@ -108,15 +119,19 @@ def check_digest(path: Path, content: bytes, expected: Any, beside: str) -> None
     """Refuse a file's content that has not the SHA-256 which the file `beside` it names; none where that is None."""
     if expected is not None and hashlib.sha256(content).hexdigest() != expected:
         raise ValueError(
-            f"{path} is truncated or damaged, or it and {beside} do not belong together: its sha256 is not the one "
-            "there. Copy both files anew from where they came; a training that was killed mends its own when it is "
-            "resumed"
+            f"{path} is truncated or damaged, or it and {beside} do not belong together: its sha256"
+            " is not the one there. Copy both files anew from where they came; a training that was"
+            " killed mends its own when it is resumed"
         )
 
 
 def below(prefix: str, content: Mapping[str, Any]) -> dict[str, Any]:
     """What the names with that prefix name, by the rest of them: a file's arrays stand side by side."""
-    return {name.removeprefix(prefix): value for name, value in content.items() if name.startswith(prefix)}
+    return {
+        name.removeprefix(prefix): value
+        for name, value in content.items()
+        if name.startswith(prefix)
+    }
 
 
 def read_json(path: Path, what: str) -> Any:
@@ -135,7 +150,8 @@ def read_json(path: Path, what: str) -> Any:
     plain = {name: value for name, value in content.items() if name != _SEAL}
     if content[_SEAL] != sealed(plain)[_SEAL]:
         raise ValueError(
-            f"{path} is not the {what} that was written: its content does not have the {_SEAL} that it names. It was "
-            f"damaged or edited: copy it anew from where it came, or delete its entry {_SEAL} if you meant to edit it"
+            f"{path} is not the {what} that was written: its content does not have the {_SEAL} that"
+            " it names. It was damaged or edited: copy it anew from where it came, or delete its"
+            f" entry {_SEAL} if you meant to edit it"
         )
     return plain

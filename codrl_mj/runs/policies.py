@@ -1,7 +1,7 @@
 """Trained policies as files that are safe to load: safetensors for the weights, JSON for everything else.
 
-`load_policy` never unpickles, so a policy from elsewhere can do no more than choose bad actions. `load_sb3_zip` does,
-and says so.
+`load_policy` never unpickles, so a policy from elsewhere can do no more than choose bad actions.
+`load_sb3_zip` does, and says so.
 """
 
 import contextlib
@@ -27,7 +27,9 @@ _ENTRIES = {"format", DIGEST, "agent", "observation_space", "action_space"}
 class Policy(Protocol):
     """Anything that chooses actions; Stable-Baselines3's policies and models are such."""
 
-    def predict(self, observation: np.ndarray, *, deterministic: bool = False) -> tuple[np.ndarray, Any]:
+    def predict(
+        self, observation: np.ndarray, *, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
         """(observations (N, k)) -> actions (N, ...), and a state that is not used."""
 
 
@@ -48,7 +50,9 @@ def _make_space(described: dict[str, Any]) -> spaces.Space[Any]:
     if described["type"] == "Discrete":
         return spaces.Discrete(described["n"])
     dtype = np.dtype(described["dtype"]).type
-    return spaces.Box(np.array(described["low"], dtype), np.array(described["high"], dtype), dtype=dtype)
+    return spaces.Box(
+        np.array(described["low"], dtype), np.array(described["high"], dtype), dtype=dtype
+    )
 
 
 def save_policy(policy: Any, agent: AgentConfig, folder: Path) -> None:
@@ -80,17 +84,22 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
 
     Raises:
         FileNotFoundError: the folder has no policy.
-        ValueError: the files are truncated, damaged, of another format, or do not belong together. Policies from before
-            there were digests are loaded without that proof.
+        ValueError: the files are truncated, damaged, of another format, or do not belong together.
+            Policies from before there were digests are loaded without that proof.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load
 
     description = read_json(folder / DESCRIPTION, "policy description")
     if not isinstance(description, dict) or description.get("format") != FORMAT:
-        raise ValueError(f"{folder / DESCRIPTION}: not a policy of this program: its format must be {FORMAT!r}")
+        raise ValueError(
+            f"{folder / DESCRIPTION}: not a policy of this program: its format must be {FORMAT!r}"
+        )
     if surplus := description.keys() - _ENTRIES:  # such as the digest's name, damaged
-        raise ValueError(f"{folder / DESCRIPTION} has unknown entries: {', '.join(sorted(surplus))}. Copy it anew")
+        raise ValueError(
+            f"{folder / DESCRIPTION} has unknown entries: {', '.join(sorted(surplus))}. Copy it"
+            " anew"
+        )
     weights = folder / WEIGHTS
     if not weights.is_file():
         raise FileNotFoundError(f"no policy weights at {weights}")
@@ -99,9 +108,20 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
     try:
         with trusting(trust):
             agent = agent_from_mapping(description["agent"])
-        spaces_ = _make_space(description["observation_space"]), _make_space(description["action_space"])
+        spaces_ = (
+            _make_space(description["observation_space"]),
+            _make_space(description["action_space"]),
+        )
         policy = agent.make_policy(*spaces_)  # type: ignore[arg-type]
-    except (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError, RuntimeError) as error:
+    except (
+        ArithmeticError,
+        AssertionError,
+        AttributeError,
+        LookupError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ) as error:
         raise ValueError(f"{folder / DESCRIPTION} does not describe a policy: {error!r}") from None
     try:
         tensors = load(content)
@@ -124,31 +144,38 @@ class NormalizedPolicy:
         self.policy, self.statistics = policy, statistics
         self.observation_space, self.action_space = policy.observation_space, policy.action_space
 
-    def predict(self, observation: np.ndarray, *, deterministic: bool = False) -> tuple[np.ndarray, Any]:
+    def predict(
+        self, observation: np.ndarray, *, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
         """Return the policy's actions for raw observations."""
-        return self.policy.predict(self.statistics.normalize_obs(observation), deterministic=deterministic)
+        return self.policy.predict(
+            self.statistics.normalize_obs(observation), deterministic=deterministic
+        )
 
 
 def load_sb3_zip(path: Path, agent: str, trust: bool, normalize: Path | str | None = None) -> Any:
     """Load the policy of a model that Stable-Baselines3 saved, by an algorithm, such as `ppo`, that it does not name.
 
-    Neither file is opened without `trust` that whoever made it may execute code on this machine, which loading allows.
-    `normalize` is the file that `VecNormalize.save` wrote, if the model was trained behind it, else `"none"`. None
-    refuses a zip that seems to have been.
+    Neither file is opened without `trust` that whoever made it may execute code on this machine,
+    which loading allows. `normalize` is the file that `VecNormalize.save` wrote, if the model was
+    trained behind it, else `"none"`. None refuses a zip that seems to have been.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no model at {path}")
     if not trust:
         raise ValueError(
-            f"{path} is a Stable-Baselines3 model: it holds pickled Python objects, and loading it executes whatever "
-            "its author put there. Pass --trust if that author is you, or somebody whose programs you would run"
+            f"{path} is a Stable-Baselines3 model: it holds pickled Python objects, and loading it"
+            " executes whatever its author put there. Pass --trust if that author is you, or"
+            " somebody whose programs you would run"
         )
     import stable_baselines3
     from stable_baselines3.common.base_class import BaseAlgorithm
 
     kind: Any = getattr(stable_baselines3, agent.upper(), None)
     if not isinstance(kind, type) or not issubclass(kind, BaseAlgorithm):
-        raise ValueError(f"agent = {agent!r}: Stable-Baselines3 has no such agent; name the one that made {path}")
+        raise ValueError(
+            f"agent = {agent!r}: Stable-Baselines3 has no such agent; name the one that made {path}"
+        )
     try:
         model = kind.load(path, device="cpu")  # type: ignore[attr-defined]
     except Exception as error:  # whatever the file's objects raise
@@ -158,7 +185,9 @@ def load_sb3_zip(path: Path, agent: str, trust: bool, normalize: Path | str | No
         _check_whole(path, model)
     if normalize in (None, "none"):
         return model.policy
-    return NormalizedPolicy(model.policy, _load_statistics(Path(str(normalize)), model.observation_space))
+    return NormalizedPolicy(
+        model.policy, _load_statistics(Path(str(normalize)), model.observation_space)
+    )
 
 
 def _load_statistics(path: Path, space: spaces.Space[Any]) -> Any:
@@ -172,15 +201,23 @@ def _load_statistics(path: Path, space: spaces.Space[Any]) -> Any:
             f"--normalize {path}: no such file; name what VecNormalize.save wrote, or none"
         ) from None
     except Exception as error:  # whatever the file's objects raise
-        raise ValueError(f"--normalize {path}: must be a file that VecNormalize.save wrote: {error!r}") from None
+        raise ValueError(
+            f"--normalize {path}: must be a file that VecNormalize.save wrote: {error!r}"
+        ) from None
     if not isinstance(statistics, VecNormalize):
         kind = type(statistics).__name__
-        raise ValueError(f"--normalize {path}: holds a {kind}: must be a file that VecNormalize.save wrote")
-    mean: Any = getattr(statistics.obs_rms, "mean", None) if statistics.norm_obs else np.zeros(space.shape or ())
+        raise ValueError(
+            f"--normalize {path}: holds a {kind}: must be a file that VecNormalize.save wrote"
+        )
+    mean: Any = (
+        getattr(statistics.obs_rms, "mean", None)
+        if statistics.norm_obs
+        else np.zeros(space.shape or ())
+    )
     if np.shape(mean) != space.shape:
         raise ValueError(
-            f"--normalize {path}: is for {statistics.observation_space}, the policy observes {space}: name the file "
-            "that was saved with the policy"
+            f"--normalize {path}: is for {statistics.observation_space}, the policy observes"
+            f" {space}: name the file that was saved with the policy"
         )
     return statistics
 
@@ -190,19 +227,33 @@ def _check_whole(path: Path, model: Any) -> None:
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
     beside, reason = [*path.parent.glob("*.pkl"), *path.parent.glob("*/vecnormalize.pkl")], ""
-    seen, space, is_on_policy = model._last_obs, model.observation_space, isinstance(model, OnPolicyAlgorithm)
-    # Only VecNormalize gives PPO and A2C original observations; algorithms with a replay buffer always keep some.
+    seen, space, is_on_policy = (
+        model._last_obs,
+        model.observation_space,
+        isinstance(model, OnPolicyAlgorithm),
+    )
+    # Only VecNormalize gives PPO and A2C original observations; algorithms with a replay buffer
+    # always keep some.
     if is_on_policy and model._last_original_obs is not None:
         reason = "its last observations were normalized"
-    elif isinstance(seen, np.ndarray) and ((seen < space.low - 1e-4) | (seen > space.high + 1e-4)).any():
+    elif (
+        isinstance(seen, np.ndarray)
+        and ((seen < space.low - 1e-4) | (seen > space.high + 1e-4)).any()
+    ):
         reason = "its last observations lie outside of its observation space, as normalized ones do"
     elif beside:
         reason = f"{', '.join(map(str, sorted(beside)[:3]))} may have its statistics"
     remedy = "name what VecNormalize.save wrote with --normalize FILE.pkl, or say --normalize none"
     if reason:
-        raise ValueError(f"{path} may be half of a policy that was trained behind VecNormalize: {reason}: {remedy}")
+        raise ValueError(
+            f"{path} may be half of a policy that was trained behind VecNormalize: {reason}:"
+            f" {remedy}"
+        )
     if model.num_timesteps and not (is_on_policy and seen is not None):
-        warnings.warn(f"{path} does not say whether it was trained behind VecNormalize: if so, {remedy}", stacklevel=3)
+        warnings.warn(
+            f"{path} does not say whether it was trained behind VecNormalize: if so, {remedy}",
+            stacklevel=3,
+        )
 
 
 def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
@@ -218,8 +269,14 @@ def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
         text = f"{name}: the policy was trained with {trained}, {env.task} as it is set has {space}"
         frames = np.prod(trained.shape or (1,)) / np.prod(space.shape or (1,))
         if name == "observation_space" and frames > 1 and frames % 1 == 0:
-            text += f" ({frames:g} times as many: stacked frames, as of VecFrameStack, are not supported)"
-        text += ": set what it was trained with, by --env.action, --env.observe-actuator, --actuator, --env.options"
+            text += (
+                f" ({frames:g} times as many: stacked frames, as of VecFrameStack, are not"
+                " supported)"
+            )
+        text += (
+            ": set what it was trained with, by --env.action, --env.observe-actuator, --actuator,"
+            " --env.options"
+        )
         if exact or name != "action_space" or not _is_same(trained, space, bounds=False):
             raise ValueError(text)
         warnings.warn(text, stacklevel=2)

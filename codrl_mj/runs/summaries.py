@@ -75,7 +75,9 @@ class RunSummary:
         """The summary as JSON-serialisable values; `modified` in ISO 8601, UTC."""
         modified = None
         if self.modified is not None:
-            modified = datetime.datetime.fromtimestamp(self.modified, datetime.UTC).isoformat(timespec="seconds")
+            modified = datetime.datetime.fromtimestamp(self.modified, datetime.UTC).isoformat(
+                timespec="seconds"
+            )
         values = {**vars(self), "path": str(self.path), "modified": modified}
         return values | {"evaluation_return": self.evaluation_return}
 
@@ -89,14 +91,18 @@ def find_runs(root: Path) -> list[RunSummary]:
         if CONFIG in files:
             below.clear()
             path = Path(folder)
-            found.append(read_run(path, path.relative_to(root).as_posix() if path != root else None))
+            found.append(
+                read_run(path, path.relative_to(root).as_posix() if path != root else None)
+            )
         below[:] = [name for name in below if not name.startswith(".")]
     return sorted(found, key=lambda run: run.name)
 
 
 def typical_seed(evaluation: Mapping[str, Any] | None) -> int | None:
     """Return the seed of the evaluated episode with the median return (of two, the lower); None if none is known."""
-    returns, conditions = ((evaluation or {}).get(name) for name in ("episode_returns", "conditions"))
+    returns, conditions = (
+        (evaluation or {}).get(name) for name in ("episode_returns", "conditions")
+    )
     seed = conditions.get("seed") if isinstance(conditions, Mapping) else None
     if not isinstance(returns, list) or not returns or not isinstance(seed, int):
         return None
@@ -110,8 +116,14 @@ def rank(evaluation: Mapping[str, Any] | None, total: float) -> str:
     if (seed := typical_seed(evaluation)) is None or evaluation is None:
         return ""
     returns = evaluation["episode_returns"]
-    median, worse = returns[seed - evaluation["conditions"]["seed"]], sum(one < total for one in returns)
-    return f"of {len(returns)} evaluated episodes {worse} returned less, the median {median:.3g} (seed {seed})"
+    median, worse = (
+        returns[seed - evaluation["conditions"]["seed"]],
+        sum(one < total for one in returns),
+    )
+    return (
+        f"of {len(returns)} evaluated episodes {worse} returned less, the median {median:.3g} (seed"
+        f" {seed})"
+    )
 
 
 def read_evaluation(run: Path, best: bool) -> Mapping[str, Any] | None:
@@ -137,17 +149,26 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
     missing = [file for file in POLICY_FILES if not (path / file).is_file()]
     done = finished(path)
     if done and missing:
-        problems.append(f"it is finished, but {' and '.join(missing)} is missing: copy the folder anew")
+        problems.append(
+            f"it is finished, but {' and '.join(missing)} is missing: copy the folder anew"
+        )
     for folder in (path, path / BEST):
         described = _mapping(folder / DESCRIPTION, "policy description", problems)
         try:
             if described is not None and (folder / WEIGHTS).is_file():
-                check_digest(folder / WEIGHTS, (folder / WEIGHTS).read_bytes(), described.get(DIGEST), DESCRIPTION)
+                check_digest(
+                    folder / WEIGHTS,
+                    (folder / WEIGHTS).read_bytes(),
+                    described.get(DIGEST),
+                    DESCRIPTION,
+                )
         except (ValueError, OSError) as error:
             problems.append(str(error))
     reported, learned = _first("steps", progress), _first("steps", result)
     if None not in (reported, learned) and reported != learned:
-        problems.append(f"{path / PROGRESS} ends at step {reported:.0f} of {learned:.0f}: copy it anew")
+        problems.append(
+            f"{path / PROGRESS} ends at step {reported:.0f} of {learned:.0f}: copy it anew"
+        )
     agent = config.get("agent")
     task = env["task"] if isinstance(env.get("task"), str) else None
     steps, pace = _first("steps", result, progress), _first("steps_per_second", progress)
@@ -169,7 +190,14 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
         modified=_modified(path),
         evaluation=evaluation,
         configuration=leaves(
-            {**config, **{key: one for key, one in (content or {}).items() if key not in ("train", "labels")}}
+            {
+                **config,
+                **{
+                    key: one
+                    for key, one in (content or {}).items()
+                    if key not in ("train", "labels")
+                },
+            }
         ),
     )
 
@@ -250,15 +278,23 @@ def _actuator_of(env: Mapping[str, Any], task: str | None, labels: Any) -> str |
     labels = labels if isinstance(labels, list) else []
     papers = TASKS[task].paper if task in TASKS else ()
     names: list[str] = []
-    for actuator, label, paper in itertools.zip_longest(each, labels[: len(each)], papers[: len(each)]):
+    for actuator, label, paper in itertools.zip_longest(
+        each, labels[: len(each)], papers[: len(each)]
+    ):
         if label or actuator is None or isinstance(actuator, str):
             names.append(str(label or actuator or "ideal"))
             continue
         try:
             with trusting(False):
                 names.append(name_of(actuator_from_mapping(actuator), paper))
-        except (ValueError, TypeError, AttributeError):  # somebody's family is called so, what cannot be read is not
-            names.append(str(actuator.get("family", "custom")) if isinstance(actuator, Mapping) else "custom")
+        except (
+            ValueError,
+            TypeError,
+            AttributeError,
+        ):  # somebody's family is called so, what cannot be read is not
+            names.append(
+                str(actuator.get("family", "custom")) if isinstance(actuator, Mapping) else "custom"
+            )
     return ", ".join(dict.fromkeys(names))
 
 
@@ -280,7 +316,9 @@ def sort_runs(runs: Sequence[RunSummary], key: str) -> list[RunSummary]:
             return getattr(run, key)
         return run.mean_return if run.evaluation_return is None else run.evaluation_return
 
-    known = sorted((run for run in runs if value(run) is not None), key=value, reverse=key in _HIGHEST_FIRST)
+    known = sorted(
+        (run for run in runs if value(run) is not None), key=value, reverse=key in _HIGHEST_FIRST
+    )
     return known + [run for run in runs if value(run) is None]
 
 
@@ -304,23 +342,39 @@ def compare(runs: Sequence[RunSummary]) -> Comparison:
         raise ValueError(f"runs: {len(runs)}: there must be two or more to compare")
     named = [{**run.configuration, "env.actuator": run.actuator} for run in runs]
     if any(run.actuator == "ideal" for run in runs):  # which has no fields that could differ
-        named = [{key: value for key, value in one.items() if not key.startswith("env.actuator.")} for one in named]
-    settings = {key: tuple(one.get(key) for one in named) for key in dict.fromkeys(key for one in named for key in one)}
+        named = [
+            {key: value for key, value in one.items() if not key.startswith("env.actuator.")}
+            for one in named
+        ]
+    settings = {
+        key: tuple(one.get(key) for one in named)
+        for key in dict.fromkeys(key for one in named for key in one)
+    }
     results: dict[str, tuple[Any, ...]] = {
         name: tuple(getattr(run, name) for run in runs)
         for name in ("state", "problem", "steps", "mean_return", "seconds")
     }
     evaluations = [run.evaluation or {} for run in runs]
     units = [one.get("units") for one in evaluations]
-    measures = {name: str(unit) for one in units if isinstance(one, Mapping) for name, unit in one.items()}
+    measures = {
+        name: str(unit) for one in units if isinstance(one, Mapping) for name, unit in one.items()
+    }
     for measure in measures:
         results[f"evaluation.{measure}"] = tuple(one.get(measure) for one in evaluations)
-    results = {name: values for name, values in results.items() if any(value is not None for value in values)}
+    results = {
+        name: values
+        for name, values in results.items()
+        if any(value is not None for value in values)
+    }
     known_units = {f"evaluation.{measure}": unit for measure, unit in measures.items()}
     known_units |= {"seconds": "s", "mean_return": "reward"}
     return Comparison(
         names=tuple(run.name for run in runs),
-        configuration={key: values for key, values in settings.items() if any(value != values[0] for value in values)},
+        configuration={
+            key: values
+            for key, values in settings.items()
+            if any(value != values[0] for value in values)
+        },
         results=results,
         units={name: unit for name, unit in known_units.items() if name in results},
     )

@@ -1,6 +1,14 @@
 """Studies: arms that are trained with many seeds, trials that test them, questions that are judged, and a page."""
 
-from codrl_mj.study.inference import Stratum, detectable, effect, equivalence_p, false_discovery, holm, permutation_p
+from codrl_mj.study.inference import (
+    Stratum,
+    detectable,
+    effect,
+    equivalence_p,
+    false_discovery,
+    holm,
+    permutation_p,
+)
 from codrl_mj.study.pages import conclusions, markdown_table, read_csv, write_csv, write_page
 from codrl_mj.study.parallel import Workers
 from codrl_mj.study.program import Program, main

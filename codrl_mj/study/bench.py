@@ -23,7 +23,9 @@ def on_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., np
     """One hinge with a load of some inertia [kg*m^2] that an actuator drives in steps of `timestep` [s], to be run."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.compiler.boundmass = timestep, 0.0
-    spec.option.tolerance = 0.0  # it is relative to the inertia, beside which friction would count as none
+    spec.option.tolerance = (
+        0.0  # it is relative to the inertia, beside which friction would count as none
+    )
     body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
     body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
     spec.add_actuator(target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
@@ -33,8 +35,8 @@ def on_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., np
     def run(torque: float, duration: float, speed: float = 0.0) -> np.ndarray:
         """Ask for a torque [N*m] at the joint for a `duration` [s], from a speed of the joint [rad/s].
 
-        Shape (steps, 3): the actuator's torque [N*m] in each step, that which accelerates the hinge [N*m], and its
-        speed [rad/s] after the step.
+        Shape (steps, 3): the actuator's torque [N*m] in each step, that which accelerates the hinge
+        [N*m], and its speed [rad/s] after the step.
         """
         mujoco.mj_resetData(model, data)
         data.ctrl[:], data.qvel[:] = torque, speed
@@ -50,22 +52,26 @@ def on_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., np
 class Delivery(NamedTuple):
     """What an actuator makes of a command within `HORIZON`, in steps of the policy and shares of the largest force.
 
-    A loop that is quick at first and creeps to its end much later is thus called quick and weak: that is what a policy
-    meets, whose commands change long before.
+    A loop that is quick at first and creeps to its end much later is thus called quick and weak:
+    that is what a policy meets, whose commands change long before.
     """
 
     dead_time: float
     """Until a thousandth of what comes in the end is there [steps]."""
     lag: float
-    """Average residence time less the dead time [steps]: the time constant of the first-order lag that comes as late;
-    ringing counts as lateness. Source: Astrom, Hagglund, *PID Controllers*, 2nd ed., section 2.4 (area methods)."""
+    """Average residence time less the dead time [steps]: the time constant of the first-order lag
+    that comes as late; ringing counts as lateness. Source: Astrom, Hagglund, *PID Controllers*, 2nd
+    ed., section 2.4 (area methods).
+    """
     at_rest: float
     """What is there in the end, while the joint is blocked."""
     at_speed: float
     """The same at the reference speed, while it drives."""
     friction: float
-    """What brakes the joint while nothing is asked for [largest force]: the larger of all of it at a twentieth of the
-    reference speed, and of what the actuator rubs away itself at that speed, where its back-EMF is no friction."""
+    """What brakes the joint while nothing is asked for [largest force]: the larger of all of it at
+    a twentieth of the reference speed, and of what the actuator rubs away itself at that speed,
+    where its back-EMF is no friction.
+    """
     noise: float
     """Standard deviation of the force [largest force] from one integration step to the next."""
     unasked: float
@@ -119,17 +125,25 @@ def delivered(actuator: Any, task: str, share: float = 1.0) -> Delivery:
     check_chosen("task", [task], REFERENCE_SPEEDS)
     if actuator.MOTION:
         raise ValueError(
-            f"actuator: a {actuator.family} is asked for motion, not for forces: name one of another family"
+            f"actuator: a {actuator.family} is asked for motion, not for forces: name one of"
+            " another family"
         )
     known = find_task(task)
-    return delivery(actuator, timestep(task), known.step_duration, share * known.max_force, REFERENCE_SPEEDS[task])
+    return delivery(
+        actuator,
+        timestep(task),
+        known.step_duration,
+        share * known.max_force,
+        REFERENCE_SPEEDS[task],
+    )
 
 
 def doses(found: Delivery, task: str) -> dict[str, float]:
     """The dose of every axis that does to a command what the actuator does, as it was `found` on the task, by axis.
 
-    Weakness g and a supply that lacks a share d leave g*min(1, 2*(1 - d)) of the largest force at rest, and
-    g*(1 - 2*d) at the reference speed (`doses.supply`): solved for both, with g at most 1.
+    Weakness g and a supply that lacks a share d leave g*min(1, 2*(1 - d)) of the largest force at
+    rest, and g*(1 - 2*d) at the reference speed (`doses.supply`): solved for both, with g at most
+    1.
     """
     rest, speed = max(found.at_rest, 0.0), min(found.at_speed, found.at_rest)
     strength = rest if speed >= 0.0 else rest - speed
@@ -170,8 +184,12 @@ def redesign(actuator: Any, task: str) -> Drive | None:
         wrong = actuator.controller.current_noise or actuator.controller.current_bias
         return None if wrong else redesigned(actuator, task)
     if isinstance(actuator, Drive):
-        loop = dataclasses.replace(actuator.controller, bandwidth=0.0, kp=0.0, ki=0.0, anti_windup="back_calculation")
-        return None if loop == actuator.controller else dataclasses.replace(actuator, controller=loop)
+        loop = dataclasses.replace(
+            actuator.controller, bandwidth=0.0, kp=0.0, ki=0.0, anti_windup="back_calculation"
+        )
+        return (
+            None if loop == actuator.controller else dataclasses.replace(actuator, controller=loop)
+        )
     return None
 
 
@@ -191,5 +209,9 @@ def redesigned(actuator: Actuator, task: str) -> Drive:
             arm_radius=motor.arm_radius,
         ),
         SampledLoop(sample_rate=20.0 / timestep(task), max_current=limit),
-        Supply(voltage) if actuator.supply is None else dataclasses.replace(actuator.supply, voltage=voltage),
+        (
+            Supply(voltage)
+            if actuator.supply is None
+            else dataclasses.replace(actuator.supply, voltage=voltage)
+        ),
     )

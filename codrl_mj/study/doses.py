@@ -1,7 +1,7 @@
 """What stands between a command and its force, in doses: one thing at a time; and policies trained and tested on it.
 
-Every dose is a pure number that means the same on every task: times in steps of the policy, forces in shares of the
-task's largest one, supplies in shares of what the task's motor needs.
+Every dose is a pure number that means the same on every task: times in steps of the policy, forces
+in shares of the task's largest one, supplies in shares of what the task's motor needs.
 """
 
 import dataclasses
@@ -10,7 +10,17 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop, Drive, GearMotor, Lag, Motor, SampledLoop, Supply
+from codrl_mj.actuators import (
+    IDEAL,
+    Actuator,
+    CurrentLoop,
+    Drive,
+    GearMotor,
+    Lag,
+    Motor,
+    SampledLoop,
+    Supply,
+)
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.trials import Arm, Trial
@@ -56,7 +66,8 @@ def posed(task: str, actuator: Any = IDEAL, **fields: Any) -> EnvConfig:
 
     Ideal and real actuators are integrated alike, so that the actuator alone makes the difference.
     """
-    # CartPole by the paper's reward: by Gymnasium's nearly every policy is at the ceiling, and nothing told apart
+    # CartPole by the paper's reward: by Gymnasium's nearly every policy is at the ceiling, and
+    # nothing told apart
     options = {"center_radius": CENTRE_RADIUS} if task == "cartpole" else {}
     return EnvConfig(task, actuator, timestep=timestep(task), options=options, **fields)
 
@@ -78,7 +89,9 @@ def weakness(task: str, dose: float) -> EnvConfig:
 
 def delay(task: str, dose: float) -> EnvConfig:
     """Commands that come so many steps of the policy late."""
-    return posed(task, disturbances=Disturbances(command_delay=dose * find_task(task).step_duration))
+    return posed(
+        task, disturbances=Disturbances(command_delay=dose * find_task(task).step_duration)
+    )
 
 
 def friction(task: str, dose: float) -> EnvConfig:
@@ -89,7 +102,8 @@ def friction(task: str, dose: float) -> EnvConfig:
 def motor_constant(task: str) -> float:
     """Torque constant [N*m/A] of a motor of 1 ohm that asks for the least voltage at the task's reference point.
 
-    Largest force F at the reference speed w: u = F/k + k*w is least for k = sqrt(F/w), where both terms are equal.
+    Largest force F at the reference speed w: u = F/k + k*w is least for k = sqrt(F/w), where both
+    terms are equal.
     """
     return math.sqrt(find_task(task).max_force / REFERENCE_SPEEDS[task])
 
@@ -115,22 +129,31 @@ def supply(task: str, dose: float) -> EnvConfig:
 def noise(task: str, dose: float) -> EnvConfig:
     """A loop whose current sensor is noisy, with a standard deviation in shares of the largest current.
 
-    The winding's time constant is ten integration steps and half the error is gone after one, so that half of a
-    sample's noise becomes torque.
+    The winding's time constant is ten integration steps and half the error is gone after one, so
+    that half of a sample's noise becomes torque.
     """
     step, constant = timestep(task), motor_constant(task)
     inductance, largest = 10.0 * step, find_task(task).max_force / constant
     kp = 0.5 * inductance / step
     loop = CurrentLoop(
-        kp=kp, ki=kp / inductance, max_voltage=100.0 * needed_voltage(task), current_noise=dose * largest
+        kp=kp,
+        ki=kp / inductance,
+        max_voltage=100.0 * needed_voltage(task),
+        current_noise=dose * largest,
     )
     return posed(task, Actuator(Motor(1.0, inductance, constant, constant), loop))
 
 
 _LOOPS = {"weaker": "weaker", "paper": "paper"}
 REAL: Mapping[str, Mapping[str, Any]] = {
-    "pendulum": {"marginal motor": {"name": "quanser-srv02", "motor": {"gear_ratio": 70.0}}, **_LOOPS},
-    "cartpole": {"marginal motor": {"name": "lego-ev3-large", "motor": {"gear_ratio": 44.2}}, **_LOOPS},
+    "pendulum": {
+        "marginal motor": {"name": "quanser-srv02", "motor": {"gear_ratio": 70.0}},
+        **_LOOPS,
+    },
+    "cartpole": {
+        "marginal motor": {"name": "lego-ev3-large", "motor": {"gear_ratio": 44.2}},
+        **_LOOPS,
+    },
     "acrobot": {"marginal motor": {"name": "pololu-37d-30", "motor": {"gear_ratio": 30.0}}},
     "furuta": {
         "marginal motor": {
@@ -140,9 +163,10 @@ REAL: Mapping[str, Mapping[str, Any]] = {
         }
     },
 }
-"""Task -> drives that policies were trained through, each by the name of its arm and of its test: a motor that
-`codrl-mj motor choose` calls `try it`, for some bound says that it does not suffice (on the cars there is none), and
-the paper's under two loops."""
+"""Task -> drives that policies were trained through, each by the name of its arm and of its test: a
+motor that `codrl-mj motor choose` calls `try it`, for some bound says that it does not suffice (on
+the cars there is none), and the paper's under two loops.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,7 +242,9 @@ def arm(task: str, name: str, env: EnvConfig) -> Arm:
     changes: dict[str, Any] = {"total_steps": BUDGETS[task]} if task in BUDGETS else {}
     base = TrainConfig.preset(task, agent, **changes)
     never = 10**9
-    config = dataclasses.replace(base, env=env, evaluation_interval=never, checkpoint_interval=never)
+    config = dataclasses.replace(
+        base, env=env, evaluation_interval=never, checkpoint_interval=never
+    )
     return Arm(f"{task}: {name}", config, SECONDS[task])
 
 
@@ -236,7 +262,10 @@ def generic(base: Arm) -> Arm:
     """
     env, definition = base.config.env, find_task(base.task)
     step, pulse = definition.step_duration, 0.25 * definition.max_force
-    ranges = f"time_constant=uniform(0, {2 * step:g})", f"delay=uniform(0, {8 * timestep(base.task):g})"
+    ranges = (
+        f"time_constant=uniform(0, {2 * step:g})",
+        f"delay=uniform(0, {8 * timestep(base.task):g})",
+    )
     pushes = Disturbances(pulse_force=pulse, pulse_duration=step, pulse_interval=10 * step)
     randomized = dataclasses.replace(
         env, actuator=Lag(), randomize=(*ranges, "gain=uniform(0.5, 1.25)"), disturbances=pushes

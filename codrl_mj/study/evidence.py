@@ -51,8 +51,8 @@ class Outcome(NamedTuple):
     def spared(self) -> bool:
         """Whether nothing that matters is lost.
 
-        No more than `MARGIN` of the score on the mean, and surely no more than `FAILED`; by no more than a tenth of the
-        policies more than that; and no more than a tenth of the success.
+        No more than `MARGIN` of the score on the mean, and surely no more than `FAILED`; by no more
+        than a tenth of the policies more than that; and no more than a tenth of the success.
         """
         within = self.loss.mean <= MARGIN and self.loss.high <= FAILED
         return within and self.failed <= SPARED and self.success_lost.mean <= SPARED
@@ -112,13 +112,20 @@ class Evidence:
     @classmethod
     def read(cls, *files: Path) -> "Evidence":
         """Read files; those of the checkout or the wheel unless some are given, and none if there are none."""
-        there = [path for folder in EVIDENCE for study in STUDIES if (path := folder / study / RUNS).is_file()]
+        there = [
+            path
+            for folder in EVIDENCE
+            for study in STUDIES
+            if (path := folder / study / RUNS).is_file()
+        ]
         rows: list[dict[str, str]] = []
         for path in files or there:
             with path.open(newline="", encoding="utf-8") as opened:
                 rows += (found := list(csv.DictReader(opened)))
             if lacking := [name for name in _COLUMNS if found and name not in found[0]]:
-                raise ValueError(f"{path}: has no column {lacking[0]!r}: give the {RUNS} of the study")
+                raise ValueError(
+                    f"{path}: has no column {lacking[0]!r}: give the {RUNS} of the study"
+                )
             for number, row in enumerate(found, start=2):
                 for key in ("score", "success"):
                     try:
@@ -126,23 +133,34 @@ class Evidence:
                     except ValueError:
                         finite = False
                     if not finite:
-                        raise ValueError(f"{path}, line {number}: {key} = {row[key]!r}: must be a finite number")
+                        raise ValueError(
+                            f"{path}, line {number}: {key} = {row[key]!r}: must be a finite number"
+                        )
         return cls(rows)
 
     def without(self, *tested: str) -> "Evidence":
         """The same without some tests, such as `lag 2` or `marginal motor`."""
         return Evidence(row for row in self.rows if row["tested"] not in tested)
 
-    def outcome(self, task: str, trained: str, tested: str, besides: str | None = None) -> Outcome | None:
+    def outcome(
+        self, task: str, trained: str, tested: str, besides: str | None = None
+    ) -> Outcome | None:
         """What policies lost in a test, by seed; None with fewer than two policies.
 
-        `trained` is an arm, without the task. Each policy is compared with itself in another test, or, unless that is
-        given, with the mean of those that were trained and tested on ideal forces.
+        `trained` is an arm, without the task. Each policy is compared with itself in another test,
+        or, unless that is given, with the mean of those that were trained and tested on ideal
+        forces.
         """
-        found, home = self._tested.get((task, trained, tested), {}), self._tested.get((task, "ideal", "ideal"), {})
+        found, home = (
+            self._tested.get((task, trained, tested), {}),
+            self._tested.get((task, "ideal", "ideal"), {}),
+        )
         if besides is not None:
             paired = self._tested.get((task, trained, besides), {})
-            values = [np.subtract(paired[seed], found[seed]) for seed in sorted(found.keys() & paired.keys())]
+            values = [
+                np.subtract(paired[seed], found[seed])
+                for seed in sorted(found.keys() & paired.keys())
+            ]
         else:
             level = np.mean(list(home.values()), axis=0) if home else np.full(2, math.nan)
             values = [level - found[seed] for seed in sorted(found)] if home else []
@@ -161,15 +179,22 @@ class Evidence:
         low, high = tested[index - 1], tested[index]
         share = min((dose - low) / (high - low), 1.0)
         outcome = Outcome(
-            *((1.0 - share) * one + share * other for one, other in zip(curve[low], curve[high], strict=True))
+            *(
+                (1.0 - share) * one + share * other
+                for one, other in zip(curve[low], curve[high], strict=True)
+            )
         )
-        between = {f"{axis} {at:g}" for at, weight in ((low, 1.0 - share), (high, share)) if at and weight}
+        between = {
+            f"{axis} {at:g}" for at, weight in ((low, 1.0 - share), (high, share)) if at and weight
+        }
         return Loss(axis, dose, outcome, dose > 1.005 * tested[-1], tuple(sorted(between)))
 
     def _curve_of(self, task: str, axis: str) -> dict[float, Outcome]:
         """Dose -> what ideal-trained policies lose by it, of those that were tested, none first."""
         doses, none = AXES[axis].doses, f"{axis} 0" if AXES[axis].own_motor else "ideal"
-        outcomes = {dose: self.outcome(task, "ideal", f"{axis} {dose:g}", none) for dose in doses[1:]}
+        outcomes = {
+            dose: self.outcome(task, "ideal", f"{axis} {dose:g}", none) for dose in doses[1:]
+        }
         found = {dose: outcome for dose, outcome in outcomes.items() if outcome is not None}
         if not found:
             return {}

@@ -1,7 +1,7 @@
 """A grid of trainings and tests: every cell an ordinary run folder, found again by its configuration, trained once.
 
-A grid that was killed goes on where it was: what is finished is left alone, trainings that were begun continue
-from their checkpoints.
+A grid that was killed goes on where it was: what is finished is left alone, trainings that were
+begun continue from their checkpoints.
 """
 
 import dataclasses
@@ -18,7 +18,14 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import did_you_mean
 from codrl_mj.runs.files import read_json, write_json
 from codrl_mj.study.parallel import Workers, compute
-from codrl_mj.training import RunInUseError, TrainConfig, TrainingStoppedError, finished, load_config, train
+from codrl_mj.training import (
+    RunInUseError,
+    TrainConfig,
+    TrainingStoppedError,
+    finished,
+    load_config,
+    train,
+)
 
 _FAILURES, _DEPLOYMENTS = "failures", "deployments"
 _PATIENCE = 120.0  # s to wait for a run folder that a dying process of a killed grid still holds
@@ -49,7 +56,10 @@ def check_chosen(field: str, given: Sequence[str], known: Iterable[str]) -> None
     known = list(known)
     for name in given:
         if name not in known:
-            raise ValueError(f"{field}: unknown {name!r}: {did_you_mean(name, known)}Known are {', '.join(known)}")
+            raise ValueError(
+                f"{field}: unknown {name!r}: {did_you_mean(name, known)}Known are"
+                f" {', '.join(known)}"
+            )
     if not given:
         raise ValueError(f"{field}: none is named: name one or more of {', '.join(known)}")
 
@@ -80,7 +90,8 @@ def train_runs(
 ) -> dict[Path, str]:
     """Train every run that is not finished; what went wrong, by run folder. `options` are those of `training.train`.
 
-    `on_run` is called with a folder when it is finished or has failed; those finished before come first.
+    `on_run` is called with a folder when it is finished or has failed; those finished before come
+    first.
     """
     work = {
         folder: (folder, {"train": config.as_mapping()}, _train, config, folder, options)
@@ -97,7 +108,8 @@ def deploy_cells(
 ) -> None:
     """Evaluate policies, by names of their tests, that were not evaluated before: records of `Evaluation.as_mapping()`.
 
-    `on_cell` is called with a name when its policy is evaluated or that failed; those evaluated before come first.
+    `on_cell` is called with a name when its policy is evaluated or that failed; those evaluated
+    before come first.
     """
     work = {
         name: (test, {"test": name, "run": test.run.name}, _deploy, test)
@@ -108,14 +120,19 @@ def deploy_cells(
 
 
 def _compute(
-    cells: Iterable[Any], work: Mapping[Any, tuple[Any, ...]], workers: Workers, on_cell: Callable[[Any], None]
+    cells: Iterable[Any],
+    work: Mapping[Any, tuple[Any, ...]],
+    workers: Workers,
+    on_cell: Callable[[Any], None],
 ) -> dict[Any, str]:
     """Do the work that there is for cells, arguments of `_attempt`; what went wrong. A failure stops no other cell."""
     for cell in cells:
         if cell not in work:
             on_cell(cell)
     failures = {}
-    for cell, failure in compute(_attempt, ((cell, *arguments) for cell, arguments in work.items()), workers):
+    for cell, failure in compute(
+        _attempt, ((cell, *arguments) for cell, arguments in work.items()), workers
+    ):
         if failure is not None:
             failures[cell] = failure
         on_cell(cell)
@@ -123,7 +140,11 @@ def _compute(
 
 
 def _attempt(
-    name: Any, cell: Path | Deployment, about: Mapping[str, Any], function: Callable[..., None], *arguments: Any
+    name: Any,
+    cell: Path | Deployment,
+    about: Mapping[str, Any],
+    function: Callable[..., None],
+    *arguments: Any,
 ) -> tuple[Any, str | None]:
     """Call a function: the name, and what went wrong in a line, of which a record is kept until nothing does."""
     record = failure_record(cell)
@@ -133,7 +154,10 @@ def _attempt(
         raise
     except Exception as error:
         line = " ".join(str(error).split()) or type(error).__name__
-        write_json(record, {"error": line, "traceback": "".join(traceback.format_exception(error)), **about})
+        write_json(
+            record,
+            {"error": line, "traceback": "".join(traceback.format_exception(error)), **about},
+        )
         return name, line
     record.unlink(missing_ok=True)
     return name, None

@@ -1,7 +1,8 @@
 """What may be concluded from scores of training runs: tests, corrections for their number, equivalence, power.
 
-A score is one trained policy's mean over its test episodes. Runs, not episodes, are what training repeats. A contrast
-pools strata (the same question on several tasks or doses): its effect is the mean of their differences of means.
+A score is one trained policy's mean over its test episodes. Runs, not episodes, are what training
+repeats. A contrast pools strata (the same question on several tasks or doses): its effect is the
+mean of their differences of means.
 """
 
 import bisect
@@ -58,10 +59,10 @@ def effect(strata: Sequence[Stratum], confidence: float = 0.95) -> Interval:
 def permutation_p(strata: Sequence[Stratum], least: float = 0.0, two_sided: bool = True) -> float:
     """How often labels given at random make a mean difference as large as the one seen: the p of no difference.
 
-    Labels are exchanged within each stratum: among its runs, or, where it is paired, within every pair. The labels seen
-    count as one of the relabellings. Where both kinds have the same distribution (of pairs: where differences are as
-    likely with either sign) the level is exact; where their means alone are equal it is so approximately, for about
-    equal numbers of runs.
+    Labels are exchanged within each stratum: among its runs, or, where it is paired, within every
+    pair. The labels seen count as one of the relabellings. Where both kinds have the same
+    distribution (of pairs: where differences are as likely with either sign) the level is exact;
+    where their means alone are equal it is so approximately, for about equal numbers of runs.
 
     Args:
         strata: at least one, of which none shares runs with another.
@@ -112,7 +113,8 @@ def equivalence_p(strata: Sequence[Stratum], margin: float) -> float:
 def holm(p: Sequence[float]) -> np.ndarray:
     """Holm's corrected p: the chance of any false positive among all of them stays below the level.
 
-    Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6 (1979).
+    Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of
+    Statistics 6 (1979).
     """
     values = np.asarray(p, dtype=float)
     order = np.argsort(values)
@@ -139,7 +141,9 @@ def power(runs: int, difference: float, level: float = 0.05) -> float:
     freedom, shift = 2 * runs - 2, difference * np.sqrt(runs / 2)
     bound = t.ppf(1 - level / 2, freedom)
     above, below = nct.sf(bound, freedom, shift), nct.cdf(-bound, freedom, shift)
-    return float(np.nan_to_num(above, nan=1.0) + np.nan_to_num(below))  # scipy has NaN where nothing is left to find
+    return float(
+        np.nan_to_num(above, nan=1.0) + np.nan_to_num(below)
+    )  # scipy has NaN where nothing is left to find
 
 
 def detectable(runs: int, level: float = 0.05, chance: float = 0.8) -> float:
@@ -149,8 +153,12 @@ def detectable(runs: int, level: float = 0.05, chance: float = 0.8) -> float:
     return float(brentq(lambda difference: power(runs, difference, level) - chance, 1e-6, 50.0))
 
 
-def runs_needed(difference: float, level: float = 0.05, chance: float = 0.8, most: int = 10_000) -> int | None:
+def runs_needed(
+    difference: float, level: float = 0.05, chance: float = 0.8, most: int = 10_000
+) -> int | None:
     """Runs of each kind that find a difference, in standard deviations of a run, with that chance; None: > `most`."""
     if difference == 0 or power(most, difference, level) < chance:
         return None
-    return bisect.bisect_left(range(most), chance, 2, key=lambda runs: power(runs, difference, level))
+    return bisect.bisect_left(
+        range(most), chance, 2, key=lambda runs: power(runs, difference, level)
+    )

@@ -20,7 +20,11 @@ TITLES: Mapping[str, str] = {
     "mountain_car_continuous": "Continuous Mountain Car",
 }
 """What tasks are called."""
-_SVG = {"svg.hashsalt": "codrl_mj", "svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans", "sans-serif"]}
+_SVG = {
+    "svg.hashsalt": "codrl_mj",
+    "svg.fonttype": "none",
+    "font.sans-serif": ["DejaVu Sans", "sans-serif"],
+}
 """The same bytes for the same figure; text as text, which a reader can search and edit."""
 
 
@@ -34,12 +38,16 @@ def conclusions(page: Path) -> str:
     """A page's conclusions, which a person writes: what its file says, or that there is none yet.
 
     Args:
-        page: the page; the file of `actuators.md` is `actuators_conclusions.md` beside it, which nothing here writes.
+        page: the page; the file of `actuators.md` is `actuators_conclusions.md` beside it, which
+            nothing here writes.
     """
     file = page.with_name(f"{page.stem}_conclusions.md")
     if file.is_file():
         return file.read_text(encoding="utf-8").strip() + "\n"
-    return f"No conclusions are written yet: they belong into `{file.name}` beside this page, which includes them.\n"
+    return (
+        f"No conclusions are written yet: they belong into `{file.name}` beside this page, which"
+        " includes them.\n"
+    )
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> str:
@@ -79,7 +87,13 @@ def legend(figure: Any, columns: int) -> None:
     entries: dict[str, Any] = {}
     for axes in figure.axes:
         entries |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns, fontsize="small")
+    figure.legend(
+        entries.values(),
+        entries.keys(),
+        loc="outside lower center",
+        ncols=columns,
+        fontsize="small",
+    )
 
 
 def save(figure: Any, path: Path) -> None:

@@ -34,8 +34,14 @@ class Workers(Checked):
     def __post_init__(self) -> None:
         """Validate."""
         super().__post_init__()
-        if isinstance(self.jobs, bool) or not isinstance(self.jobs, int) or (self.jobs < 1 and self.jobs != -1):
-            raise ValueError(f"jobs = {self.jobs!r}: must be an integer >= 1, or -1 for one on each CPU")
+        if (
+            isinstance(self.jobs, bool)
+            or not isinstance(self.jobs, int)
+            or (self.jobs < 1 and self.jobs != -1)
+        ):
+            raise ValueError(
+                f"jobs = {self.jobs!r}: must be an integer >= 1, or -1 for one on each CPU"
+            )
 
     @property
     def cores(self) -> int:
@@ -43,11 +49,14 @@ class Workers(Checked):
         return (os.cpu_count() or 1) if self.jobs == -1 else self.jobs
 
 
-def compute(function: Callable[..., Any], work: Iterable[tuple[Any, ...]], workers: Workers) -> Iterator[Any]:
+def compute(
+    function: Callable[..., Any], work: Iterable[tuple[Any, ...]], workers: Workers
+) -> Iterator[Any]:
     """Results of calls, all of it picklable, as they come; those of a Ray cluster when all are there.
 
-    After a Ctrl-C no call is begun any more, trainings write their checkpoints, and other calls end; a second one stops
-    at once. What a call raises breaks the others off. Processes end with this one, however it ends.
+    After a Ctrl-C no call is begun any more, trainings write their checkpoints, and other calls
+    end; a second one stops at once. What a call raises breaks the others off. Processes end with
+    this one, however it ends.
     """
     calls = list(work)
     if not calls:
@@ -56,7 +65,10 @@ def compute(function: Callable[..., Any], work: Iterable[tuple[Any, ...]], worke
 
     local = workers.backend == "local"
     none: list[int] = []
-    with _backend(workers) as backend, stopping(signal.SIGINT) if local else contextlib.nullcontext(none) as asked:
+    with (
+        _backend(workers) as backend,
+        stopping(signal.SIGINT) if local else contextlib.nullcontext(none) as asked,
+    ):
         parallel = joblib.Parallel(
             n_jobs=workers.jobs,
             backend=backend,
@@ -67,16 +79,22 @@ def compute(function: Callable[..., Any], work: Iterable[tuple[Any, ...]], worke
         call = joblib.delayed(_call)
         parent = os.getpid() if local else None
         begun = itertools.takewhile(lambda _: not asked, calls)
-        for result, stopped_by in parallel(call(function, arguments, parent) for arguments in begun):
+        for result, stopped_by in parallel(
+            call(function, arguments, parent) for arguments in begun
+        ):
             if stopped_by is None:
                 yield result
             else:
                 asked.append(stopped_by)
         if asked:
-            raise TrainingStoppedError("stopped: the same command goes on from the last checkpoints", asked[0])
+            raise TrainingStoppedError(
+                "stopped: the same command goes on from the last checkpoints", asked[0]
+            )
 
 
-def _call(function: Callable[..., Any], arguments: tuple[Any, ...], parent: int | None) -> tuple[Any, int | None]:
+def _call(
+    function: Callable[..., Any], arguments: tuple[Any, ...], parent: int | None
+) -> tuple[Any, int | None]:
     """The result, and the signal that stopped it."""
     if parent is not None and os.getpid() != parent:
         _serve(parent)
@@ -109,7 +127,9 @@ def _backend(workers: Workers) -> Iterator[str]:
         import ray
         from ray.util.joblib import register_ray
     except ModuleNotFoundError:
-        raise ValueError("backend = 'ray': Ray is not installed: pip install 'codrl-mj[ray]'") from None
+        raise ValueError(
+            "backend = 'ray': Ray is not installed: pip install 'codrl-mj[ray]'"
+        ) from None
     ours = not ray.is_initialized()
     if ours:
         ray.init(address=workers.address, log_to_driver=False)

@@ -8,7 +8,14 @@ from pathlib import Path
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from codrl_mj.fields import Checked, integer
@@ -64,7 +71,10 @@ class Program(Checked, abc.ABC):
         grid, workers = self.grid, self.workers
         if self.dry_run:
             left = _print_costs(grid)
-            print(f"about {left:.2f} core hours are left: {left / workers.cores:.2f} hours with {workers.cores} jobs")
+            print(
+                f"about {left:.2f} core hours are left: {left / workers.cores:.2f} hours with"
+                f" {workers.cores} jobs"
+            )
             return 0
         check_writable(self.root)
         check_writable(self.out)
@@ -101,11 +111,19 @@ def main(kind: type[Program], arguments: Sequence[str] | None = None) -> int:
 
 
 def compute(
-    grid: Grid, workers: Workers, accept_changes: bool = False, on_seed: Callable[[], None] = lambda: None
+    grid: Grid,
+    workers: Workers,
+    accept_changes: bool = False,
+    on_seed: Callable[[], None] = lambda: None,
 ) -> None:
     """Compute what of a grid is missing, with a progress bar each for its trainings and its tests."""
     counts = {"training": len(grid.cells), "test": len(grid.deployments)}
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=_console()) as bar:
         rows = {kind: bar.add_task(f"{kind}s", total=count) for kind, count in counts.items()}
         grid.compute(workers, accept_changes, lambda kind: bar.advance(rows[kind]), on_seed)

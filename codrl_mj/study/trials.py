@@ -1,8 +1,9 @@
 """What studies consist of: arms that are trained with many seeds, and trials that test their policies.
 
-A study is its trials. Every training is a run folder that is found again by its configuration, every test of a policy a
-file in it; so whatever is there is never computed again, whoever computed it. Run folders do not outlive a machine: a
-row of every test, with the name of its run, is published, and stands for a run folder that is not at hand.
+A study is its trials. Every training is a run folder that is found again by its configuration,
+every test of a policy a file in it; so whatever is there is never computed again, whoever computed
+it. Run folders do not outlive a machine: a row of every test, with the name of its run, is
+published, and stands for a run folder that is not at hand.
 """
 
 import collections
@@ -141,9 +142,15 @@ class Grid:
             ("arm", {(trial.arm.name, repr(trial.arm.config)) for trial in self.trials}),
             ("trial", {(trial.name, repr(trial.env)) for trial in self.trials}),
         ):
-            twice = [name for name, count in collections.Counter(name for name, _ in named).items() if count > 1]
+            twice = [
+                name
+                for name, count in collections.Counter(name for name, _ in named).items()
+                if count > 1
+            ]
             if twice:
-                raise ValueError(f"{kind} {twice[0]!r}: stands for several: give each a name of its own")
+                raise ValueError(
+                    f"{kind} {twice[0]!r}: stands for several: give each a name of its own"
+                )
 
     @functools.cached_property
     def arms(self) -> tuple[Arm, ...]:
@@ -167,7 +174,9 @@ class Grid:
         """The tests by trial and seed, whether the policies are trained or not."""
         folders = self.folders
         return {
-            (trial.name, seed): Deployment(folders[trial.arm.name, seed], trial.env, self.episodes, EVALUATION_SEED)
+            (trial.name, seed): Deployment(
+                folders[trial.arm.name, seed], trial.env, self.episodes, EVALUATION_SEED
+            )
             for trial in self.trials
             for seed in self.seeds_of(trial.arm)
         }
@@ -179,13 +188,19 @@ class Grid:
         for row in [] if self.published is None else read_csv(self.published / RUNS):
             key = f"{row['task']}: {row['trained']} on {row['tested']}", int(row["seed"])
             if key in tests and tests[key].run.name == row["run"]:
-                found[key] = {name: float(row[name]) if row[name] else None for name in ("returns", *MEASURES)}
+                found[key] = {
+                    name: float(row[name]) if row[name] else None for name in ("returns", *MEASURES)
+                }
         return found
 
     def _untested(self) -> dict[tuple[str, int], Deployment]:
         """The tests of which there is neither a file nor a row."""
         tests = self.deployments
-        return {key: test for key, test in tests.items() if key not in self.rows and not test.record.is_file()}
+        return {
+            key: test
+            for key, test in tests.items()
+            if key not in self.rows and not test.record.is_file()
+        }
 
     def compute(
         self,
@@ -200,8 +215,8 @@ class Grid:
             workers: what computes it.
             accept_changes: continue begun trainings even if code or packages have changed since.
             on_cell: called with `training` or `test` when one is finished or has failed.
-            on_seed: called when all of a seed's are, or of the fewest seeds that occupy every core, unless nothing
-                came of it.
+            on_seed: called when all of a seed's are, or of the fewest seeds that occupy every core,
+                unless nothing came of it.
 
         Raises:
             ValueError: Ray is asked for and not installed.
@@ -209,9 +224,13 @@ class Grid:
         """
         cells, folders, tests = self.cells, self.folders, self._untested()
         needed = {test.run for test in tests.values()}
-        left = [cell[1] for cell, folder in folders.items() if folder in needed and not finished(folder)]
+        left = [
+            cell[1] for cell, folder in folders.items() if folder in needed and not finished(folder)
+        ]
         rounds: list[list[int]] = [[]]
-        for seed in sorted({seed for _, seed in cells}):  # trained and tested, so that a part says something of all
+        for seed in sorted(
+            {seed for _, seed in cells}
+        ):  # trained and tested, so that a part says something of all
             rounds[-1].append(seed)
             if sum(map(left.count, rounds[-1])) >= workers.cores:
                 rounds.append([])
@@ -221,9 +240,17 @@ class Grid:
                 on_cell("training")
             waiting = {folder: config for folder, config in runs.items() if folder in needed}
             train_runs(
-                waiting, workers, lambda _: on_cell("training"), accept_changes=accept_changes, tensorboard=False
+                waiting,
+                workers,
+                lambda _: on_cell("training"),
+                accept_changes=accept_changes,
+                tensorboard=False,
             )
-            ready = {called(*key): test for key, test in tests.items() if key[1] in seeds and finished(test.run)}
+            ready = {
+                called(*key): test
+                for key, test in tests.items()
+                if key[1] in seeds and finished(test.run)
+            }
             deploy_cells(ready, workers, lambda _: on_cell("test"))
             if any(map(finished, waiting)) or any(test.record.is_file() for test in ready.values()):
                 on_seed()
@@ -237,8 +264,12 @@ class Grid:
         folders, tests = self.folders, self.deployments
         at_hand = {cell: folder for cell, folder in folders.items() if finished(folder)}
         arm_of = {trial.name: trial.arm.name for trial in self.trials}
-        done = at_hand | {cell: folders[cell] for trial, seed in self.rows if (cell := (arm_of[trial], seed))}
-        evaluations: dict[str, dict[int, Mapping[str, Any]]] = {trial.name: {} for trial in self.trials}
+        done = at_hand | {
+            cell: folders[cell] for trial, seed in self.rows if (cell := (arm_of[trial], seed))
+        }
+        evaluations: dict[str, dict[int, Mapping[str, Any]]] = {
+            trial.name: {} for trial in self.trials
+        }
         missing: dict[str, Path | Deployment] = {
             called(*cell): folder for cell, folder in folders.items() if cell not in done
         }
@@ -261,17 +292,33 @@ class Grid:
 
     def _totals(self, at_hand: Mapping[tuple[str, int], Path], done: int, missing: int) -> "Totals":
         """What trainings took: those at hand with tests, which get rows, beside what is published of all that have."""
-        tests, before, file = self.deployments, Totals(0, 0, 0.0, {}), (self.published or self.root) / TOTALS
+        tests, before, file = (
+            self.deployments,
+            Totals(0, 0, 0.0, {}),
+            (self.published or self.root) / TOTALS,
+        )
         have_rows = {tests[key].run for key in self.rows}
         tested = {test.run for test in tests.values() if test.record.is_file()}
         if self.rows and file.is_file() and len(read_csv(file.with_name(RUNS))) == len(self.rows):
             before = Totals(**read_json(file, "totals of a study"))
-        new = [one for one in at_hand.values() if one in tested and not (before.trainings and one in have_rows)]
+        new = [
+            one
+            for one in at_hand.values()
+            if one in tested and not (before.trainings and one in have_rows)
+        ]
         if before.trainings and not new:
             return before
-        codes = [str(read_json(folder / "config.json", "run configuration").get("code"))[:8] for folder in new]
+        codes = [
+            str(read_json(folder / "config.json", "run configuration").get("code"))[:8]
+            for folder in new
+        ]
         seconds = before.seconds + sum(training_seconds(folder) for folder in new)
-        return Totals(done, missing, seconds, dict(collections.Counter(before.codes) + collections.Counter(codes)))
+        return Totals(
+            done,
+            missing,
+            seconds,
+            dict(collections.Counter(before.codes) + collections.Counter(codes)),
+        )
 
     def costs(self) -> list[Cost]:
         """What every arm takes.
@@ -284,11 +331,17 @@ class Grid:
         found = []
         for arm in self.arms:
             mine = {seed: folders[arm.name, seed] for seed in self.seeds_of(arm)}
-            took = {seed: training_seconds(folder) for seed, folder in mine.items() if finished(folder)}
+            took = {
+                seed: training_seconds(folder) for seed, folder in mine.items() if finished(folder)
+            }
             seconds = float(np.mean(list(took.values()))) if took else arm.seconds
             waiting = sum(untested[folder] for folder in mine.values())
-            done = tuple(seed for seed, folder in mine.items() if seed in took or not untested[folder])
-            found.append(Cost(arm, done, tuple(seed for seed in mine if seed not in done), seconds, waiting))
+            done = tuple(
+                seed for seed, folder in mine.items() if seed in took or not untested[folder]
+            )
+            found.append(
+                Cost(arm, done, tuple(seed for seed in mine if seed not in done), seconds, waiting)
+            )
         return found
 
 
@@ -319,7 +372,9 @@ class Collected:
         return {seed: float(value) for seed, value in found.items() if value is not None}
 
 
-def run_rows(collected: Collected, score: Callable[[Trial], Mapping[int, float]]) -> Iterable[dict[str, Any]]:
+def run_rows(
+    collected: Collected, score: Callable[[Trial], Mapping[int, float]]
+) -> Iterable[dict[str, Any]]:
     """A row for every policy and test, units as in docs/evaluation.md; `score` gives those of a trial by seed."""
     for trial in collected.grid.trials:
         scores = score(trial)
@@ -336,14 +391,18 @@ def run_rows(collected: Collected, score: Callable[[Trial], Mapping[int, float]]
             }
 
 
-def trial_rows(collected: Collected, score: Callable[[Trial], Mapping[int, float]]) -> Iterable[dict[str, Any]]:
+def trial_rows(
+    collected: Collected, score: Callable[[Trial], Mapping[int, float]]
+) -> Iterable[dict[str, Any]]:
     """A row for every trial: mean score with its 95 % bootstrap interval over policies, and means of the measures."""
     for trial in collected.grid.trials:
         scores = np.array(list(score(trial).values()))
         if not scores.size:
             continue
         mean = bootstrap_mean(scores)
-        measured = {name: list(collected.scores(trial, name).values()) for name in ("returns", *MEASURES)}
+        measured = {
+            name: list(collected.scores(trial, name).values()) for name in ("returns", *MEASURES)
+        }
         env = trial.env
         yield {
             "task": trial.arm.task,

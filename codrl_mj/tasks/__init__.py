@@ -4,12 +4,22 @@ from collections.abc import Mapping
 from typing import Any
 
 from codrl_mj.actuators import check_same_family, resolve
-from codrl_mj.tasks import acrobot, cartpole, furuta, mountain_car, mountain_car_continuous, pendulum
+from codrl_mj.tasks import (
+    acrobot,
+    cartpole,
+    furuta,
+    mountain_car,
+    mountain_car_continuous,
+    pendulum,
+)
 from codrl_mj.tasks.base import Task
 from codrl_mj.tasks.registration import TASKS, find_task, reference_of, register
 from codrl_mj.tasks.twin import Twin
 
-OURS = tuple(register(each.TASK) for each in (pendulum, cartpole, acrobot, mountain_car, mountain_car_continuous))
+OURS = tuple(
+    register(each.TASK)
+    for each in (pendulum, cartpole, acrobot, mountain_car, mountain_car_continuous)
+)
 """The tasks that rebuild Gymnasium's, and have the paper's actuators."""
 register(furuta.TASK)
 
@@ -18,12 +28,13 @@ def resolve_actuators(given: Any, task: Task) -> tuple[Any, ...]:
     """Turn whatever a user may write for a task's actuator into one for each of its motors.
 
     Args:
-        given: what `codrl_mj.actuators.resolve` takes, or the name `default`, which is the task's own actuator; for all
-            motors, or a list of these, one for each.
+        given: what `codrl_mj.actuators.resolve` takes, or the name `default`, which is the task's
+            own actuator; for all motors, or a list of these, one for each.
         task: the task, whose own actuators the names vary.
 
     Raises:
-        ValueError: unknown name or field, a value out of bounds, or not one for each motor, or of several families.
+        ValueError: unknown name or field, a value out of bounds, or not one for each motor, or of
+            several families.
     """
     count = len(task.motors)
     each = list(given) if isinstance(given, list | tuple) else [given] * count
@@ -37,7 +48,9 @@ def resolve_actuators(given: Any, task: Task) -> tuple[Any, ...]:
         elif isinstance(one, str) and one == "default":
             each[at] = task.default_actuator
     papers = task.paper or (None,) * count
-    actuators = tuple(resolve(one, paper, task.name) for one, paper in zip(each, papers, strict=True))
+    actuators = tuple(
+        resolve(one, paper, task.name) for one, paper in zip(each, papers, strict=True)
+    )
     check_same_family(actuators)
     return actuators
 

@@ -2,8 +2,9 @@
 
 ## Description
 
-Two links (1 kg, 1 m each, centre of mass in the middle, 1 kg m^2 about it) hang from a fixed shoulder under a gravity
-of 9.8 m/s^2. The actuator turns the elbow. These are Gymnasium's "book" dynamics, without its torque noise.
+Two links (1 kg, 1 m each, centre of mass in the middle, 1 kg m^2 about it) hang from a fixed
+shoulder under a gravity of 9.8 m/s^2. The actuator turns the elbow. These are Gymnasium's "book"
+dynamics, without its torque noise.
 
 ## Observation space
 
@@ -16,8 +17,8 @@ of 9.8 m/s^2. The actuator turns the elbow. These are Gymnasium's "book" dynamic
 | 4 | `velocity_1` | -4 pi | 4 pi | rad/s |
 | 5 | `velocity_2` | -9 pi | 9 pi | rad/s |
 
-Angle 1 is the first link's, 0 hanging down; angle 2 the second's relative to the first. Both grow counter-clockwise and
-are wrapped to [-pi, pi].
+Angle 1 is the first link's, 0 hanging down; angle 2 the second's relative to the first. Both grow
+counter-clockwise and are wrapped to [-pi, pi].
 
 ## Action space
 
@@ -34,12 +35,13 @@ All four state entries uniform in [-0.1, 0.1], in float32. `reset(options={"low"
 
 ## End
 
-The tip is more than 1 m above the shoulder, which is success: -cos(angle 1) - cos(angle 1 + angle 2) > 1. Truncated
-after 500 steps (100 s).
+The tip is more than 1 m above the shoulder, which is success: -cos(angle 1) - cos(angle 1 + angle
+2) > 1. Truncated after 500 steps (100 s).
 
 ## Arguments
 
-[Those of every environment](arguments.md). RK4 is Gymnasium's, ten steps with a motor the paper's choice.
+[Those of every environment](arguments.md). RK4 is Gymnasium's, ten steps with a motor the paper's
+choice.
 """
 
 import math
@@ -92,7 +94,14 @@ def _wrapped(angle: Any) -> Any:
 
 def observation(state: Entries) -> tuple[Any, ...]:
     """Cosines and sines of the angles, and the speeds."""
-    return np.cos(state[0]), np.sin(state[0]), np.cos(state[1]), np.sin(state[1]), state[2], state[3]
+    return (
+        np.cos(state[0]),
+        np.sin(state[0]),
+        np.cos(state[1]),
+        np.sin(state[1]),
+        state[2],
+        state[3],
+    )
 
 
 def terminated(state: Entries) -> Any:
@@ -114,10 +123,14 @@ class Twin(GymnasiumTwin):
     env_id = "Acrobot-v1"
     _LARGEST = 400.0  # N*m*s^2
 
-    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
+    def __call__(
+        self, state: np.ndarray, force: float, timestep: float, integrator: str
+    ) -> np.ndarray:
         """One `step` with the torque as the only one to choose from."""
         del integrator  # it has one only
-        if not abs(force) * timestep**2 < self._LARGEST:  # Gymnasium wraps angles turn by turn: it would not come back
+        if (
+            not abs(force) * timestep**2 < self._LARGEST
+        ):  # Gymnasium wraps angles turn by turn: it would not come back
             return np.full(4, np.nan)
         return self.after(state, 0, AVAIL_TORQUE=[force], dt=timestep)
 
@@ -146,7 +159,14 @@ TASK = Task(
     render_fps=15,
     integrators=("rk4",),
     state_names=("theta1 [rad]", "theta2 [rad]", "theta1_dot [rad/s]", "theta2_dot [rad/s]"),
-    observation_names=("cos_angle_1", "sin_angle_1", "cos_angle_2", "sin_angle_2", "velocity_1", "velocity_2"),
+    observation_names=(
+        "cos_angle_1",
+        "sin_angle_1",
+        "cos_angle_2",
+        "sin_angle_2",
+        "velocity_1",
+        "velocity_2",
+    ),
     observation_space=spaces.Box(-_HIGH, _HIGH, dtype=np.float32),
     initial_bounds=initial_bounds,
     initial_state=initial_state,
@@ -185,7 +205,12 @@ TASK = Task(
         # at the task's limits, twice as fast, one RK4 step of Gymnasium amplifies rounding to 1e-12
         bounds=(np.pi, np.pi, 2 * np.pi, 4 * np.pi),
         # on the cut of the angles, and faster than the first link may turn after the step
-        edges=((*around(math.pi), 0.0), (*around(math.pi), 0.0), (-4 * math.pi, -1.0, 4 * math.pi), (-6.0, 6.0)),
+        edges=(
+            (*around(math.pi), 0.0),
+            (*around(math.pi), 0.0),
+            (-4 * math.pi, -1.0, 4 * math.pi),
+            (-6.0, 6.0),
+        ),
         # a large swing, angles within half a turn, speeds below 4 pi
         start=(2.0, 0.5, 0.0, 0.0),
         steps=7,

@@ -4,7 +4,9 @@ import enum
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-COMPILED = "it is compiled into the task's functions: limit or end episodes in a `gymnasium.Wrapper`"
+COMPILED = (
+    "it is compiled into the task's functions: limit or end episodes in a `gymnasium.Wrapper`"
+)
 
 
 class ModelNumber(NamedTuple):
@@ -60,7 +62,9 @@ GRAVITY = ModelNumber("opt.gravity", entry=2, scale=-1.0)
 
 def mass(body: str, only: tuple[str, ...] = (), inverse: bool = False) -> ModelNumber:
     """A body's mass [kg], and its inertia with it."""
-    return ModelNumber("body_mass", body, inverse=inverse, varies=(f"model.mass.{body}",), only=only)
+    return ModelNumber(
+        "body_mass", body, inverse=inverse, varies=(f"model.mass.{body}",), only=only
+    )
 
 
 def centre(body: str, scale: float = 1.0, only: tuple[str, ...] = ()) -> ModelNumber:

@@ -42,14 +42,15 @@ INTEGRATORS = {
 class Task(fields.Checked):
     """One task, defined once; every face (single, batched, analytic, dm_control) is built from it.
 
-    A function of a state takes the state's entries, in Gymnasium's own order: `state[0]`, `state[1]` and so on, each a
-    number, or an array with a number for each of N states (`states.T` of states (N, n)). What is the same for all
-    states may be returned as a single number. These functions are plain Python that numba compiles as it stands
-    (`codrl_mj.physics.compiled_task`); every face runs the compiled form.
+    A function of a state takes the state's entries, in Gymnasium's own order: `state[0]`,
+    `state[1]` and so on, each a number, or an array with a number for each of N states (`states.T`
+    of states (N, n)). What is the same for all states may be returned as a single number. These
+    functions are plain Python that numba compiles as it stands (`codrl_mj.physics.compiled_task`);
+    every face runs the compiled form.
 
     Raises:
-        ValueError: a field is out of bounds, or a function, called once on plain numbers, does not return what others
-            declare.
+        ValueError: a field is out of bounds, or a function, called once on plain numbers, does not
+            return what others declare.
     """
 
     name: str
@@ -65,11 +66,13 @@ class Task(fields.Checked):
     motor_inner_steps: int = field(metadata=fields.integer(1, least=1).metadata)
     """Integration steps per environment step when a motor is in the loop."""
     max_force: Any
-    """Largest desired force [N] or torque [N*m] of any action; where the action is the force, it saturates here. One
-    for each motor, or one for all."""
+    """Largest desired force [N] or torque [N*m] of any action; where the action is the force, it
+    saturates here. One for each motor, or one for all.
+    """
     integrators: tuple[str, ...]
-    """Names of the integrators that can be chosen, keys of `INTEGRATORS`; the first is Gymnasium's. The model's own has
-    to be of that kind."""
+    """Names of the integrators that can be chosen, keys of `INTEGRATORS`; the first is Gymnasium's.
+    The model's own has to be of that kind.
+    """
     state_names: tuple[str, ...]
     """Names of the state's entries, with units."""
     observation_names: tuple[str, ...]
@@ -85,51 +88,61 @@ class Task(fields.Checked):
     terminated: Callable[[Entries], Any]
     """(state) -> whether the episode ends there."""
     constrain: Callable[[Entries, float], tuple[Any, ...]] | None = None
-    """(state as integrated, integration step [s]) -> entries of the state within the bounds that Gymnasium's `step`
-    keeps: speed limits, walls, wrapped angles. Applied after every integration step; None where there are no bounds.
-    Must let NaN through."""
+    """(state as integrated, integration step [s]) -> entries of the state within the bounds that
+    Gymnasium's `step` keeps: speed limits, walls, wrapped angles. Applied after every integration
+    step; None where there are no bounds. Must let NaN through.
+    """
     goal: Callable[[Entries], Any] | None = None
-    """(state) -> whether the task's goal is reached there. An episode succeeds if it ends at the goal and has been
-    there for `goal_hold`. None where the goal is to last: an episode then succeeds if it is not terminated before the
-    time limit."""
+    """(state) -> whether the task's goal is reached there. An episode succeeds if it ends at the
+    goal and has been there for `goal_hold`. None where the goal is to last: an episode then
+    succeeds if it is not terminated before the time limit.
+    """
     goal_hold: float = fields.real(0.0, least=0.0, unit="s")
     """How long an episode that succeeds has been at the goal when it ends [s]."""
 
     forces: tuple[Any, ...] | None = None
-    """Desired forces [N] or torques [N*m] of the discrete actions, in order, each a number, or with several motors a
-    tuple; None where the action is the force."""
+    """Desired forces [N] or torques [N*m] of the discrete actions, in order, each a number, or with
+    several motors a tuple; None where the action is the force.
+    """
     options: type[Any] = NoOptions
     """The task's options: a `NamedTuple` class whose fields all have defaults."""
     qpos: tuple[int, ...] = ()
-    """Which state entries are MuJoCo's `qpos`, in order; an arithmetic progression, as is `qvel`. The state's first
-    half unless told otherwise."""
+    """Which state entries are MuJoCo's `qpos`, in order; an arithmetic progression, as is `qvel`.
+    The state's first half unless told otherwise.
+    """
     qvel: tuple[int, ...] = ()
     """Which state entries are MuJoCo's `qvel`, in order; the second half unless told otherwise."""
     action_space: spaces.Space[Any] = None  # type: ignore[assignment]
-    """The action space, Gymnasium's; unless told otherwise up to `max_force`, or which of `forces`. A copy of another
-    force keeps it, as Gymnasium's Pendulum does where `max_torque` is written; with None it gets its own."""
+    """The action space, Gymnasium's; unless told otherwise up to `max_force`, or which of `forces`.
+    A copy of another force keeps it, as Gymnasium's Pendulum does where `max_torque` is written;
+    with None it gets its own.
+    """
     observation_space: spaces.Box = None  # type: ignore[assignment]
     """The observation space, Gymnasium's; without bounds unless told otherwise."""
     render_fps: int = fields.integer(0, least=0)
     """Frames per second of a video with one frame a step: real time unless told otherwise, as Gymnasium does."""
     motors: tuple[str, ...] = ("motor",)
-    """Names of the MJCF model's actuators that the task drives, in the order of actions and forces. With several of
-    them, forces and signals are arrays (n,) wherever they are numbers otherwise."""
+    """Names of the MJCF model's actuators that the task drives, in the order of actions and forces.
+    With several of them, forces and signals are arrays (n,) wherever they are numbers otherwise.
+    """
     reward_threshold: float | None = fields.real(None)
     """Mean return at which the task counts as solved."""
     agent: str = "ppo"
     """The agent that `codrl-mj train` takes unless told otherwise."""
     gymnasium_id: str | None = None
-    """Id of the environment that this task rebuilds, with the same spaces, starts, rewards and ends; None if it is none
-    of Gymnasium's."""
+    """Id of the environment that this task rebuilds, with the same spaces, starts, rewards and
+    ends; None if it is none of Gymnasium's.
+    """
     twin: Callable[[], Twin] | None = None
-    """Makes that environment, or the equations of motion in closed form, to be driven by any force: the analytic
-    physics, and the oracle of the certificate."""
+    """Makes that environment, or the equations of motion in closed form, to be driven by any force:
+    the analytic physics, and the oracle of the certificate.
+    """
     ideal_inner_steps: int = fields.integer(1, least=1)
     """Integration steps per environment step when the actuator is ideal: Gymnasium's."""
     paper: tuple[Actuator, ...] = ()
-    """The paper's actuators, one for each motor, of which other named actuators are variations; none where there are
-    none."""
+    """The paper's actuators, one for each motor, of which other named actuators are variations;
+    none where there are none.
+    """
     actuator: str = "ideal"
     """Name of its actuator where it has none of the paper's, such as a motor of the catalogue."""
     wrapped: tuple[int, ...] = ()
@@ -150,7 +163,11 @@ class Task(fields.Checked):
         derived = {
             "qpos": tuple(range(half)),
             "qvel": tuple(range(half, 2 * half)),
-            "action_space": spaces.Box(-limits, limits) if self.forces is None else spaces.Discrete(len(self.forces)),
+            "action_space": (
+                spaces.Box(-limits, limits)
+                if self.forces is None
+                else spaces.Discrete(len(self.forces))
+            ),
             "observation_space": spaces.Box(-np.inf, np.inf, size, np.float32),
             "render_fps": max(round(1.0 / self.step_duration), 1),
         }
@@ -173,30 +190,43 @@ class Task(fields.Checked):
     @property
     def max_forces(self) -> np.ndarray:
         """Largest desired forces [N] or torques [N*m], shape (n,)."""
-        return np.broadcast_to(np.array(self.max_force, dtype=np.float64), (len(self.motors),)).copy()
+        return np.broadcast_to(
+            np.array(self.max_force, dtype=np.float64), (len(self.motors),)
+        ).copy()
 
-    def steps_within(self, actuator: ActuatorModel, inner_steps: int | None, timestep: float | None) -> int:
+    def steps_within(
+        self, actuator: ActuatorModel, inner_steps: int | None, timestep: float | None
+    ) -> int:
         """Integration steps in an environment step: their number, by the step [s], or the default for an actuator.
 
         Raises:
-            ValueError: both were given, the number is below 1, or the timestep does not divide the environment step.
+            ValueError: both were given, the number is below 1, or the timestep does not divide the
+                environment step.
         """
         if inner_steps is not None and timestep is not None:
-            raise ValueError(f"inner_steps = {inner_steps} and timestep = {timestep}: give one of them, not both")
+            raise ValueError(
+                f"inner_steps = {inner_steps} and timestep = {timestep}: give one of them, not both"
+            )
         if timestep is not None:
-            if not (isinstance(timestep, numbers.Real) and math.isfinite(timestep) and timestep > 0):
+            if not (
+                isinstance(timestep, numbers.Real) and math.isfinite(timestep) and timestep > 0
+            ):
                 raise ValueError(f"timestep = {timestep!r}: must be a finite number > 0 [s]")
             count = round(self.step_duration / timestep)
             if count < 1 or not math.isclose(count * timestep, self.step_duration, rel_tol=1e-9):
                 raise ValueError(
-                    f"timestep = {timestep:g} s does not divide {self.name}'s environment step of "
-                    f"{self.step_duration:g} s: the ratio is {self.step_duration / timestep:.6g}, must be an "
-                    "integer >= 1"
+                    f"timestep = {timestep:g} s does not divide {self.name}'s environment step of"
+                    f" {self.step_duration:g} s: the ratio is {self.step_duration / timestep:.6g},"
+                    " must be an integer >= 1"
                 )
             return count
         if inner_steps is None:
             return self.ideal_inner_steps if isinstance(actuator, Ideal) else self.motor_inner_steps
-        if isinstance(inner_steps, bool) or not isinstance(inner_steps, numbers.Integral) or inner_steps < 1:
+        if (
+            isinstance(inner_steps, bool)
+            or not isinstance(inner_steps, numbers.Integral)
+            or inner_steps < 1
+        ):
             raise ValueError(f"inner_steps = {inner_steps!r}: must be an integer >= 1")
         return int(inner_steps)
 
@@ -207,7 +237,9 @@ class Task(fields.Checked):
             ValueError: the task has no such integrator.
         """
         if name is not None and name not in self.integrators:
-            raise ValueError(f"integrator = {name!r}: {self.name} has {', '.join(self.integrators)}")
+            raise ValueError(
+                f"integrator = {name!r}: {self.name} has {', '.join(self.integrators)}"
+            )
         return name or self.integrators[0]
 
     @functools.cached_property
@@ -223,25 +255,35 @@ class Task(fields.Checked):
         states = np.random.default_rng(0).uniform(0.1, 1.0, (len(self.state_names), 5))
         units: list[str | None] = []
         for entry, least, most in zip(
-            self.observation(states), self.observation_space.low, self.observation_space.high, strict=True
+            self.observation(states),
+            self.observation_space.low,
+            self.observation_space.high,
+            strict=True,
         ):
             same = [k for k, one in enumerate(states) if np.array_equal(entry, one)]
             plain = "1" if (least, most) == (-1.0, 1.0) else None
-            units.append(self.state_names[same[0]].partition("[")[2].rstrip("]") or None if same else plain)
+            units.append(
+                self.state_names[same[0]].partition("[")[2].rstrip("]") or None if same else plain
+            )
         return tuple(units)
 
     def bounds(self, options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
         """`initial_bounds` under a reset's options.
 
         Raises:
-            ValueError: the task asks for no option of such a name, or bounds are not finite or not in order.
+            ValueError: the task asks for no option of such a name, or bounds are not finite or not
+                in order.
         """
         asked = None if options is None else _Asked(options)
         low, high = self.initial_bounds(asked)  # type: ignore[arg-type]
         if asked is not None:
-            fields.check_names(asked.data, sorted(map(str, asked.names)), "reset option", every=True)
+            fields.check_names(
+                asked.data, sorted(map(str, asked.names)), "reset option", every=True
+            )
             if not (np.isfinite([low, high]).all() and np.less_equal(low, high).all()):
-                raise ValueError(f"reset options = {options}: ask for {low} to {high}; must be finite, in order")
+                raise ValueError(
+                    f"reset options = {options}: ask for {low} to {high}; must be finite, in order"
+                )
         return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
 
     def initial(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:

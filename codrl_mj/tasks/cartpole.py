@@ -2,8 +2,8 @@
 
 ## Description
 
-A cart (1 kg) slides on a track under a gravity of 9.8 m/s^2; a uniform pole (0.1 kg, 1 m) stands on it on a hinge.
-There is no friction. The actuator pushes the cart.
+A cart (1 kg) slides on a track under a gravity of 9.8 m/s^2; a uniform pole (0.1 kg, 1 m) stands on
+it on a hinge. There is no friction. The actuator pushes the cart.
 
 ## Observation space
 
@@ -20,23 +20,24 @@ There is no friction. The actuator pushes the cart.
 
 ## Reward
 
-1 a step, the last one included. With `center_radius` a step that ends farther than that from the centre earns 0, and
-the episode goes on. With `sutton_barto_reward` the step that ends the episode earns -1, and with `center_radius` so
-does one that ends farther out; all others earn 0.
+1 a step, the last one included. With `center_radius` a step that ends farther than that from the
+centre earns 0, and the episode goes on. With `sutton_barto_reward` the step that ends the episode
+earns -1, and with `center_radius` so does one that ends farther out; all others earn 0.
 
 ## Start
 
-All four state entries uniform in [-0.05, 0.05]. `reset(options={"low": ..., "high": ...})` sets the bounds.
+All four state entries uniform in [-0.05, 0.05]. `reset(options={"low": ..., "high": ...})` sets the
+bounds.
 
 ## End
 
-The cart is more than 2.4 m from the centre, or the pole leans by more than 12 degrees. Truncated after 500 steps (10
-s), which is success.
+The cart is more than 2.4 m from the centre, or the pole leans by more than 12 degrees. Truncated
+after 500 steps (10 s), which is success.
 
 ## Arguments
 
-[Those of every environment](arguments.md), and two of its own: `center_radius` [m], > 0, no limit by default, 0.1 in
-the paper's training; and Gymnasium's `sutton_barto_reward`. `euler` is explicit,
+[Those of every environment](arguments.md), and two of its own: `center_radius` [m], > 0, no limit
+by default, 0.1 in the paper's training; and Gymnasium's `sutton_barto_reward`. `euler` is explicit,
 Gymnasium's default.
 """
 
@@ -105,9 +106,15 @@ class Twin(GymnasiumTwin):
 
     env_id = "CartPole-v1"
 
-    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
+    def __call__(
+        self, state: np.ndarray, force: float, timestep: float, integrator: str
+    ) -> np.ndarray:
         """One `step` with `force_mag` set to the force; the end of an episode is the task's to judge."""
-        settings = {"tau": timestep, "kinematics_integrator": integrator, "steps_beyond_terminated": None}
+        settings = {
+            "tau": timestep,
+            "kinematics_integrator": integrator,
+            "steps_beyond_terminated": None,
+        }
         return self.after(state, 1, force_mag=force, **settings)
 
 

@@ -2,10 +2,10 @@
 
 ## Description
 
-An arm (0.095 kg, 85 mm) turns about a vertical shaft. A rod (0.024 kg, 129 mm) hangs from a hinge at its end and swings
-across it, under a gravity of 9.81 m/s^2. The actuator turns the arm: the rod has none. It is
-an off-the-shelf motor, `quanser-qube-servo-2`, behind a drive. The paper's actuators (`paper`, `weak` and so on) are
-refused; `ideal` is the bare arm, without the rotor.
+An arm (0.095 kg, 85 mm) turns about a vertical shaft. A rod (0.024 kg, 129 mm) hangs from a hinge
+at its end and swings across it, under a gravity of 9.81 m/s^2. The actuator turns the arm: the rod
+has none. It is an off-the-shelf motor, `quanser-qube-servo-2`, behind a drive. The paper's
+actuators (`paper`, `weak` and so on) are refused; `ideal` is the bare arm, without the rotor.
 
 ## Observation space
 
@@ -18,38 +18,40 @@ refused; `ideal` is the bare arm, without the rotor.
 | 4 | `arm_velocity` | -inf | inf | rad/s |
 | 5 | `rod_velocity` | -inf | inf | rad/s |
 
-Angles grow counter-clockwise, the arm's as seen from above, the rod's as seen from outside: 0 upright, not wrapped.
+Angles grow counter-clockwise, the arm's as seen from above, the rod's as seen from outside: 0
+upright, not wrapped.
 
 ## Action space
 
-`Box(-0.084, 0.084, (1,), float32)`: the desired torque on the arm [N*m]; it saturates at +-0.084, which the motor makes
-of the drive's largest current, 2 A.
+`Box(-0.084, 0.084, (1,), float32)`: the desired torque on the arm [N*m]; it saturates at +-0.084,
+which the motor makes of the drive's largest current, 2 A.
 
 ## Reward
 
-h (1 - (arm angle / 2)^2 / 2 - (torque / 0.084)^2 / 10), with the height h = (1 + cos(rod angle))/2, angles after the
-step and the torque delivered. It is never negative, so ending early earns nothing.
+h (1 - (arm angle / 2)^2 / 2 - (torque / 0.084)^2 / 10), with the height h = (1 + cos(rod angle))/2,
+angles after the step and the torque delivered. It is never negative, so ending early earns nothing.
 
 ## Start
 
-Hanging: arm angle, rod angle less pi, and both velocities uniform in [-0.05, 0.05] (rad, rad/s). `reset(options={"low":
-..., "high": ...})` sets the bounds.
+Hanging: arm angle, rod angle less pi, and both velocities uniform in [-0.05, 0.05] (rad, rad/s).
+`reset(options={"low": ..., "high": ...})` sets the bounds.
 
 ## End
 
-The arm is more than 2 rad (115 degrees) off the middle.
-Truncated after 250 steps (5 s). An episode succeeds if the rod is within 0.1 rad of upright over its last second.
+The arm is more than 2 rad (115 degrees) off the middle. Truncated after 250 steps (5 s). An episode
+succeeds if the rod is within 0.1 rad of upright over its last second.
 
 ## Arguments
 
-[Those of every environment](arguments.md). The supply is the motor's nominal 18 V; the bench's amplifier is made for 10
-V: set `{"name": "default", "supply": {"voltage": 10.0}}`, and its delay by `disturbances={"command_delay": 0.004}`.
-`physics="analytic"` has the equations in closed form, for actuators without a rotor.
+[Those of every environment](arguments.md). The supply is the motor's nominal 18 V; the bench's
+amplifier is made for 10 V: set `{"name": "default", "supply": {"voltage": 10.0}}`, and its delay by
+`disturbances={"command_delay": 0.004}`. `physics="analytic"` has the equations in closed form, for
+actuators without a rotor.
 
 ## What to expect
 
-On 10 V PPO's `default` settings balance from all of five seeds, by torque, current or voltage, and return 231 to 233 of
-250:
+On 10 V PPO's `default` settings balance from all of five seeds, by torque, current or voltage, and
+return 231 to 233 of 250:
 
 ```console
 $ codrl-mj train furuta --env.action voltage --actuator.supply.voltage 10 --seed 0 --out runs/volts
@@ -57,8 +59,9 @@ $ codrl-mj train furuta --env.action voltage --actuator.supply.voltage 10 --seed
 
 Beware of a local optimum: whirling the rod returns 190 and more.
 
-Policies trained on the ideal arm lose on weaker supplies (V) and behind delays (ms). The mean return over three seeds,
-the worst in brackets ([all rows](furuta_supplies.csv) of `scripts/furuta_table.py`):
+Policies trained on the ideal arm lose on weaker supplies (V) and behind delays (ms). The mean
+return over three seeds, the worst in brackets ([all rows](furuta_supplies.csv) of
+`scripts/furuta_table.py`):
 
 | run on | trained on ideal | at 18 V | at 6 V | at 18 V, 6 ms |
 | --- | ---: | ---: | ---: | ---: |
@@ -72,10 +75,11 @@ Train at 18 V: you lose nothing down to 7 V and behind 8 ms, and still swing up 
 
 ## Where the numbers come from
 
-Masses and lengths are the manual's (Quanser, *QUBE-Servo 2 User Manual*). Arm and rod are uniform: the arm's inertia
-about the shaft is m l^2/3 (some simulators have m l^2/12). Joint damping, 5e-6 and 1e-6 N m s/rad, is what
-quanser_robots and Pyrado identified; others have up to five hundred times that: add it by `joint=` to the arm. There
-is no stiction, and the encoder's cable does not pull.
+Masses and lengths are the manual's (Quanser, *QUBE-Servo 2 User Manual*). Arm and rod are uniform:
+the arm's inertia about the shaft is m l^2/3 (some simulators have m l^2/12). Joint damping, 5e-6
+and 1e-6 N m s/rad, is what quanser_robots and Pyrado identified; others have up to five hundred
+times that: add it by `joint=` to the arm. There is no stiction, and the encoder's cable does not
+pull.
 """
 
 import math
@@ -108,7 +112,14 @@ def initial_state(draws: Entries) -> tuple[Any, ...]:
 
 def observation(state: Entries) -> tuple[Any, ...]:
     """Cosines and sines of the angles, and the speeds."""
-    return np.cos(state[0]), np.sin(state[0]), np.cos(state[1]), np.sin(state[1]), state[2], state[3]
+    return (
+        np.cos(state[0]),
+        np.sin(state[0]),
+        np.cos(state[1]),
+        np.sin(state[1]),
+        state[2],
+        state[3],
+    )
 
 
 def terminated(state: Entries) -> Any:
@@ -130,12 +141,14 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any
 class Twin:
     """The equations of motion in closed form, of numbers of its own: nothing is read from the MJCF.
 
-    With the inertias J of arm and hub about the shaft, I of the rod about its hinge and Z along it, the Lagrangian is
+    With the inertias J of arm and hub about the shaft, I of the rod about its hinge and Z along it,
+    the Lagrangian is
 
     ((J + m L^2 + I sin^2 a + Z cos^2 a) w^2 - m L l cos a w v + I v^2)/2 - m g l/2 cos a
 
-    with the arm's length L and speed w, and the rod's mass m, length l, angle a and speed v. Cazzolato and Prime, *On
-    the Dynamics of the Furuta Pendulum*, Journal of Control Science and Engineering (2011), measure a from hanging.
+    with the arm's length L and speed w, and the rod's mass m, length l, angle a and speed v.
+    Cazzolato and Prime, *On the Dynamics of the Furuta Pendulum*, Journal of Control Science and
+    Engineering (2011), measure a from hanging.
     """
 
     GRAVITY = 9.81
@@ -151,10 +164,16 @@ class Twin:
         sine, cosine = np.sin(angle), np.cos(angle)
         across, along = rod_mass * rod**2 / 3, rod_mass * self.RADIUS**2 / 2
         coupling = rod_mass * arm * rod / 2
-        matrix_11 = (arm_mass / 3 + rod_mass) * arm**2 + self.HUB + across * sine**2 + along * cosine**2
+        matrix_11 = (
+            (arm_mass / 3 + rod_mass) * arm**2 + self.HUB + across * sine**2 + along * cosine**2
+        )
         matrix_12 = -coupling * cosine
         twisting = (across - along) * sine * cosine
-        of_arm = force - (self.DAMPING[0] + 2 * twisting * rod_speed) * arm_speed - coupling * sine * rod_speed**2
+        of_arm = (
+            force
+            - (self.DAMPING[0] + 2 * twisting * rod_speed) * arm_speed
+            - coupling * sine * rod_speed**2
+        )
         weight = rod_mass * self.GRAVITY * rod / 2
         of_rod = weight * sine - self.DAMPING[1] * rod_speed + twisting * arm_speed**2
         determinant = matrix_11 * across - matrix_12**2
@@ -167,7 +186,9 @@ class Twin:
             ]
         )
 
-    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
+    def __call__(
+        self, state: np.ndarray, force: float, timestep: float, integrator: str
+    ) -> np.ndarray:
         """One step of the classical Runge-Kutta method."""
         del integrator  # it has one only
         with np.errstate(all="ignore"):  # whoever asked notices a state that is lost
@@ -214,7 +235,12 @@ TASK = Task(
     },
     trials=Trials(
         bounds=(ARM_LIMIT, math.pi, 25.0, 35.0),
-        edges=((*around(ARM_LIMIT), 0.0), (*around(math.pi), 0.0), (-25.0, 0.0, 25.0), (-35.0, 0.0, 35.0)),
+        edges=(
+            (*around(ARM_LIMIT), 0.0),
+            (*around(math.pi), 0.0),
+            (-25.0, 0.0, 25.0),
+            (-35.0, 0.0, 35.0),
+        ),
         # the rod swings through below its hinge
         start=(0.2, 2.0, 0.0, 0.0),
         steps=20,

@@ -2,8 +2,8 @@
 
 ## Description
 
-A car on a hill of the shape sin(3 x) is too weak to drive up, and has to rock. Its acceleration along x is
-0.001 F - 0.0025 cos(3 x), in m/s^2 with F in N: a car of 1000 kg.
+A car on a hill of the shape sin(3 x) is too weak to drive up, and has to rock. Its acceleration
+along x is 0.001 F - 0.0025 cos(3 x), in m/s^2 with F in N: a car of 1000 kg.
 
 ## Observation space
 
@@ -94,8 +94,8 @@ _LOW, _HIGH = np.array([[MIN_POSITION, -MAX_SPEED], [MAX_POSITION, MAX_SPEED]], 
 class Twin(GymnasiumTwin):
     """`MountainCarEnv`: its step has no duration, but force, gravity and speed limit are attributes.
 
-    One step is v += force - gravity cos(3 x), x += v. With w = v dt for its v, and force and gravity times dt^2, it is
-    a step of any duration dt.
+    One step is v += force - gravity cos(3 x), x += v. With w = v dt for its v, and force and
+    gravity times dt^2, it is a step of any duration dt.
     """
 
     env_id = "MountainCar-v0"
@@ -106,7 +106,9 @@ class Twin(GymnasiumTwin):
         self._strength = strength
         setattr(self.env, strength, getattr(gymnasium_env(source), strength))
 
-    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
+    def __call__(
+        self, state: np.ndarray, force: float, timestep: float, integrator: str
+    ) -> np.ndarray:
         """One `step` to the right with `force` set to the force's effect, of either sign."""
         del integrator  # it has one only
         position, change = self.after(
@@ -161,7 +163,10 @@ TASK = Task(
     attributes={**attributes(GOAL, "force"), "gravity": ModelNumber("jnt_user", "slider", 2)},
     trials=Trials(
         bounds=(1.2, MAX_SPEED),
-        edges=((-1.2, -1.2 + 1e-9, -1.19, -0.5, 0.0, 0.5, 0.59, 0.6), (*around(MAX_SPEED), 1e-9, -1e-9, 0.0)),
+        edges=(
+            (-1.2, -1.2 + 1e-9, -1.19, -0.5, 0.0, 0.5, 0.59, 0.6),
+            (*around(MAX_SPEED), 1e-9, -1e-9, 0.0),
+        ),
         # between the walls, below 0.07 m/s
         start=(-0.5, 0.02),
         steps=12,

@@ -2,8 +2,8 @@
 
 ## Description
 
-The car and the hill of [MountainCar](mountain_car.md), with a stronger motor. Its acceleration along x is 0.0015 F -
-0.0025 cos(3 x), in m/s^2 with F in N: a car of 666.7 kg.
+The car and the hill of [MountainCar](mountain_car.md), with a stronger motor. Its acceleration
+along x is 0.0015 F - 0.0025 cos(3 x), in m/s^2 with F in N: a car of 666.7 kg.
 
 ## Observation space
 
@@ -20,8 +20,8 @@ Only the observation is rounded to float32; Gymnasium rounds its state in every 
 
 ## Reward
 
-100 for the step that ends at the goal, minus 0.1 F^2 for the force F [N] that the motor delivered at the end of the
-step. Gymnasium charges for the action.
+100 for the step that ends at the goal, minus 0.1 F^2 for the force F [N] that the motor delivered
+at the end of the step. Gymnasium charges for the action.
 
 ## Start
 
@@ -33,7 +33,8 @@ At the end of a step x >= 0.45 m with v >= 0, which is success. Truncated after 
 
 ## Arguments
 
-[Those of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. Integrated as MountainCar.
+[Those of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. Integrated as
+MountainCar.
 """
 
 import dataclasses
@@ -71,8 +72,8 @@ TASK = dataclasses.replace(
     reward_threshold=90.0,
     agent="ddpg",
     gymnasium_id="MountainCarContinuous-v0",
-    # its own equations are the same, but written so that they cannot be scaled (its gravity is no attribute), and it
-    # rounds its state to float32
+    # its own equations are the same, but written so that they cannot be scaled (its gravity is no
+    # attribute), and it rounds its state to float32
     twin=functools.partial(mountain_car.Twin, "MountainCarContinuous-v0", "power"),
     asset="mountain_car_continuous.xml",
     max_force=FORCE,

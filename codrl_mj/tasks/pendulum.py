@@ -2,8 +2,8 @@
 
 ## Description
 
-A uniform rod (1 kg, 1 m) hangs from a pivot under a gravity of 10 m/s^2. The actuator turns the pivot, too weakly to
-lift the rod in one go.
+A uniform rod (1 kg, 1 m) hangs from a pivot under a gravity of 10 m/s^2. The actuator turns the
+pivot, too weakly to lift the rod in one go.
 
 ## Observation space
 
@@ -17,28 +17,28 @@ The angle theta is 0 upright and grows counter-clockwise; the state's is not wra
 
 ## Action space
 
-`Box(-2, 2, (1,), float32)`: the desired torque [N*m]; it saturates at +-2. To compare with Gymnasium to
-rounding give float64 actions.
+`Box(-2, 2, (1,), float32)`: the desired torque [N*m]; it saturates at +-2. To compare with
+Gymnasium to rounding give float64 actions.
 
 ## Reward
 
--(theta^2 + 0.1 theta_dot^2 + 0.001 torque^2), with theta wrapped to [-pi, pi) and theta_dot from *before* the step, and
-the torque that the motor delivered *in* it.
+-(theta^2 + 0.1 theta_dot^2 + 0.001 torque^2), with theta wrapped to [-pi, pi) and theta_dot from
+*before* the step, and the torque that the motor delivered *in* it.
 
 ## Start
 
-theta uniform in [-pi, pi] rad, theta_dot in [-1, 1] rad/s. `reset(options={"x_init": ..., "y_init": ...})` sets the two
-bounds, as in Gymnasium.
+theta uniform in [-pi, pi] rad, theta_dot in [-1, 1] rad/s. `reset(options={"x_init": ..., "y_init":
+...})` sets the two bounds, as in Gymnasium.
 
 ## End
 
-Never; truncated after 200 steps (10 s). An episode succeeds if over its last second the rod is within 0.1 rad of
-upright and slower than 0.1 rad/s.
+Never; truncated after 200 steps (10 s). An episode succeeds if over its last second the rod is
+within 0.1 rad of upright and slower than 0.1 rad/s.
 
 ## Arguments
 
-[Those of every environment](arguments.md); Gymnasium's `g` is the model's gravity. Semi-implicit Euler is
-the installed Gymnasium's (the paper says explicit).
+[Those of every environment](arguments.md); Gymnasium's `g` is the model's gravity. Semi-implicit
+Euler is the installed Gymnasium's (the paper says explicit).
 """
 
 import math
@@ -65,7 +65,12 @@ GOAL_HOLD = 1.0  # s
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
     """Angle and speed lie within +-pi and +-1, or within the reset options' `x_init` and `y_init`."""
     given = options or {}
-    high = np.array([utils.verify_number_and_cast(given.get(*entry)) for entry in (("x_init", np.pi), ("y_init", 1.0))])
+    high = np.array(
+        [
+            utils.verify_number_and_cast(given.get(*entry))
+            for entry in (("x_init", np.pi), ("y_init", 1.0))
+        ]
+    )
     return -high, high
 
 
@@ -114,7 +119,9 @@ class Twin(GymnasiumTwin):
 
     env_id = "Pendulum-v1"
 
-    def __call__(self, state: np.ndarray, force: float, timestep: float, integrator: str) -> np.ndarray:
+    def __call__(
+        self, state: np.ndarray, force: float, timestep: float, integrator: str
+    ) -> np.ndarray:
         """One `step` with the torque as a float64 action, which Gymnasium does not round."""
         del integrator  # it has one only
         return self.after(state, np.array([force]), dt=timestep, max_torque=np.inf)

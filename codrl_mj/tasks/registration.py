@@ -31,9 +31,15 @@ def register(task: Task) -> Task:
     if not hasattr(task, "env_id"):
         raise ValueError(f"{task!r}: must be a codrl_mj.Task")
     if TASKS.get(task.name, task) is not task:
-        raise ValueError(f"task {task.name!r} is registered already, of {reference_of(TASKS[task.name])}: rename one")
+        raise ValueError(
+            f"task {task.name!r} is registered already, of {reference_of(TASKS[task.name])}:"
+            " rename one"
+        )
     if task.name not in TASKS and task.env_id in registry:
-        raise ValueError(f"environment id {task.env_id!r} is registered already: choose another for task {task.name!r}")
+        raise ValueError(
+            f"environment id {task.env_id!r} is registered already: choose another for task"
+            f" {task.name!r}"
+        )
     if task.env_id not in registry:
         register_with_gymnasium(
             id=task.env_id,
@@ -50,13 +56,17 @@ def register(task: Task) -> Task:
 def reference_of(task: Any, home: str | None = None) -> str:
     """What finds a task, or a world, by its name in any process: the name of ours, `module:NAME` of somebody's.
 
-    Of one that stands in no module it is the name, which only processes know that have registered it.
+    Of one that stands in no module it is the name, which only processes know that have registered
+    it.
 
     Args:
         task: the task or world.
         home: the module to look for it first; that of a task's functions if none is named.
     """
-    home, script = home or task.reward.__module__, "__main__"  # the first and the last choice where several have it
+    home, script = (
+        home or task.reward.__module__,
+        "__main__",
+    )  # the first and the last choice where several have it
     others = (module for module in list(sys.modules) if module not in (home, script, "__mp_main__"))
     for module in itertools.chain([home], others, [script]):
         for name, value in list(getattr(sys.modules.get(module), "__dict__", {}).items()):
@@ -69,7 +79,8 @@ def find_task(name: str) -> Task:
     """The task called `name`.
 
     Args:
-        name: a key of `TASKS`; or `module:NAME` of anybody's task, which is imported and registered.
+        name: a key of `TASKS`; or `module:NAME` of anybody's task, which is imported and
+            registered.
 
     Raises:
         ValueError: unknown name; the nearest known one is suggested.

@@ -12,12 +12,15 @@ import numpy as np
 class Twin(Protocol):
     """Drives an environment that is not ours by one integration step at a time. Made without arguments.
 
-    Where it has the environment as `env`, this one's numbers can be read and written through the analytic physics.
-    Where the environment has its equations of motion as a function, `derivative(state, force)` may return the state's
-    time derivative, shape (n,): the certificate then compares with that.
+    Where it has the environment as `env`, this one's numbers can be read and written through the
+    analytic physics. Where the environment has its equations of motion as a function,
+    `derivative(state, force)` may return the state's time derivative, shape (n,): the certificate
+    then compares with that.
     """
 
-    def __call__(self, state: np.ndarray, force: Any, timestep: float, integrator: str) -> np.ndarray:
+    def __call__(
+        self, state: np.ndarray, force: Any, timestep: float, integrator: str
+    ) -> np.ndarray:
         """The state one integration step later.
 
         Args:
@@ -72,8 +75,9 @@ class Trials(NamedTuple):
     balanced_steps: int
     """Of these, the first ones over which energies are balanced, with integration steps many times finer."""
     horizon: int | None = None
-    """Environment steps over which two implementations must agree to 1e-9; None for a whole episode. A chaotic task's
-    rounding errors, 1e-16 * exp(lambda t), pass that within one."""
+    """Environment steps over which two implementations must agree to 1e-9; None for a whole
+    episode. A chaotic task's rounding errors, 1e-16 * exp(lambda t), pass that within one.
+    """
 
 
 def around(value: float) -> tuple[float, ...]:

@@ -1,8 +1,8 @@
 """Checkpoints: the whole state of a training, as files that appear whole, prove themselves intact, and hold no code.
 
-A state is all that the rest of a training depends on: weights, optimisers, replay buffer, exploration noise, counters,
-the environments and every random generator. Nothing is pickled. Rollout buffers are left out: states are taken between
-two rollouts, when they are empty.
+A state is all that the rest of a training depends on: weights, optimisers, replay buffer,
+exploration noise, counters, the environments and every random generator. Nothing is pickled.
+Rollout buffers are left out: states are taken between two rollouts, when they are empty.
 """
 
 import functools
@@ -36,7 +36,10 @@ _COUNTERS = (
     "exploration_rate",
 )
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-_DRAWN = ("exploration_mat", "exploration_matrices")  # of state-dependent noise, in use until it is drawn anew
+_DRAWN = (
+    "exploration_mat",
+    "exploration_matrices",
+)  # of state-dependent noise, in use until it is drawn anew
 
 
 class State(NamedTuple):
@@ -51,15 +54,21 @@ class State(NamedTuple):
 def capture(model: BaseAlgorithm, envs: Any) -> State:
     """The state of a model and its environments between two rollouts."""
     arrays: dict[str, np.ndarray] = {}
-    facts: dict[str, Any] = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
+    facts: dict[str, Any] = {
+        name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)
+    }
     modules, tensors = model._get_torch_save_params()
     for module in modules:
         state = operator.attrgetter(module)(model).state_dict()
         if "param_groups" in state:
             facts[f"{module}.groups"] = state["param_groups"]
-            facts[f"{module}.moments"] = {str(index): list(moments) for index, moments in state["state"].items()}
+            facts[f"{module}.moments"] = {
+                str(index): list(moments) for index, moments in state["state"].items()
+            }
             for index, moments in state["state"].items():
-                arrays |= {f"{module}.{index}.{name}": _array(value) for name, value in moments.items()}
+                arrays |= {
+                    f"{module}.{index}.{name}": _array(value) for name, value in moments.items()
+                }
         else:
             arrays |= {f"{module}.{name}": _array(value) for name, value in state.items()}
     arrays |= {f"tensor.{name}": _array(operator.attrgetter(name)(model)) for name in tensors}
@@ -74,7 +83,9 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
         arrays |= {f"noise.{name}": _array(getattr(distribution, name)) for name in _DRAWN}
     if hasattr(model, "snapshot"):
         arrays |= {f"model.{name}": value for name, value in model.snapshot().items()}
-    numpy_state: Any = np.random.get_state(legacy=False)  # Stable-Baselines3 draws from NumPy's global generator
+    numpy_state: Any = np.random.get_state(
+        legacy=False
+    )  # Stable-Baselines3 draws from NumPy's global generator
     arrays["random.numpy.key"] = numpy_state["state"].pop("key")
     facts["random.numpy"] = numpy_state
     facts["random.actions"] = model.action_space.np_random.bit_generator.state
@@ -85,7 +96,8 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
 def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
     """Bring a model of the same configuration to what `capture` returned, once `learn` has set it up.
 
-    Model and environments are no good after a state that is refused, which is another configuration's.
+    Model and environments are no good after a state that is refused, which is another
+    configuration's.
     """
     arrays, facts = state
     try:
@@ -96,12 +108,16 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
             own = operator.attrgetter(module)(model)
             if (state_dict := own.state_dict()).keys() == {"state", "param_groups"}:
                 moments = {
-                    int(index): {name: torch.tensor(arrays[f"{module}.{index}.{name}"]) for name in names}
+                    int(index): {
+                        name: torch.tensor(arrays[f"{module}.{index}.{name}"]) for name in names
+                    }
                     for index, names in facts[f"{module}.moments"].items()
                 }
                 own.load_state_dict({"state": moments, "param_groups": facts[f"{module}.groups"]})
             else:
-                own.load_state_dict({name: torch.tensor(arrays[f"{module}.{name}"]) for name in state_dict})
+                own.load_state_dict(
+                    {name: torch.tensor(arrays[f"{module}.{name}"]) for name in state_dict}
+                )
         for name in tensors:
             with torch.no_grad():
                 operator.attrgetter(name)(model).copy_(torch.tensor(arrays[f"tensor.{name}"]))
@@ -122,7 +138,9 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
         if hasattr(model, "restore"):
             model.restore(below("model.", arrays))
         numpy_state = facts["random.numpy"]
-        np.random.set_state(numpy_state | {"state": numpy_state["state"] | {"key": arrays["random.numpy.key"]}})
+        np.random.set_state(
+            numpy_state | {"state": numpy_state["state"] | {"key": arrays["random.numpy.key"]}}
+        )
         model.action_space.np_random.bit_generator.state = facts["random.actions"]
         torch.set_rng_state(torch.tensor(arrays["random.torch"]))
     except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
@@ -149,8 +167,8 @@ def _state_dependent_noise(model: Any) -> StateDependentNoiseDistribution | None
 def save_checkpoint(folder: Path, state: State, run: str) -> Path:
     """Write a checkpoint and delete those that are no longer needed; those before stay where it cannot be written.
 
-    Its name has its step and a digest of its content. `run` says what the run is (its configuration), so that none is
-    continued from another's checkpoint.
+    Its name has its step and a digest of its content. `run` says what the run is (its
+    configuration), so that none is continued from another's checkpoint.
     """
     content = save(state.arrays, metadata={"run": run, "facts": json.dumps(state.facts)})
     step = f"{state.facts['num_timesteps']:012d}"

@@ -22,7 +22,8 @@ class TrainConfig(Checked):
     """What to train, on what, for how long.
 
     Raises:
-        ValueError: a field is out of bounds, or the agent cannot act in the task; the message says what would do.
+        ValueError: a field is out of bounds, or the agent cannot act in the task; the message says
+            what would do.
     """
 
     env: EnvConfig
@@ -48,13 +49,21 @@ class TrainConfig(Checked):
         """Validate."""
         for name, kind in {"agent": AgentConfig, "env": EnvConfig}.items():
             if not isinstance(getattr(self, name), kind):
-                raise ValueError(f"TrainConfig.{name} = {getattr(self, name)!r}: must be a {kind.__name__}")
+                raise ValueError(
+                    f"TrainConfig.{name} = {getattr(self, name)!r}: must be a {kind.__name__}"
+                )
         check_fits(self.agent.known_as(), self.env)
         super().__post_init__()
         if self.total_steps is None and self.total_episodes is None:
-            raise ValueError("TrainConfig.total_steps = None: must be an integer >= 1, or total_episodes must be one")
+            raise ValueError(
+                "TrainConfig.total_steps = None: must be an integer >= 1, or total_episodes must"
+                " be one"
+            )
         if self.total_steps is None and self.env.time_limit is None:
-            raise ValueError(f"TrainConfig.total_steps = None: {self.task} has no time limit: give max_episode_steps")
+            raise ValueError(
+                f"TrainConfig.total_steps = None: {self.task} has no time limit: give"
+                " max_episode_steps"
+            )
 
     @property
     def task(self) -> str:
@@ -116,15 +125,17 @@ class TrainConfig(Checked):
     def from_mapping(cls, mapping: Mapping[str, Any], whole: bool = False) -> "TrainConfig":
         """The configuration that a mapping describes: `as_mapping`'s, or any part of it.
 
-        What is not given is the preset's of the given agent (a name, or a mapping with its `name` and fields to set)
-        and the given `settings` (`default` if none is named). Task and actuator may stand in `env` or above it.
+        What is not given is the preset's of the given agent (a name, or a mapping with its `name`
+        and fields to set) and the given `settings` (`default` if none is named). Task and actuator
+        may stand in `env` or above it.
 
         Args:
             mapping: the fields.
             whole: refuse a mapping that leaves fields out.
 
         Raises:
-            ValueError: a key is unknown (the message suggests one) or missing, or a value out of bounds.
+            ValueError: a key is unknown (the message suggests one) or missing, or a value out of
+                bounds.
         """
         if not isinstance(mapping, Mapping):
             raise ValueError(f"not a training configuration: {mapping!r} is no mapping")
@@ -137,7 +148,11 @@ class TrainConfig(Checked):
         missing = [name for name in names if name not in given] if whole else []
         if missing:
             raise ValueError(f"not a training configuration: it has no {', '.join(missing)}")
-        env, settings, agent = given.pop("env"), given.pop("settings", "default"), given.pop("agent", None)
+        env, settings, agent = (
+            given.pop("env"),
+            given.pop("settings", "default"),
+            given.pop("agent", None),
+        )
         if whole:
             return cls(EnvConfig.from_mapping(env), agent_from_mapping(agent), **given)
         if not isinstance(env, Mapping):
@@ -148,17 +163,23 @@ class TrainConfig(Checked):
         if isinstance(agent, str) or agent is None:
             agent = {"name": agent or default_agent(task, env.get("options"))}
         if not isinstance(agent, Mapping) or "name" not in agent:
-            raise ValueError(f"agent = {agent!r}: must be an agent's name, or a mapping with its name and settings")
+            raise ValueError(
+                f"agent = {agent!r}: must be an agent's name, or a mapping with its name and"
+                " settings"
+            )
         own = {"options": env["options"]} if env.get("options") else {}
         base = cls.preset(task, agent["name"], settings, env.get("actuator", "default"), own)
         agent = agent_from_mapping(base.agent.as_mapping() | dict(agent))
-        return dataclasses.replace(base, env=EnvConfig.from_mapping(env, base.env), agent=agent, **given)
+        return dataclasses.replace(
+            base, env=EnvConfig.from_mapping(env, base.env), agent=agent, **given
+        )
 
 
 def default_agent(task: str, options: Any = None) -> str:
     """The agent that is trained on a task unless another is named; of the five tasks the paper's.
 
-    In environments of others, SAC for continuous actions and PPO for others; their `options` may decide on that.
+    In environments of others, SAC for continuous actions and PPO for others; their `options` may
+    decide on that.
     """
     posed = EnvConfig(task, options=options)
     return posed.world.default_agent(posed)
@@ -169,13 +190,15 @@ def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConf
 
     Args:
         path: the file; a run folder's `config.json` will do as well.
-        trust: whether to import the module of an actuator that it names as `module:NAME`, which executes it.
-        **overriding: top-level keys to set otherwise; None leaves them, and so does the name of the agent that the file
-            has settings for.
+        trust: whether to import the module of an actuator that it names as `module:NAME`, which
+            executes it.
+        **overriding: top-level keys to set otherwise; None leaves them, and so does the name of the
+            agent that the file has settings for.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not YAML, has an unknown key, or a value out of bounds; the message has the file's name.
+        ValueError: it is not YAML, has an unknown key, or a value out of bounds; the message has
+            the file's name.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no configuration file at {path}")
@@ -187,7 +210,10 @@ def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConf
             agent = content.get("agent")
             if isinstance(agent, Mapping) and agent.get("name") == overriding.get("agent"):
                 overriding["agent"] = None
-            content = {**content, **{key: value for key, value in overriding.items() if value is not None}}
+            content = {
+                **content,
+                **{key: value for key, value in overriding.items() if value is not None},
+            }
         with trusting(trust):
             return TrainConfig.from_mapping(content)
     except (ValueError, TypeError) as error:

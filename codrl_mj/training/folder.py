@@ -73,10 +73,13 @@ def load_config(run: Path, trust: bool = False) -> TrainConfig:
         raise ValueError(f"{run / CONFIG}: not a run configuration: {error}") from None
 
 
-def admit(run: Path, config: TrainConfig, resume: bool, accept_changes: bool) -> dict[str, Any] | None:
+def admit(
+    run: Path, config: TrainConfig, resume: bool, accept_changes: bool
+) -> dict[str, Any] | None:
     """Refuse, before anything is made or compiled, a folder in which a training can neither begin nor go on.
 
-    What a new run is, to be written once it begins; None where there is one to go on with, finished or not.
+    What a new run is, to be written once it begins; None where there is one to go on with, finished
+    or not.
     """
     check_writable(run)
     if (run / LOCK).exists():
@@ -88,9 +91,15 @@ def admit(run: Path, config: TrainConfig, resume: bool, accept_changes: bool) ->
         return None
     if run.exists() and not unused(run):
         remedy = "continue it with --resume, " if exists and not finished(run) else ""
-        raise FileExistsError(f"run folder {run} exists already: {remedy}choose another --out, or delete it")
+        raise FileExistsError(
+            f"run folder {run} exists already: {remedy}choose another --out, or delete it"
+        )
     labels = [label_of(one) for one in config.actuators]
-    return {"train": config.as_mapping(), **made_with, **({"labels": labels} if any(labels) else {})}
+    return {
+        "train": config.as_mapping(),
+        **made_with,
+        **({"labels": labels} if any(labels) else {}),
+    }
 
 
 def unused(run: Path) -> bool:
@@ -118,7 +127,10 @@ def standing(run: Path) -> str:
         step = max(int(named["step"]) for named in kept.values())
         return f"Its last checkpoint is of step {step:,}: continue with {resuming(run)}"
     if (run / BEST / EVALUATION).exists():
-        return f"It has no checkpoint to continue from, only its best policy so far, in {run / BEST}: start it anew"
+        return (
+            f"It has no checkpoint to continue from, only its best policy so far, in {run / BEST}:"
+            " start it anew"
+        )
     return "It had no checkpoint yet, and nothing of it is left: start it anew"
 
 
@@ -133,33 +145,46 @@ def _sweep(run: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def check_same(run: Path, config: TrainConfig, now: Mapping[str, Any], accept_changes: bool) -> None:
+def check_same(
+    run: Path, config: TrainConfig, now: Mapping[str, Any], accept_changes: bool
+) -> None:
     """Raise unless a run folder's training can be continued to the result that it would have had uninterrupted."""
     begun = load_config(run, trust=True)  # as its caller does, who names it
     if other := differing(begun.as_mapping(), config.as_mapping()):
-        told = "; ".join(f"{name}: {there!r} and {asked!r}" for name, (there, asked) in other.items())
+        told = "; ".join(
+            f"{name}: {there!r} and {asked!r}" for name, (there, asked) in other.items()
+        )
         raise ValueError(
-            f"{run} was started with another configuration (there, and asked for): {told}. A run continues as it "
-            "began: choose another run folder for other settings"
+            f"{run} was started with another configuration (there, and asked for): {told}. A run"
+            " continues as it began: choose another run folder for other settings"
         )
     then = read_json(run / CONFIG, "run configuration")
     versions = then.get("versions")
     if not isinstance(versions, Mapping):
-        raise ValueError(f"{run / CONFIG}: not a run configuration: versions = {versions!r}: must be a mapping")
-    changed = [f"{name} was {was}, is {is_now}" for name, (was, is_now) in differing(versions, now["versions"]).items()]
+        raise ValueError(
+            f"{run / CONFIG}: not a run configuration: versions = {versions!r}: must be a mapping"
+        )
+    changed = [
+        f"{name} was {was}, is {is_now}"
+        for name, (was, is_now) in differing(versions, now["versions"]).items()
+    ]
     if then.get("code") != now["code"]:
-        changed.append(f"the code of codrl_mj was {str(then.get('code'))[:8]}, is {now['code'][:8]}")
+        changed.append(
+            f"the code of codrl_mj was {str(then.get('code'))[:8]}, is {now['code'][:8]}"
+        )
     if changed and not accept_changes:
         raise ValueError(
-            f"{run} was started with other software: {'; '.join(changed)}. Its result might differ from that of one "
-            "uninterrupted run: go back to that software, or accept it with --accept-changes"
+            f"{run} was started with other software: {'; '.join(changed)}. Its result might differ"
+            " from that of one uninterrupted run: go back to that software, or accept it with"
+            " --accept-changes"
         )
 
 
 def provenance(config: TrainConfig) -> dict[str, Any]:
     """What a run's result depends on besides its configuration: package versions, and a digest of code.
 
-    The code is ours, and the files of task, model, agent and family of actuators where these are somebody's own.
+    The code is ours, and the files of task, model, agent and family of actuators where these are
+    somebody's own.
     """
     versions = {package: importlib.metadata.version(package) for package in _PACKAGES}
     return {
@@ -179,8 +204,12 @@ def _code_digest(*others: str | Path) -> str:
         for path in sorted(root.rglob(pattern)):
             digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes() + b"\0")
     for other in others:
-        file = getattr(sys.modules[other], "__file__", None) if isinstance(other, str) else other  # a notebook has none
-        if file is not None and not any(Path(file).is_relative_to(ours) for ours in (package, asset_folder())):
+        file = (
+            getattr(sys.modules[other], "__file__", None) if isinstance(other, str) else other
+        )  # a notebook has none
+        if file is not None and not any(
+            Path(file).is_relative_to(ours) for ours in (package, asset_folder())
+        ):
             digest.update(Path(file).read_bytes())
     return digest.hexdigest()
 
@@ -191,12 +220,16 @@ def taken(run: Path, exists: bool) -> Iterator[None]:
     made = [path for path in (run, *run.parents) if not path.exists()]
     with owned(run):
         if finished(run) or not ((run / CONFIG).exists() if exists else unused(run)):
-            raise RunInUseError(f"{run}: another process trained in it in the meantime; start again")
+            raise RunInUseError(
+                f"{run}: another process trained in it in the meantime; start again"
+            )
         _sweep(run)
         try:
             yield
         except BaseException as error:
-            if exists or isinstance(error, TrainingStoppedError):  # else all of it is this training's
+            if exists or isinstance(
+                error, TrainingStoppedError
+            ):  # else all of it is this training's
                 raise
             _sweep(run)
             if not [*run.glob(f"{CHECKPOINTS}/*"), *run.glob(f"{BEST}/*")]:
@@ -217,7 +250,9 @@ def owned(run: Path) -> Iterator[None]:
     try:
         lock.acquire(blocking=False)
     except Timeout:
-        raise RunInUseError(f"{run}: another process is training in it; wait for it, or stop it") from None
+        raise RunInUseError(
+            f"{run}: another process is training in it; wait for it, or stop it"
+        ) from None
     try:
         yield
     finally:

@@ -30,8 +30,9 @@ class Progress:
     mean_length: float
     """Mean length of the same episodes [steps]."""
     torque_error: float
-    """Root mean square of desired minus delivered torque at the motor shaft [N*m] at the ends of the environment steps
-    since the last report; an evaluation's is over all integration steps."""
+    """Root mean square of desired minus delivered torque at the motor shaft [N*m] at the ends of
+    the environment steps since the last report; an evaluation's is over all integration steps.
+    """
     evaluation_return: float
     """Mean return of the evaluation that took place then (NaN where none did)."""
     steps_per_second: float
@@ -57,10 +58,13 @@ def read_episodes(path: Path) -> np.ndarray:
         raise ValueError(f"{path}: not a table of episodes: {error}") from None
 
 
-def learning_curves(episodes: np.ndarray, steps: np.ndarray, evaluations: np.ndarray) -> list[Curve]:
+def learning_curves(
+    episodes: np.ndarray, steps: np.ndarray, evaluations: np.ndarray
+) -> list[Curve]:
     """Returns over environment steps: of the training episodes, their running mean, and of the evaluations.
 
-    Episodes are rows of `EPISODE_COLUMNS`; evaluations (n,) are those at the steps (n,), NaN where there was none.
+    Episodes are rows of `EPISODE_COLUMNS`; evaluations (n,) are those at the steps (n,), NaN where
+    there was none.
     """
     curves = []
     if len(episodes):
@@ -69,15 +73,23 @@ def learning_curves(episodes: np.ndarray, steps: np.ndarray, evaluations: np.nda
         sums, last = np.cumsum(np.concatenate([[0.0], returns])), np.arange(1, len(returns) + 1)
         first = np.maximum(0, last - WINDOW)
         means = (sums[last] - sums[first]) / (last - first)
-        curves.append(Curve("training episodes", ends[::stride], returns[::stride], style="dots", colour=5))
+        curves.append(
+            Curve("training episodes", ends[::stride], returns[::stride], style="dots", colour=5)
+        )
         curves.append(Curve(f"mean of {WINDOW} episodes", ends, means, colour=0))
     known = np.isfinite(evaluations)
-    return [*curves, Curve("evaluations", steps[known], evaluations[known], colour=1)] if known.any() else curves
+    return (
+        [*curves, Curve("evaluations", steps[known], evaluations[known], colour=1)]
+        if known.any()
+        else curves
+    )
 
 
 def save_learning_curve(path: Path, title: str, episodes: np.ndarray, reports: np.ndarray) -> None:
     """Write the learning curve of a run as a PNG file, from rows of `EPISODE_COLUMNS` and of `REPORT_COLUMNS`."""
-    steps, evaluations = (reports[:, REPORT_COLUMNS.index(name)] for name in ("steps", "evaluation_return"))
+    steps, evaluations = (
+        reports[:, REPORT_COLUMNS.index(name)] for name in ("steps", "evaluation_return")
+    )
     curves = tuple(learning_curves(episodes, steps, evaluations))
     save(Plot(title, "environment steps", "return", curves), path, (6.0, 3.5))
 
@@ -87,7 +99,9 @@ class GrowingTable:
 
     def __init__(self, path: Path, columns: Sequence[str], rows: np.ndarray | None = None) -> None:
         """Write the file anew, with the rows (n, columns) that a checkpoint has."""
-        self.rows: list[tuple[float, ...]] = [] if rows is None else [tuple(row) for row in rows.tolist()]
+        self.rows: list[tuple[float, ...]] = (
+            [] if rows is None else [tuple(row) for row in rows.tolist()]
+        )
         self._path, self._columns, self._kept = path, columns, 0
         with writing(path) as temporary:
             temporary.write_text(f"{','.join(columns)}\r\n", newline="")

@@ -28,20 +28,24 @@ def train(
 ) -> Path:
     """Train an agent and leave a run folder; or continue one.
 
-    The folder grows while the agent trains: `config.json` (resolved configuration, versions, digest of the code),
-    `progress.csv` and `episodes.csv`, `checkpoints/`, `best/` (the policy of the best evaluation), TensorBoard's
-    events; at the end come `policy.safetensors` and `policy.json` (the last policy), `evaluation.json`,
-    `learning_curve.png` and, last, `result.json`, which marks the run as finished.
+    The folder grows while the agent trains: `config.json` (resolved configuration, versions, digest
+    of the code), `progress.csv` and `episodes.csv`, `checkpoints/`, `best/` (the policy of the best
+    evaluation), TensorBoard's events; at the end come `policy.safetensors` and `policy.json` (the
+    last policy), `evaluation.json`, `learning_curve.png` and, last, `result.json`, which marks the
+    run as finished.
 
-    SIGINT (Ctrl-C) and SIGTERM let the rollout end, write a checkpoint and stop; a second Ctrl-C stops at once.
+    SIGINT (Ctrl-C) and SIGTERM let the rollout end, write a checkpoint and stop; a second Ctrl-C
+    stops at once.
 
     Args:
         config: what to train.
         out: the run folder.
         on_progress: called at the ends of rollouts.
-        resume: continue the run if `out` has one, from its last checkpoint that is intact, to the very result that an
-            uninterrupted run has; start it if there is none, and return if it is finished.
-        accept_changes: continue even if code or package versions differ from those it was started with.
+        resume: continue the run if `out` has one, from its last checkpoint that is intact, to the
+            very result that an uninterrupted run has; start it if there is none, and return if it
+            is finished.
+        accept_changes: continue even if code or package versions differ from those it was started
+            with.
         tensorboard: write events for TensorBoard, if it is installed.
         wandb: name of a Weights & Biases project to report to as well.
 
@@ -51,8 +55,8 @@ def train(
     Raises:
         FileExistsError: `out` exists and `resume` is False; nothing in it was touched.
         OSError: `out` cannot be written.
-        ValueError: the configuration cannot be trained, for instance because the actuator is unstable; or the run in
-            `out` has another one, or was started with other software.
+        ValueError: the configuration cannot be trained, for instance because the actuator is
+            unstable; or the run in `out` has another one, or was started with other software.
         RunInUseError: another process trains in `out`.
         TrainingStoppedError: a signal asked to stop.
     """
@@ -78,11 +82,19 @@ def train(
             watcher = Watcher(config, out, asked, on_progress, tensorboard)
             with contextlib.closing(watcher), watcher.explaining():
                 if record is not None:
-                    write_json(out / CONFIG, sealed(record))  # before anything else is in the folder
+                    write_json(
+                        out / CONFIG, sealed(record)
+                    )  # before anything else is in the folder
                 steps = config.total_steps
                 if steps is None:  # those of the longest possible episodes where these are counted
-                    steps = (config.total_episodes or 0) * (config.env.time_limit or 0) * config.num_envs
-                model.set_logger(Logger(None, []))  # until the watcher's: the default makes a folder in the system's
+                    steps = (
+                        (config.total_episodes or 0)
+                        * (config.env.time_limit or 0)
+                        * config.num_envs
+                    )
+                model.set_logger(
+                    Logger(None, [])
+                )  # until the watcher's: the default makes a folder in the system's
                 with contextlib.suppress(LearningEnded):
                     model.learn(steps, callback=watcher, log_interval=None)
                 watcher.finish()
@@ -110,7 +122,9 @@ def stopping(*signals: int) -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def _reporting_to(wandb_project: str | None, out: Path, config: TrainConfig) -> contextlib.AbstractContextManager[Any]:
+def _reporting_to(
+    wandb_project: str | None, out: Path, config: TrainConfig
+) -> contextlib.AbstractContextManager[Any]:
     """A context in which Weights & Biases gets what goes to TensorBoard."""
     if wandb_project is None:
         return contextlib.nullcontext()
@@ -122,6 +136,8 @@ def _reporting_to(wandb_project: str | None, out: Path, config: TrainConfig) -> 
         dir=out,
         config=config.as_mapping(),
         sync_tensorboard=True,
-        id=hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:16],  # a continued run goes on there
+        id=hashlib.sha256(str(out.resolve()).encode()).hexdigest()[
+            :16
+        ],  # a continued run goes on there
         resume="allow",
     )

@@ -12,7 +12,16 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from codrl_mj.evaluation import Evaluation, evaluate
-from codrl_mj.runs import BEST, CHECKPOINTS, CURVE, EPISODES, EVALUATION, PROGRESS, RESULT, TENSORBOARD
+from codrl_mj.runs import (
+    BEST,
+    CHECKPOINTS,
+    CURVE,
+    EPISODES,
+    EVALUATION,
+    PROGRESS,
+    RESULT,
+    TENSORBOARD,
+)
 from codrl_mj.runs.files import sealed, write_json
 from codrl_mj.runs.policies import save_policy
 from codrl_mj.training import folder, history
@@ -84,32 +93,44 @@ class Watcher(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self.complete:
             raise LearningEnded
-        if self._resumed is not None:  # Stable-Baselines3 has drawn state-dependent noise since it was restored
+        if (
+            self._resumed is not None
+        ):  # Stable-Baselines3 has drawn state-dependent noise since it was restored
             restore(self.model, self.training_env, self._resumed)
             self._resumed = None
         stopping = bool(self._asked)
         self.boundary(stopping)
         if stopping:
-            told = f"stopped after {self.saved_steps:,} steps: continue with {folder.resuming(self._out)}"
+            told = (
+                f"stopped after {self.saved_steps:,} steps: continue with"
+                f" {folder.resuming(self._out)}"
+            )
             raise folder.TrainingStoppedError(told, self._asked[-1])
 
     def _on_step(self) -> bool:
         # of every step since the last call, where an agent's compiled loop takes several
         signals = self.locals.get("signals", self.training_env.signals)  # type: ignore[attr-defined]
         if signals is not None:
-            errors = np.subtract(signals["desired_force"], signals["actual_force"]).reshape(-1, len(self._arms))
+            errors = np.subtract(signals["desired_force"], signals["actual_force"]).reshape(
+                -1, len(self._arms)
+            )
             errors = (errors * self._arms).ravel()
             self._squares += float(np.dot(errors, errors))
             self._samples += errors.size
         for info in self.locals["infos"]:
             if "episode" in info:
                 episode = info["episode"]
-                self.episodes.add((len(self.episodes.rows) + 1, self.num_timesteps, episode["r"], episode["l"]))
+                self.episodes.add(
+                    (len(self.episodes.rows) + 1, self.num_timesteps, episode["r"], episode["l"])
+                )
         return not self._episodes_done
 
     @property
     def _episodes_done(self) -> bool:
-        return self._config.total_episodes is not None and len(self.episodes.rows) >= self._config.total_episodes
+        return (
+            self._config.total_episodes is not None
+            and len(self.episodes.rows) >= self._config.total_episodes
+        )
 
     @property
     def complete(self) -> bool:
@@ -123,7 +144,9 @@ class Watcher(BaseCallback):
         try:
             yield
         except OSError as error:
-            raise OSError(f"training in {self._out} was broken off: {error}. {folder.standing(self._out)}") from error
+            raise OSError(
+                f"training in {self._out} was broken off: {error}. {folder.standing(self._out)}"
+            ) from error
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"stopped at once. {folder.standing(self._out)}") from None
         except Exception:
@@ -133,13 +156,16 @@ class Watcher(BaseCallback):
     def _check_weights(self) -> None:
         """Raise if a weight is no finite number, before that is kept, with what makes it likely."""
         model = getattr(self, "model", None)  # not before learning begins
-        if model is None or all(tensor.isfinite().all() for tensor in model.policy.state_dict().values()):
+        if model is None or all(
+            tensor.isfinite().all() for tensor in model.policy.state_dict().values()
+        ):
             return
         agent = self._config.agent.as_mapping()
         rates = [f"agent.{name} = {agent[name]:g}" for name in _RATES if agent.get(name)]
         raise FloatingPointError(
-            f"the weights of {agent['name']} became no finite numbers by step {self.model.num_timesteps:,}: learning "
-            f"diverged. Lower {' or '.join(rates)}, or scale the rewards down"
+            f"the weights of {agent['name']} became no finite numbers by step"
+            f" {self.model.num_timesteps:,}: learning diverged. Lower {' or '.join(rates)}, or"
+            " scale the rewards down"
         )
 
     # -- between two rollouts -----------------------------------------------------------------------------
@@ -189,7 +215,9 @@ class Watcher(BaseCallback):
             mean_return=self.episodes.last_mean("return"),
             mean_length=self.episodes.last_mean("length"),
             torque_error=math.sqrt(self._squares / self._samples) if self._samples else math.nan,
-            evaluation_return=self.evaluation.returns.mean if self.evaluation and evaluated else math.nan,
+            evaluation_return=(
+                self.evaluation.returns.mean if self.evaluation and evaluated else math.nan
+            ),
             steps_per_second=(self.model.num_timesteps - self._steps_before) / elapsed,
             seconds=self._seconds_before + elapsed,
         )
@@ -220,7 +248,9 @@ class Watcher(BaseCallback):
         assert self.evaluation is not None  # of the last boundary
         self._keep_policy(self._out, self.evaluation)
         title = f"{self._config.agent.name.upper()} on {self._config.task}"
-        history.save_learning_curve(self._out / CURVE, title, self.episodes.array(), self.reports.array())
+        history.save_learning_curve(
+            self._out / CURVE, title, self.episodes.array(), self.reports.array()
+        )
         result = {
             "steps": self.model.num_timesteps,
             "episodes": len(self.episodes.rows),

@@ -21,7 +21,9 @@ from codrl_mj.validation.table import REPORT, Check, Skipped
 GROUPS: dict[str, str] = {
     "dynamics": "Accelerations and single steps against the installed Gymnasium",
     "trajectories": "Whole runs against the installed Gymnasium, and what chaos makes of rounding",
-    "convergence": "Ever smaller steps, ever faster loops: the order at which the solutions converge",
+    "convergence": (
+        "Ever smaller steps, ever faster loops: the order at which the solutions converge"
+    ),
     "motor": "The motor and its current loop against closed forms and other people's motors",
     "energy": "Every joule that goes in comes out",
     "execution": "Batched, copied, restored, looked at: the same bits",
@@ -33,7 +35,16 @@ WITHOUT_TASK = ("motor",)
 
 DIVERGED = "runs to its end"
 """Name of the check that fails where a simulation breaks down."""
-PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "scipy", "numba", "control", "gym-electric-motor")
+PACKAGES = (
+    "codrl-mj",
+    "mujoco",
+    "gymnasium",
+    "numpy",
+    "scipy",
+    "numba",
+    "control",
+    "gym-electric-motor",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,8 +76,16 @@ class Certificate:
         """Everything but the plots, for JSON; infinities and NaN as text."""
         checks: list[dict[str, Any]] = []
         for check in self.checks:
-            row = {one.name: getattr(check, one.name) for one in dataclasses.fields(check) if one.name != "plots"}
-            text = {name: str(one) for name, one in row.items() if isinstance(one, float) and not math.isfinite(one)}
+            row = {
+                one.name: getattr(check, one.name)
+                for one in dataclasses.fields(check)
+                if one.name != "plots"
+            }
+            text = {
+                name: str(one)
+                for name, one in row.items()
+                if isinstance(one, float) and not math.isfinite(one)
+            }
             checks.append(row | text | {"samples": int(check.samples), "passed": check.passed})
         return {
             "format": "codrl_mj certificate 1",
@@ -129,12 +148,19 @@ def _certify(
                 skips.append(dataclasses.replace(outcome, group=group, task=task))
             else:
                 made = dataclasses.replace(outcome, group=group, task=task)
-                found.append(made if made.passed else dataclasses.replace(made, fault=made.fault or _fault(made)))
+                found.append(
+                    made
+                    if made.passed
+                    else dataclasses.replace(made, fault=made.fault or _fault(made))
+                )
     on_part(len(parts), len(parts), "done")
     return Certificate(subject, tuple(found), tuple(skips), quick, time.perf_counter() - started)
 
 
-_OWN = f"an `advance` or a function of your own has to depend on its arguments alone; if it does, {REPORT}"
+_OWN = (
+    "an `advance` or a function of your own has to depend on its arguments alone; if it does,"
+    f" {REPORT}"
+)
 _RUN = f"if it passes on a gentler run in Task.trials, this one was too violent; if not, {REPORT}"
 _TWIN = "your model and your twin differ: compare masses, gravity and the integrator"
 _FAULTS = {"dynamics": _TWIN, "trajectories": _TWIN, "convergence": _RUN, "energy": _RUN}
@@ -146,7 +172,10 @@ def _fault(check: Check) -> str:
     if not check.task or (check.task in TASKS and is_ours(TASKS[check.task])):
         return REPORT
     if check.name == DIVERGED or check.name.startswith("stable: "):
-        return "your model or motor is not stable at this step: shorten it, or slow down the motor's loop"
+        return (
+            "your model or motor is not stable at this step: shorten it, or slow down the motor's"
+            " loop"
+        )
     return _FAULTS.get(check.group, _OWN)
 
 
@@ -169,8 +198,8 @@ def validate(
 ) -> Certificate:
     """Check that the port is right.
 
-    A task of one's own is put through all that applies to it: what needs a twin, or states and a run of `Task.trials`,
-    is skipped without them.
+    A task of one's own is put through all that applies to it: what needs a twin, or states and a
+    run of `Task.trials`, is skipped without them.
 
     Args:
         tasks: a task, several, or None for all that are registered.
@@ -183,13 +212,18 @@ def validate(
     """
     given = list(TASKS) if tasks is None else [tasks] if isinstance(tasks, str) else list(tasks)
     if not given or (groups is not None and not list(groups)):
-        raise ValueError(f"tasks = {tasks!r}, groups = {groups!r}: must name one at least; None stands for all of them")
+        raise ValueError(
+            f"tasks = {tasks!r}, groups = {groups!r}: must name one at least; None stands for all"
+            " of them"
+        )
     names = dict.fromkeys(find_task(name).name for name in given)
     others = [name for name in names if TASKS[name] not in OURS]
     chosen = list(GROUPS) if groups is None else list(groups)
     for group in chosen:
         if group not in GROUPS:
-            raise ValueError(f"unknown group of checks {group!r}: must be one of {', '.join(GROUPS)}")
+            raise ValueError(
+                f"unknown group of checks {group!r}: must be one of {', '.join(GROUPS)}"
+            )
 
     def of_task(group: str, task: str | None) -> Outcomes:
         module = "own_model" if group in WITHOUT_TASK and task is not None else group
@@ -227,8 +261,8 @@ def validate_model(
     """
     if not motors(model):
         raise ValueError(
-            f"the model has no motor of codrl_mj among its {model.nactuator} actuators: put some in with "
-            "codrl_mj.motorise"
+            f"the model has no motor of codrl_mj among its {model.nactuator} actuators: put some in"
+            " with codrl_mj.motorise"
         )
     subject = copy.copy(model)
     subject.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # it is left to diverge
@@ -237,5 +271,7 @@ def validate_model(
         ("motor", name, own_model.motor_checks(subject, quick)),
         ("execution", name, execution.model_checks(subject, quick, execution.FULL_STATE)),
     ]
-    unknown = [Skipped("all checks", reason, group, name) for group, reason in own_model.UNKNOWN.items()]
+    unknown = [
+        Skipped("all checks", reason, group, name) for group, reason in own_model.UNKNOWN.items()
+    ]
     return _certify(name, parts, unknown, quick, on_part)

@@ -14,7 +14,9 @@ from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, spectral_ra
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant
 from codrl_mj.tasks import Task, resolve_actuators
 
-NO_TWIN = "it rebuilds no environment of Gymnasium's: there is no second implementation of its mechanics"
+NO_TWIN = (
+    "it rebuilds no environment of Gymnasium's: there is no second implementation of its mechanics"
+)
 PHYSICS = (("MuJoCo", MujocoPhysics), ("analytic", AnalyticPhysics))
 STAND_IN = "default current loop"
 """What stands in for the paper's actuator where a task has none."""
@@ -82,7 +84,12 @@ def forces_of(task: Task, shares: np.ndarray) -> np.ndarray:
     return forces[:, 0] if len(task.motors) == 1 else forces
 
 
-BOUNDS = {"max_speed": math.inf, "_max_speed": math.inf, "min_position": -math.inf, "max_position": math.inf}
+BOUNDS = {
+    "max_speed": math.inf,
+    "_max_speed": math.inf,
+    "min_position": -math.inf,
+    "max_position": math.inf,
+}
 """Attributes of environments and their twins that bound a state, and what bounds none."""
 
 Equations = Callable[[np.ndarray, Any], np.ndarray]
@@ -92,10 +99,10 @@ Equations = Callable[[np.ndarray, Any], np.ndarray]
 def gymnasium_equations(task: Task, dt: float | None = None) -> Equations:
     """The right-hand side of the task's equations of motion, read off the environment, which nothing bounds here.
 
-    No equation is written down here. A twin may have its right-hand side as a method (Acrobot). The others take Euler
-    steps, whose new velocity is v + a*dt, linear in dt: one step of the environment gives a = (v_new - v)/dt, and the
-    derivative of a position is its velocity. dt [s] is a power of two, or None for one of at most a quarter of an
-    environment step.
+    No equation is written down here. A twin may have its right-hand side as a method (Acrobot). The
+    others take Euler steps, whose new velocity is v + a*dt, linear in dt: one step of the
+    environment gives a = (v_new - v)/dt, and the derivative of a position is its velocity. dt [s]
+    is a power of two, or None for one of at most a quarter of an environment step.
     """
     assert task.twin is not None
     driver: Any = task.twin()
@@ -110,7 +117,9 @@ def gymnasium_equations(task: Task, dt: float | None = None) -> Equations:
     def derivative(state: np.ndarray, force: float) -> np.ndarray:
         change = np.empty_like(state)
         change[qpos] = state[qvel]
-        change[qvel] = (np.asarray(driver(state, force, step, integrator))[qvel] - state[qvel]) / step
+        change[qvel] = (
+            np.asarray(driver(state, force, step, integrator))[qvel] - state[qvel]
+        ) / step
         return change
 
     return derivative

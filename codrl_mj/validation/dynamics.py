@@ -1,6 +1,7 @@
 """Accelerations and one-step maps against the installed Gymnasium: random states, dense grids, bounds, extreme forces.
 
-The oracle is an unmodified Gymnasium environment that is driven through its attributes, none of its equations copied.
+The oracle is an unmodified Gymnasium environment that is driven through its attributes, none of its
+equations copied.
 """
 
 import itertools
@@ -34,7 +35,9 @@ def _crossed(states: np.ndarray, forces: np.ndarray) -> tuple[np.ndarray, np.nda
     return np.repeat(states, len(forces), axis=0), np.tile(forces, len(states))
 
 
-def _after_one_step(physics: MujocoPhysics | AnalyticPhysics, states: np.ndarray, forces: np.ndarray) -> np.ndarray:
+def _after_one_step(
+    physics: MujocoPhysics | AnalyticPhysics, states: np.ndarray, forces: np.ndarray
+) -> np.ndarray:
     """The state one environment step after each state under each force; NaN where the simulation diverged."""
     after = np.full_like(states, np.nan)
     for row, (state, force) in enumerate(zip(states, forces.tolist(), strict=True)):
@@ -47,23 +50,34 @@ def _after_one_step(physics: MujocoPhysics | AnalyticPhysics, states: np.ndarray
     return after
 
 
-def _of_each(gaps: np.ndarray, names: Sequence[str], states: np.ndarray, forces: np.ndarray) -> Case:
+def _of_each(
+    gaps: np.ndarray, names: Sequence[str], states: np.ndarray, forces: np.ndarray
+) -> Case:
     """Gaps of shape (states, names), each said with its state and force."""
 
     def where(at: int) -> str:
         row, entry = divmod(at, len(names))
-        return f"{names[entry]} {np.array2string(states[row], precision=3)}, force {forces[row]:.3g}"
+        return (
+            f"{names[entry]} {np.array2string(states[row], precision=3)}, force {forces[row]:.3g}"
+        )
 
     return Case(gaps, where, len(states))
 
 
-def _stepped(task: Task, integrator: str, states: np.ndarray, forces: np.ndarray, limit: float) -> Case:
+def _stepped(
+    task: Task, integrator: str, states: np.ndarray, forces: np.ndarray, limit: float
+) -> Case:
     """One step from the states under the forces, which MuJoCo limits itself and Gymnasium is given limited."""
     physics, analytic = both(task, IDEAL, integrator, max_force=limit)
     ours = _after_one_step(physics, states, forces)
     oracle = _after_one_step(analytic, states, np.clip(forces, -limit, limit))
 
-    return _of_each(differences(task, ours, oracle), [f"{name} from" for name in task.state_names], states, forces)
+    return _of_each(
+        differences(task, ours, oracle),
+        [f"{name} from" for name in task.state_names],
+        states,
+        forces,
+    )
 
 
 @check(
@@ -73,11 +87,13 @@ def _stepped(task: Task, integrator: str, states: np.ndarray, forces: np.ndarray
         for where in ("", " at the bounds", " beyond the force limit")
     ),
 )
-def one_step(task: Task, trials: Trials, integrator: str, quick: bool) -> Iterator[tuple[Case, ...]]:
+def one_step(
+    task: Task, trials: Trials, integrator: str, quick: bool
+) -> Iterator[tuple[Case, ...]]:
     """One integration step with an ideal actuator: from random states under random forces.
 
-    And from the task's edges under no, full and extreme forces, which MuJoCo is allowed there; and from a grid under
-    commands up to `EXTREME` times the limit, against Gymnasium under the limit.
+    And from the task's edges under no, full and extreme forces, which MuJoCo is allowed there; and
+    from a grid under commands up to `EXTREME` times the limit, against Gymnasium under the limit.
     """
     generator, limit, flat = np.random.default_rng(0), task.max_force, len(task.state_names) == 2
     bounds, samples = np.array(trials.bounds), 200 if quick else 10_000

@@ -6,18 +6,19 @@ Three balances, each over a run with the motor in the loop, on MuJoCo and on Gym
 - mechanical: the work of the shaft = change of kinetic and potential energy (none of ours has friction), and what
   dampers and the medium take;
 - whole: integral of u*i = integral of R*i^2 + L*i^2/2 + change of kinetic and potential energy, which holds only
-  if what the back-EMF takes from the winding is what the shaft gives to the load: kE = kT, and one gear both ways. That
-  gear may be a wrong one, which is for the first two to see.
+  if what the back-EMF takes from the winding is what the shaft gives to the load: kE = kT, and one
+  gear both ways. That gear may be a wrong one, which is for the first two to see.
 
-A step of finite size balances only nearly: the residuals must vanish at the integrator's order, which is first for the
-Euler variants and for everything that the winding, which takes Euler steps, is part of. The mechanical balance under
-RK4 is of fourth order, because the work of a force held over a step is known exactly (of second where there is
-damping, which the trapezoidal rule adds up). It is checked without the motor,
-whose torques at one time depend on the step at first order, so that runs of two steps do not see the same forces.
+A step of finite size balances only nearly: the residuals must vanish at the integrator's order,
+which is first for the Euler variants and for everything that the winding, which takes Euler steps,
+is part of. The mechanical balance under RK4 is of fourth order, because the work of a force held
+over a step is known exactly (of second where there is damping, which the trapezoidal rule adds up).
+It is checked without the motor, whose torques at one time depend on the step at first order, so
+that runs of two steps do not see the same forces.
 
 One balance holds at any step: an Euler step of the winding, times the mean current, is the identity
-(u - kE*omega - R*i) (i + i') dt/2 = L (i'^2 - i^2)/2. It is checked to rounding over whole episodes of the named
-actuators, bounds, walls and saturation included.
+(u - kE*omega - R*i) (i + i') dt/2 = L (i'^2 - i^2)/2. It is checked to rounding over whole episodes
+of the named actuators, bounds, walls and saturation included.
 """
 
 import dataclasses
@@ -33,7 +34,14 @@ from codrl_mj.own_code import asset_path
 from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.physics import Plant, SimulationDivergedError, hills, trace_names
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.validation.compare import STAND_IN, actuators_named, forces_of, gymnasium_equations, is_ours, physics_of
+from codrl_mj.validation.compare import (
+    STAND_IN,
+    actuators_named,
+    forces_of,
+    gymnasium_equations,
+    is_ours,
+    physics_of,
+)
 from codrl_mj.validation.convergence import (
     analogues,
     free_run,
@@ -60,9 +68,10 @@ BALANCES = {
 class Meter:
     """Kinetic and potential energy of a task's states: MuJoCo's own, on the model file as it is shipped.
 
-    MuJoCo's `mj_energyPos` and `mj_energyVel` see gravity, springs and motion. A hill is a force of ours, which they do
-    not know: its potential is minus the integral of the force that *Gymnasium's* environment shows along it, a
-    Chebyshev interpolant of 48 samples, exact to rounding.
+    MuJoCo's `mj_energyPos` and `mj_energyVel` see gravity, springs and motion. A hill is a force of
+    ours, which they do not know: its potential is minus the integral of the force that
+    *Gymnasium's* environment shows along it, a Chebyshev interpolant of 48 samples, exact to
+    rounding.
     """
 
     def __init__(self, task: Task) -> None:
@@ -83,7 +92,9 @@ class Meter:
         model, data = self._at(state)
         mujoco.mj_energyPos(model, data)
         mujoco.mj_energyVel(model, data)
-        return float(data.energy.sum()) + (0.0 if self._hill is None else float(self._hill(state[0])))
+        return float(data.energy.sum()) + (
+            0.0 if self._hill is None else float(self._hill(state[0]))
+        )
 
     def loss(self, state: np.ndarray) -> float:
         """What dampers and the medium take in the state [W]."""
@@ -101,7 +112,11 @@ def hill_potential(task: Task, mass: float) -> Callable[[float], float]:
     """The potential energy [J] of a car of the given mass [kg] over position [m] on Gymnasium's hill."""
     equations = gymnasium_equations(task)
     force = np.polynomial.Chebyshev.interpolate(
-        lambda positions: np.array([-mass * equations(np.array([x, 0.0]), 0.0)[1] for x in positions]), 48, (-1.1, 0.5)
+        lambda positions: np.array(
+            [-mass * equations(np.array([x, 0.0]), 0.0)[1] for x in positions]
+        ),
+        48,
+        (-1.1, 0.5),
     )
     return force.integ()
 
@@ -113,8 +128,9 @@ class Ledger:
     time: np.ndarray
     """The times, ends of integration steps [s]."""
     supplied: np.ndarray
-    """Integral of u*i; the voltage is held over a step, the current is taken linear in it. Sums over
-    the motors, here and below."""
+    """Integral of u*i; the voltage is held over a step, the current is taken linear in it. Sums
+    over the motors, here and below.
+    """
     copper: np.ndarray
     """Integral of R*i^2, by the trapezoidal rule."""
     magnetic: np.ndarray
@@ -132,8 +148,14 @@ class Ledger:
 
     def residual(self, balance: str) -> np.ndarray:
         """What one of `BALANCES` leaves over [J]."""
-        given = self.shaft if balance == "mechanical" else self.supplied - self.copper - self.magnetic
-        return given - self.converted if balance == "electrical" else given - self.mechanical - self.lost
+        given = (
+            self.shaft if balance == "mechanical" else self.supplied - self.copper - self.magnetic
+        )
+        return (
+            given - self.converted
+            if balance == "electrical"
+            else given - self.mechanical - self.lost
+        )
 
 
 def keep(
@@ -148,12 +170,15 @@ def keep(
 ) -> Ledger:
     """Run and write down the energies, so many entries for each environment step, which divide its inner steps.
 
-    The task's own bounds should not be reached: what they take is no entry of the ledger. Each force is held for one
-    environment step. With ideal actuators all electrical entries are zero.
+    The task's own bounds should not be reached: what they take is no entry of the ledger. Each
+    force is held for one environment step. With ideal actuators all electrical entries are zero.
     """
     timestep = task.step_duration / inner_steps
-    # an environment step of one integration step shows each of them, and leaves the motor as it is in between
-    physics = kind(Plant(dataclasses.replace(task, step_duration=timestep), actuators, 1, integrator))
+    # an environment step of one integration step shows each of them, and leaves the motor as it is
+    # in between
+    physics = kind(
+        Plant(dataclasses.replace(task, step_duration=timestep), actuators, 1, integrator)
+    )
     physics.reset(start)
     traces, states = [], [start]
     for desired in forces.repeat(inner_steps, axis=0):
@@ -165,7 +190,9 @@ def keep(
     current, voltage, force = signals["current"], signals["voltage"], signals["actual_force"]
     current, state = np.vstack([np.zeros_like(current[:1]), current]), np.array(states)
 
-    motors = [actuator.motor if isinstance(actuator, Actuator) else Motor() for actuator in actuators]
+    motors = [
+        actuator.motor if isinstance(actuator, Actuator) else Motor() for actuator in actuators
+    ]
     resistance, inductance, constant, arm = (
         np.array([getattr(motor, name) for motor in motors])
         for name in ("resistance", "inductance", "back_emf_constant", "arm_radius")
@@ -179,7 +206,9 @@ def keep(
     winding = (voltage - back_emf[:-1] - resistance * current[:-1]) * mean * timestep
     meter, every = Meter(task), inner_steps // entries
     kept = slice(every - 1, None, every)
-    lost = np.array([[meter.loss(row)] for row in state]) if meter.lossy else np.zeros((len(state), 1))
+    lost = (
+        np.array([[meter.loss(row)] for row in state]) if meter.lossy else np.zeros((len(state), 1))
+    )
     return Ledger(
         time=timestep * np.arange(1, len(force) + 1)[kept],
         supplied=supplied[kept],
@@ -189,7 +218,9 @@ def keep(
         shaft=np.cumsum(force * np.diff(state[:, positions], axis=0), axis=0).sum(axis=1)[kept],
         mechanical=np.array([meter(row) for row in state[1:][kept]]) - meter(state[0]),
         lost=_integral(lost, timestep)[kept, 0],
-        identity=float(np.abs(winding - np.diff(magnetic, axis=0)).max() / max(np.abs(supplied).max(), 1e-300)),
+        identity=float(
+            np.abs(winding - np.diff(magnetic, axis=0)).max() / max(np.abs(supplied).max(), 1e-300)
+        ),
     )
 
 
@@ -198,7 +229,9 @@ def _integral(values: np.ndarray, timestep: float) -> np.ndarray:
     return np.cumsum(values[1:] + values[:-1], axis=0) * (timestep / 2)
 
 
-@check("energy", Check("winding, step by step", "identity of one Euler step of the RL circuit", 1e-13))
+@check(
+    "energy", Check("winding, step by step", "identity of one Euler step of the RL circuit", 1e-13)
+)
 def step_by_step(task: Task, quick: bool) -> Iterator[Case]:
     """Tolerance 1e-13 of the energy supplied: the rounding of some ten operations a step."""
     steps = 20 if quick else 100
@@ -211,7 +244,16 @@ def step_by_step(task: Task, quick: bool) -> Iterator[Case]:
         for label, kind in physics_of(task):
             where = f"{name} actuator, {label}"
             try:
-                ledger = keep(kind, task, actuators, start, forces, task.motor_inner_steps, task.integrators[0], 1)
+                ledger = keep(
+                    kind,
+                    task,
+                    actuators,
+                    start,
+                    forces,
+                    task.motor_inner_steps,
+                    task.integrators[0],
+                    1,
+                )
             except SimulationDivergedError as error:
                 yield Case(math.inf, f"{where}: {error}", samples)
             else:
@@ -224,7 +266,10 @@ def _kept(
     """Ledgers of the task's free run at every number of inner steps, all at the times of the coarsest."""
     start, _, forces = free_run(task)
     return {
-        label: [keep(kind, task, actuators, start, forces, int(count), integrator, int(counts[0])) for count in counts]
+        label: [
+            keep(kind, task, actuators, start, forces, int(count), integrator, int(counts[0]))
+            for count in counts
+        ]
         for label, kind in physics_of(task)
     }
 
@@ -233,17 +278,23 @@ def _kept(
     "energy",
     *(order(f"order, {name} balance, {{integrator}}", oracle) for name, oracle in BALANCES.items()),
 )
-def balances(task: Task, integrator: str, quick: bool, unknown: str = "") -> Iterator[tuple[Case, ...]]:
+def balances(
+    task: Task, integrator: str, quick: bool, unknown: str = ""
+) -> Iterator[tuple[Case, ...]]:
     """The residuals vanish at the integrator's order."""
     actuators, meter = analogues(task), Meter(task)
-    resolved = task.step_duration / (min(one.motor.electrical_time_constant for one in actuators) / 25)
+    resolved = task.step_duration / (
+        min(one.motor.electrical_time_constant for one in actuators) / 25
+    )
 
     @functools.cache
     def ledgers(exact: bool, finer: int) -> tuple[np.ndarray, dict[str, list[Ledger]]]:
         if exact:
             steps = 2 ** (np.arange(3, 7) + finer)  # finer ones reach rounding
             return steps, _kept(task, integrator, actuators_named("ideal", task), steps)
-        steps = 2 ** (math.ceil(math.log2(max(resolved, 64))) + np.arange(4 if quick else 5) + finer)
+        steps = 2 ** (
+            math.ceil(math.log2(max(resolved, 64))) + np.arange(4 if quick else 5) + finer
+        )
         return steps, _kept(task, integrator, actuators, steps)
 
     def judged(balance: str, finer: int) -> Case:
@@ -256,14 +307,26 @@ def balances(task: Task, integrator: str, quick: bool, unknown: str = "") -> Ite
             if exact:
                 sizes = [np.abs(one).max() for one in (of_steps[-1].shaft, of_steps[-1].mechanical)]
                 rounding = _ROUNDING * float(max(abs(meter(free_run(task)[0])), *sizes))
-            families.append(Family(label, task.step_duration / steps, np.array(residuals), rounding))
+            families.append(
+                Family(label, task.step_duration / steps, np.array(residuals), rounding)
+            )
         title = f"{task.name}, {integrator}: {balance} balance"
-        case = of_order(promised, families, title, "integration step [s]", "largest residual of the run [J]")
-        return case._replace(plots=(*case.plots, _flows(task, integrator, kept))) if balance == "whole" else case
+        case = of_order(
+            promised, families, title, "integration step [s]", "largest residual of the run [J]"
+        )
+        return (
+            case._replace(plots=(*case.plots, _flows(task, integrator, kept)))
+            if balance == "whole"
+            else case
+        )
 
     of_each = {balance: functools.partial(judged, balance) for balance in BALANCES}
-    # Small damping, whose integral is of second order, shows only where the fourth order's errors are far below it.
-    yield tuple(refined(task, one, 0 if unknown and name != "electrical" else 6) for name, one in of_each.items())
+    # Small damping, whose integral is of second order, shows only where the fourth order's errors
+    # are far below it.
+    yield tuple(
+        refined(task, one, 0 if unknown and name != "electrical" else 6)
+        for name, one in of_each.items()
+    )
 
 
 def _flows(task: Task, integrator: str, kept: dict[str, list[Ledger]]) -> Plot:
@@ -292,7 +355,11 @@ def unnamed(task: Task) -> str:
         "plugins": model.nplugin,
     }
     found = " and ".join(name for name, there in sources.items() if there)
-    return f"the model has {found}, whose energy no balance knows: leave that out to have it checked" if found else ""
+    return (
+        f"the model has {found}, whose energy no balance knows: leave that out to have it checked"
+        if found
+        else ""
+    )
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
@@ -311,4 +378,8 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     unknown = "" if is_ours(task) else unnamed(task)
     for integrator in task.integrators:
         for outcome in balances(task, integrator, quick, unknown):
-            yield Skipped(outcome.name, unknown) if unknown and "electrical" not in outcome.name else outcome
+            yield (
+                Skipped(outcome.name, unknown)
+                if unknown and "electrical" not in outcome.name
+                else outcome
+            )

@@ -1,7 +1,7 @@
 """However it is executed, a simulation is the same, bit for bit: batched, copied, restored, pickled, reset, looked at.
 
-The oracle is a plain loop over `mj_step`. A tolerance would hide a leak between simulations, so there is none: what is
-counted is the number of 64-bit floats that differ.
+The oracle is a plain loop over `mj_step`. A tolerance would hide a leak between simulations, so
+there is none: what is counted is the number of 64-bit floats that differ.
 """
 
 import copy
@@ -51,7 +51,9 @@ def _advance(model: mujoco.MjModel, data: mujoco.MjData, controls: np.ndarray) -
 
 def differing(ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
     """Where two float64 arrays are not the same bits."""
-    ours, oracle = (np.ascontiguousarray(array, dtype=np.float64).view(np.uint64) for array in (ours, oracle))
+    ours, oracle = (
+        np.ascontiguousarray(array, dtype=np.float64).view(np.uint64) for array in (ours, oracle)
+    )
     return ours != oracle
 
 
@@ -60,7 +62,9 @@ def bits(ours: np.ndarray, oracle: np.ndarray) -> Case:
     unequal = differing(ours, oracle)
     first = int(np.argmax(unequal.reshape(len(unequal), -1).any(axis=1)))
     return Case(
-        float(unequal.sum()), lambda _: f"the first of them at step {first + 1} of {len(unequal)}", unequal.size
+        float(unequal.sum()),
+        lambda _: f"the first of them at step {first + 1} of {len(unequal)}",
+        unequal.size,
     )
 
 
@@ -70,7 +74,10 @@ def batched(model: mujoco.MjModel, threads: str, simulations: int, steps: int) -
     inputs = np.stack([commands(model, steps, seed) for seed in range(simulations)], axis=1)
     batch = Batch(model, nsim=simulations, nthread=THREADS[threads])
     bound = batch.bind("ctrl").reshape(simulations, -1)
-    fields = [batch.bind(name).reshape(simulations, -1) for name in ("time", "qpos", "qvel", "act", "plugin_state")]
+    fields = [
+        batch.bind(name).reshape(simulations, -1)
+        for name in ("time", "qpos", "qvel", "act", "plugin_state")
+    ]
     ours = []
     for control in inputs:
         bound[:] = control
@@ -85,7 +92,9 @@ def batched(model: mujoco.MjModel, threads: str, simulations: int, steps: int) -
     Check("copied", "the original", 0.0, UNIT),
     Check("restored", "the run it was taken from", 0.0, UNIT),
 )
-def half_way(model: mujoco.MjModel, steps: int, state: mujoco.mjtState = STATE) -> Iterator[tuple[Case, ...]]:
+def half_way(
+    model: mujoco.MjModel, steps: int, state: mujoco.mjtState = STATE
+) -> Iterator[tuple[Case, ...]]:
     """Half-way a copy of `MjData`, and a new one that a state vector is put into, against what they were made of."""
 
     def restored(original: mujoco.MjData) -> mujoco.MjData:
@@ -121,7 +130,9 @@ def forward_passes(model: mujoco.MjModel, steps: int) -> Iterator[Case]:
     yield bits(np.array(often), np.array(once))
 
 
-def model_checks(model: mujoco.MjModel, quick: bool = False, state: mujoco.mjtState = STATE) -> Iterator[Check]:
+def model_checks(
+    model: mujoco.MjModel, quick: bool = False, state: mujoco.mjtState = STATE
+) -> Iterator[Check]:
     """The checks of any model whose callbacks are installed; a state vector holds `state`."""
     simulations, steps = (6, 40) if quick else (32, 200)
     for threads in THREADS:
@@ -144,7 +155,9 @@ def _episode(physics: MujocoPhysics, forces: np.ndarray, look: bool = False) -> 
     return np.array(states)
 
 
-def _simulation(task: Task, integrator: str, seed: int, steps: int) -> tuple[MujocoPhysics, np.ndarray, np.ndarray]:
+def _simulation(
+    task: Task, integrator: str, seed: int, steps: int
+) -> tuple[MujocoPhysics, np.ndarray, np.ndarray]:
     generator = np.random.default_rng(seed)
     physics = MujocoPhysics(Plant(task, actuators_of(task), task.motor_inner_steps, integrator))
     initial = task.initial(generator, None)

@@ -1,7 +1,7 @@
 """The current loop inside MuJoCo against linear systems theory: closed form, scipy and python-control.
 
-Each oracle is built from the loop's equations (the paper, Algorithm 1 and appendix) by another library and in another
-form; nothing of `codrl_mj.actuators.current_loop` is in them.
+Each oracle is built from the loop's equations (the paper, Algorithm 1 and appendix) by another
+library and in another form; nothing of `codrl_mj.actuators.current_loop` is in them.
 """
 
 import math
@@ -20,13 +20,15 @@ from codrl_mj.validation.table import Case, Check, Family, check, of_order, orde
 # -- The analogue loop that it samples ------------------------------------------------------------------------
 
 
-def closed_form(actuator: Actuator, timestep: float, torques: np.ndarray, speed: float) -> np.ndarray:
+def closed_form(
+    actuator: Actuator, timestep: float, torques: np.ndarray, speed: float
+) -> np.ndarray:
     """Joint torque [N*m] of the analogue loop after each step [s], from rest: the matrix exponential.
 
-    L di/dt = u - kE*omega - R*i,  u = kP*e + kI*I + kD*D + kFF*i_ref (+ kE*omega),  dI/dt = e - leak*I;
-    with a filter D = (e - y)/Td and dy/dt = D; without one D = de/dt, which adds kD to L, and a step of i_ref makes the
-    current jump by kD/(L + kD) of it. The voltage has no limit; desired torques [N*m] are held over each step, and the
-    joint keeps its speed [rad/s].
+    L di/dt = u - kE*omega - R*i,  u = kP*e + kI*I + kD*D + kFF*i_ref (+ kE*omega),  dI/dt = e -
+    leak*I; with a filter D = (e - y)/Td and dy/dt = D; without one D = de/dt, which adds kD to L,
+    and a step of i_ref makes the current jump by kD/(L + kD) of it. The voltage has no limit;
+    desired torques [N*m] are held over each step, and the joint keeps its speed [rad/s].
     """
     motor, loop = actuator.motor, actuator.controller
     filtered = loop.derivative_time_constant > 0
@@ -63,8 +65,9 @@ _ORACLE = "matrix exponential of the RL circuit under the analogue PID (scipy.li
 def analogue(loops: Mapping[str, Loop], quick: bool) -> Iterator[tuple[Case, ...]]:
     """Convergence to the closed form at first order in the substeps, and the limit itself.
 
-    The limit is Richardson's 2 x(2N) - x(N), whose error is of second order: below 1e-5 of the desired 1 N m at the
-    finest substep, 1/100 or less of every time constant here. A parameter off by 0.1 % moves it by more.
+    The limit is Richardson's 2 x(2N) - x(N), whose error is of second order: below 1e-5 of the
+    desired 1 N m at the finest substep, 1/100 or less of every time constant here. A parameter off
+    by 0.1 % moves it by more.
     """
     families, limits, where = [], [], []
     for name, loop in loops.items():
@@ -72,7 +75,10 @@ def analogue(loops: Mapping[str, Loop], quick: bool) -> Iterator[tuple[Case, ...
         steps = max(20, round(1.0 / loop.timestep))
         torques, speed = np.where(np.arange(steps) < steps // 2, 1.0, -0.5), 0.4
         exact = closed_form(loop.actuator, loop.timestep, torques, speed)
-        runs = [run(unlimited(loop, int(count)), loop.timestep, torques, np.full(steps, speed)) for count in counts]
+        runs = [
+            run(unlimited(loop, int(count)), loop.timestep, torques, np.full(steps, speed))
+            for count in counts
+        ]
         errors = np.array([np.abs(run.torque[:, 0] - exact).max() for run in runs])
         families.append(Family(name, loop.timestep / counts, errors))
         limit = 2 * runs[-1].torque[:, 0] - runs[-2].torque[:, 0]
@@ -90,7 +96,9 @@ def sampled_system(actuator: Actuator, timestep: float) -> Any:
     """The loop sampled at its electrical step: inputs (i_ref, shaft speed), output the next current; a `dlti`."""
     motor, loop = actuator.motor, actuator.controller
     dt = timestep / loop.substeps
-    current, integral, past, reference, speed = np.eye(5)  # each signal as a row over (i, I, e_past, i_ref, omega)
+    current, integral, past, reference, speed = np.eye(
+        5
+    )  # each signal as a row over (i, I, e_past, i_ref, omega)
     error = reference - current
     integral = (integral + dt * error) / (1 + loop.integral_leak * dt)
     derivative = (error - past) / (dt + loop.derivative_time_constant)
@@ -127,9 +135,15 @@ def random_torques(loops: Mapping[str, Loop], steps: int) -> Iterator[Case]:
         oracle = currents[substeps - 1 :: substeps, 0] * motor.torque_constant / motor.arm_radius
         errors = np.abs(measured - oracle)
         time = np.arange(1, 61) * loop.timestep
-        lines = (("desired", torques, False), ("MuJoCo", measured, False), ("scipy.signal.dlsim", oracle, True))
+        lines = (
+            ("desired", torques, False),
+            ("MuJoCo", measured, False),
+            ("scipy.signal.dlsim", oracle, True),
+        )
         curves = tuple(Curve(label, time, line[:60], reference) for label, line, reference in lines)
-        plot = Plot(f"Torque under random commands and speeds, {name}", "time [s]", "torque [N m]", curves)
+        plot = Plot(
+            f"Torque under random commands and speeds, {name}", "time [s]", "torque [N m]", curves
+        )
         where = f"{name}, step {int(errors.argmax()) + 1} of {len(torques)}"
         yield Case(errors, where, steps, (plot,) if name == list(loops)[-1] else ())
 
@@ -140,9 +154,10 @@ def random_torques(loops: Mapping[str, Loop], steps: int) -> Iterator[Case]:
 def closed_loop(actuator: Actuator, timestep: float) -> Any:
     """python-control's system from desired torque to kT times the current at the step's start, sampled at `timestep`.
 
-    The winding is python-control's forward-Euler sampling of 1/(L s + R), the integral its backward-difference
-    sampling of 1/(s + leak), both as Algorithm 1 has them. The blocks are joined as state-space systems: transfer
-    functions of poles close to 1 lose digits when their polynomials are multiplied.
+    The winding is python-control's forward-Euler sampling of 1/(L s + R), the integral its
+    backward-difference sampling of 1/(s + leak), both as Algorithm 1 has them. The blocks are
+    joined as state-space systems: transfer functions of poles close to 1 lose digits when their
+    polynomials are multiplied.
     """
     motor, loop = actuator.motor, actuator.controller
     dt, filtering = timestep, loop.derivative_time_constant  # one electrical step
@@ -157,7 +172,10 @@ def closed_loop(actuator: Actuator, timestep: float) -> Any:
     return control.feedback(pid * winding, 1) + loop.kff * control.feedback(winding, pid)
 
 
-@check("motor", Check("step response", "python-control, step_response of the discrete loop", 1e-10, "N m"))
+@check(
+    "motor",
+    Check("step response", "python-control, step_response of the discrete loop", 1e-10, "N m"),
+)
 def step_response(loops: Mapping[str, Loop]) -> Iterator[Case]:
     """Equal to rounding; tolerance 1e-10 of the 1 N m desired."""
     for name, loop in loops.items():
@@ -166,9 +184,14 @@ def step_response(loops: Mapping[str, Loop]) -> Iterator[Case]:
         time = np.arange(1, steps + 1) * step
         measured = run(actuator, step, np.ones(steps), np.zeros(steps)).torque[:, 0]
         response = control.step_response(closed_loop(actuator, step), np.arange(steps + 1) * step)
-        oracle = np.ravel(response.outputs)[1:]  # the torque of a step is that of the current at its end
+        oracle = np.ravel(response.outputs)[
+            1:
+        ]  # the torque of a step is that of the current at its end
         errors = np.abs(measured - oracle)
-        curves = (Curve("MuJoCo", time, measured), Curve("python-control", time, oracle, reference=True))
+        curves = (
+            Curve("MuJoCo", time, measured),
+            Curve("python-control", time, oracle, reference=True),
+        )
         plot = Plot(f"Step response, {name}", "time [s]", "torque for 1 N m desired [N m]", curves)
         yield Case(errors, f"{name}, at t = {time[errors.argmax()]:.3g} s", plots=(plot,))
 
@@ -184,10 +207,10 @@ _FREQUENCY = "python-control, the discrete loop's frequency response"
 def frequency_response(loops: Mapping[str, Loop], frequencies: int) -> Iterator[tuple[Case, ...]]:
     """Magnitude and phase of desired -> actual torque, from sines driven through MuJoCo, one motor a frequency.
 
-    A sampled loop has an exact frequency response, so what is left is the transient, waited out until it is 1e-10 of
-    the amplitude, and the least-squares fit's rounding: 1e-6 dB and 1e-5 degrees, far within the 0.1 dB and 0.5 degrees
-    at which an engineer would call two Bode plots equal. A gain off by 0.1 % shows some 1e-3 dB; a step of delay shows
-    up to 180 degrees.
+    A sampled loop has an exact frequency response, so what is left is the transient, waited out
+    until it is 1e-10 of the amplitude, and the least-squares fit's rounding: 1e-6 dB and 1e-5
+    degrees, far within the 0.1 dB and 0.5 degrees at which an engineer would call two Bode plots
+    equal. A gain off by 0.1 % shows some 1e-3 dB; a step of delay shows up to 180 degrees.
     """
     quantities: tuple[tuple[str, str, Callable[[np.ndarray], np.ndarray]], ...] = (
         ("magnitude", "dB", lambda response: 20 * np.log10(np.abs(response))),
@@ -200,8 +223,12 @@ def frequency_response(loops: Mapping[str, Loop], frequencies: int) -> Iterator[
         tested = np.geomspace(0.005 * nyquist, 0.97 * nyquist, frequencies)
         system = closed_loop(actuator, step)
         rotation = np.exp(2j * np.pi * tested * step)
-        oracle = system(rotation) * rotation  # the torque of a step is that of the current at its end
-        ratio = _measured_response(actuator, step, tested, np.abs(control.poles(system)).max()) / oracle
+        oracle = (
+            system(rotation) * rotation
+        )  # the torque of a step is that of the current at its end
+        ratio = (
+            _measured_response(actuator, step, tested, np.abs(control.poles(system)).max()) / oracle
+        )
         cases = []
         for (quantity, unit, of), lines in zip(quantities, curves, strict=True):
             error = np.abs(of(ratio))
@@ -209,7 +236,9 @@ def frequency_response(loops: Mapping[str, Loop], frequencies: int) -> Iterator[
             lines.append(Curve(f"{name}, MuJoCo", tested, of(ratio * oracle)))
             lines.append(Curve(f"{name}, python-control", tested, of(oracle), reference=True))
             title = f"Frequency response, desired to actual torque: {quantity}"
-            plot = Plot(title, "frequency [Hz]", f"{quantity} [{unit}]", tuple(lines), x_log=True)  # of all loops
+            plot = Plot(
+                title, "frequency [Hz]", f"{quantity} [{unit}]", tuple(lines), x_log=True
+            )  # of all loops
             where = f"{name}, {at:.3g} Hz ({at / nyquist:.3g} of Nyquist)"
             cases.append(Case(error, where, plots=(plot,) if name == list(loops)[-1] else ()))
         yield tuple(cases)
@@ -220,7 +249,9 @@ def _electrical(loop: Loop) -> tuple[float, Actuator]:
     return loop.timestep / loop.actuator.controller.substeps, unlimited(loop, 1)
 
 
-def _measured_response(actuator: Actuator, step: float, frequencies: np.ndarray, slowest: float) -> np.ndarray:
+def _measured_response(
+    actuator: Actuator, step: float, frequencies: np.ndarray, slowest: float
+) -> np.ndarray:
     """Complex amplitudes of the torques in MuJoCo under cosines of 1 N m; the slowest pole says how long to wait."""
     settle = math.ceil(math.log(1e-10) / math.log(min(max(slowest, 0.5), 0.9999)))
     phases = 2 * np.pi * frequencies * step * np.arange(settle + 1200)[:, np.newaxis]
@@ -228,7 +259,9 @@ def _measured_response(actuator: Actuator, step: float, frequencies: np.ndarray,
     torque = drive(model, np.cos(phases) * actuator.motor.arm_radius, np.zeros(len(phases))).torque
     amplitudes = []
     for phase, values in zip(phases[settle:].T, torque[settle:].T, strict=True):
-        (cosine, sine), *_ = np.linalg.lstsq(np.column_stack([np.cos(phase), np.sin(phase)]), values, rcond=None)
+        (cosine, sine), *_ = np.linalg.lstsq(
+            np.column_stack([np.cos(phase), np.sin(phase)]), values, rcond=None
+        )
         amplitudes.append(cosine - 1j * sine)
     return np.array(amplitudes)
 

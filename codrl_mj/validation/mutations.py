@@ -1,7 +1,7 @@
 """The certificate put to the test: faults that somebody could have made, each of which must fail a named check.
 
-A fault is made in a model, in the package's own source text (an edit, compiled anew), or in how a simulation is driven,
-and is undone when the `with` block ends.
+A fault is made in a model, in the package's own source text (an edit, compiled anew), or in how a
+simulation is driven, and is undone when the `with` block ends.
 """
 
 import contextlib
@@ -88,7 +88,9 @@ def edited(module: types.ModuleType, edits: Sequence[Edit]) -> types.ModuleType:
     source = inspect.getsource(module)
     for old, new in edits:
         if source.count(old) != 1:
-            raise ValueError(f"{module.__name__}: {old!r} occurs {source.count(old)} times, must occur once")
+            raise ValueError(
+                f"{module.__name__}: {old!r} occurs {source.count(old)} times, must occur once"
+            )
         source = source.replace(old, new)
     wrong = types.ModuleType(module.__name__)
     exec(compile(source, f"<mutation of {module.__name__}>", "exec"), vars(wrong))
@@ -119,18 +121,24 @@ def wrong_callback(*edits: Edit) -> Iterator[None]:
 
 
 @cache
-def _wrong_families(module: types.ModuleType, edits: tuple[Edit, ...]) -> tuple[type[ActuatorModel], ...]:
+def _wrong_families(
+    module: types.ModuleType, edits: tuple[Edit, ...]
+) -> tuple[type[ActuatorModel], ...]:
     """The families of a module, made from its edited source."""
     wrong = vars(edited(module, edits)).values()
     return tuple(
         kind
         for kind in wrong
-        if isinstance(kind, type) and kind.__module__ == module.__name__ and issubclass(kind, ActuatorModel)
+        if isinstance(kind, type)
+        and kind.__module__ == module.__name__
+        and issubclass(kind, ActuatorModel)
     )
 
 
 @contextlib.contextmanager
-def wrong_loop(*edits: Edit, module: types.ModuleType = current_loop, everywhere: bool = False) -> Iterator[None]:
+def wrong_loop(
+    *edits: Edit, module: types.ModuleType = current_loop, everywhere: bool = False
+) -> Iterator[None]:
     """The callback runs a loop that was compiled from edited source; in Python it stays what it is.
 
     With `everywhere` the plain-Python loop shares the fault: comparing the two cannot show it.
@@ -145,9 +153,18 @@ def wrong_loop(*edits: Edit, module: types.ModuleType = current_loop, everywhere
 
 
 _BACK_EMF: Edit = ("voltage - back_emf -", "voltage + back_emf -")
-_GAINS: Edit = ("parameters.kp * error + parameters.ki * integral", "parameters.ki * error + parameters.kp * integral")
-_RESISTANCE: Edit = ("- parameters.resistance * current", "- 1.01 * parameters.resistance * current")
-_VOLTAGE_LIMIT: Edit = ("voltage = min(max(voltage, -", "voltage = 0.99 * min(max(voltage / 0.99, -")
+_GAINS: Edit = (
+    "parameters.kp * error + parameters.ki * integral",
+    "parameters.ki * error + parameters.kp * integral",
+)
+_RESISTANCE: Edit = (
+    "- parameters.resistance * current",
+    "- 1.01 * parameters.resistance * current",
+)
+_VOLTAGE_LIMIT: Edit = (
+    "voltage = min(max(voltage, -",
+    "voltage = 0.99 * min(max(voltage / 0.99, -",
+)
 _WARM_WINDING: Edit = (
     "shaft.turn(parameters, resistance, timestep",
     "shaft.turn(parameters, 1.01 * resistance, timestep",
@@ -156,8 +173,10 @@ _COMMIT = "                commit_slot(number, slot, time)\n"
 _LATE_FORCE: tuple[Edit, ...] = (
     (
         _COMMIT,
-        f"                f64(HIDDEN)[actuator] = f64(slot)[2]\n{_COMMIT}"
-        "            if time == 0.0:\n                f64(HIDDEN)[actuator] = 0.0\n",
+        (
+            f"                f64(HIDDEN)[actuator] = f64(slot)[2]\n{_COMMIT}"
+            "            if time == 0.0:\n                f64(HIDDEN)[actuator] = 0.0\n"
+        ),
     ),
     ("return f64(_slot_of(model, data, actuator))[2]", "return f64(HIDDEN)[actuator]"),
 )
@@ -213,12 +232,15 @@ class Mutation:
 _PHYSICS = ("dynamics", "trajectories")
 _MECHANICS = (*_PHYSICS, "convergence", "energy")
 _LOOP = ("trajectories", "motor")
-_UNEQUAL_GAINS = tuple(task.name for task in OURS if task.paper[0].controller.kp != task.paper[0].controller.ki)
+_UNEQUAL_GAINS = tuple(
+    task.name for task in OURS if task.paper[0].controller.kp != task.paper[0].controller.ki
+)
 _BOUNDED = tuple(task.name for task in OURS if task.constrain is not None)
 _RUNGE_KUTTA = tuple(task.name for task in OURS if "rk4" in task.integrators)
 _TURNING = ("pendulum", "cartpole", "acrobot")
-"""Where back-EMF counts: gains that follow the winding hide it from anything else, and the cars' motors hardly turn (a
-difference of 3e-10, where 1e-9 is allowed)."""
+"""Where back-EMF counts: gains that follow the winding hide it from anything else, and the cars'
+motors hardly turn (a difference of 3e-10, where 1e-9 is allowed).
+"""
 
 
 MUTATIONS: tuple[Mutation, ...] = (
@@ -228,42 +250,90 @@ MUTATIONS: tuple[Mutation, ...] = (
         partial(wrong_model, ("gravity", 2, 1.001), ("jnt_user", (0, GRAVITY), 1.001)),
         _PHYSICS,
     ),
-    Mutation("a gear off by 1 %", partial(wrong_model, ("actuator_gear", (0, 0), 1.01)), _MECHANICS),
-    Mutation("a time step off by 0.1 %", partial(wrong_model, ("timestep", None, 1.001)), _MECHANICS),
-    Mutation("a wrong clip: the force limit 1 % low", partial(wrong_model, ("actuator_ctrlrange", 0, 0.99)), _PHYSICS),
-    Mutation("a wrong clip: the voltage limit 1 % low, in the callback", partial(wrong_loop, _VOLTAGE_LIMIT), _LOOP),
-    Mutation("a winding resistance off by 1 %, in the callback", partial(wrong_loop, _RESISTANCE), (*_LOOP, "energy")),
-    Mutation("the sign of the back-EMF, in the callback", partial(wrong_loop, _BACK_EMF), (*_LOOP, "energy")),
+    Mutation(
+        "a gear off by 1 %", partial(wrong_model, ("actuator_gear", (0, 0), 1.01)), _MECHANICS
+    ),
+    Mutation(
+        "a time step off by 0.1 %", partial(wrong_model, ("timestep", None, 1.001)), _MECHANICS
+    ),
+    Mutation(
+        "a wrong clip: the force limit 1 % low",
+        partial(wrong_model, ("actuator_ctrlrange", 0, 0.99)),
+        _PHYSICS,
+    ),
+    Mutation(
+        "a wrong clip: the voltage limit 1 % low, in the callback",
+        partial(wrong_loop, _VOLTAGE_LIMIT),
+        _LOOP,
+    ),
+    Mutation(
+        "a winding resistance off by 1 %, in the callback",
+        partial(wrong_loop, _RESISTANCE),
+        (*_LOOP, "energy"),
+    ),
+    Mutation(
+        "the sign of the back-EMF, in the callback",
+        partial(wrong_loop, _BACK_EMF),
+        (*_LOOP, "energy"),
+    ),
     Mutation(
         "the sign of the back-EMF, everywhere",
         partial(wrong_loop, _BACK_EMF, everywhere=True),
         ("motor", "energy"),
     ),
-    Mutation("kp and ki swapped, in the callback", partial(wrong_loop, _GAINS), _LOOP, _UNEQUAL_GAINS),
-    Mutation("kp and ki swapped, everywhere", partial(wrong_loop, _GAINS, everywhere=True), ("motor", "convergence")),
+    Mutation(
+        "kp and ki swapped, in the callback", partial(wrong_loop, _GAINS), _LOOP, _UNEQUAL_GAINS
+    ),
+    Mutation(
+        "kp and ki swapped, everywhere",
+        partial(wrong_loop, _GAINS, everywhere=True),
+        ("motor", "convergence"),
+    ),
     Mutation(
         "a drive's winding off by 1 %, its gains with it",
         partial(wrong_loop, _WARM_WINDING, module=drive),
         _LOOP,
         _TURNING,
     ),
-    Mutation("a force one step late", partial(wrong_callback, *_LATE_FORCE), (*_LOOP, "convergence", "energy")),
-    Mutation("a stale command", partial(mock.patch.object, MujocoPhysics, "step", _late), (*_PHYSICS, "convergence")),
+    Mutation(
+        "a force one step late",
+        partial(wrong_callback, *_LATE_FORCE),
+        (*_LOOP, "convergence", "energy"),
+    ),
+    Mutation(
+        "a stale command",
+        partial(mock.patch.object, MujocoPhysics, "step", _late),
+        (*_PHYSICS, "convergence"),
+    ),
     Mutation(
         "bounds that are not kept",
-        lambda: _everywhere("compiled_constrain", compiled_task.compiled_constrain, lambda *_, **__: None),
+        lambda: _everywhere(
+            "compiled_constrain", compiled_task.compiled_constrain, lambda *_, **__: None
+        ),
         _PHYSICS,
         _BOUNDED,
     ),
-    Mutation("the other Euler integrator", partial(mock.patch.object, MujocoPhysics, "__init__", _explicit), _PHYSICS),
+    Mutation(
+        "the other Euler integrator",
+        partial(mock.patch.object, MujocoPhysics, "__init__", _explicit),
+        _PHYSICS,
+    ),
     Mutation(
         "a motor that runs in every Runge-Kutta stage",
         partial(wrong_callback, _EVERY_STAGE),
         ("trajectories",),
         _RUNGE_KUTTA,
     ),
-    Mutation("a motor that runs in every forward pass", partial(wrong_callback, _EVERY_PASS), ("execution",)),
-    Mutation("a current that simulations share", partial(wrong_callback, *_SHARED_CURRENT), ("execution",)),
+    Mutation(
+        "a motor that runs in every forward pass",
+        partial(wrong_callback, _EVERY_PASS),
+        ("execution",),
+    ),
+    Mutation(
+        "a current that simulations share",
+        partial(wrong_callback, *_SHARED_CURRENT),
+        ("execution",),
+    ),
     Mutation(
         "a reset that leaves the motor running",
         partial(mock.patch.object, MujocoPhysics, "reset", _warm),
@@ -310,7 +380,9 @@ def faulty(tasks: str | Sequence[str] | None = None) -> list[str]:
     names = [tasks] if isinstance(tasks, str) else list(tasks or Mutation.tasks)
     for name in names:
         if find_task(name) not in OURS:
-            raise ValueError(f"task {name!r}: faults are made in these alone: {', '.join(Mutation.tasks)}")
+            raise ValueError(
+                f"task {name!r}: faults are made in these alone: {', '.join(Mutation.tasks)}"
+            )
     return names
 
 
@@ -354,9 +426,16 @@ def as_mapping(certificate: Certificate, caught: Sequence[Caught]) -> dict[str, 
         row["failed"] = [f"{check.group}: {check.name}" for check in one.failed]
         if (clearest := one.clearest) is not None:
             worst = clearest.worst if math.isfinite(clearest.worst) else str(clearest.worst)
-            row |= {"clearest": f"{clearest.group}: {clearest.name}", "worst": worst, "allowed": clearest.tolerance}
+            row |= {
+                "clearest": f"{clearest.group}: {clearest.name}",
+                "worst": worst,
+                "allowed": clearest.tolerance,
+            }
         rows.append(row)
-    blind = [f"{check.group}: {check.task}: {check.name}" for check in unfailed(certificate.checks, caught)]
+    blind = [
+        f"{check.group}: {check.task}: {check.name}"
+        for check in unfailed(certificate.checks, caught)
+    ]
     return {"mutations": rows, "failed by no mutation": blind} if rows else {}
 
 

@@ -1,7 +1,8 @@
 """The checks that apply to a user's own model, or a task's, with any number of our motors at either door.
 
-Actuators of any family run inside the engine, callback and all, beside the same functions in plain Python. A function
-of floats has one result, whoever compiled it: `compiled_checks` has a tolerance of no bit.
+Actuators of any family run inside the engine, callback and all, beside the same functions in plain
+Python. A function of floats has one result, whoever compiled it: `compiled_checks` has a tolerance
+of no bit.
 """
 
 import copy
@@ -79,9 +80,10 @@ def beside(
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Run a model from rest, and each actuator in Python under the inputs that the engine had for it.
 
-    The actuators in Python, by index in the model, start at rest and are never corrected. At the plugin's door the
-    desired force is what the engine made of the model's actuator; at the callback's it is the control itself, of shape
-    (steps, nu). By index: what was found in the engine and in Python, of shape (steps, k), columns as in `entries`.
+    The actuators in Python, by index in the model, start at rest and are never corrected. At the
+    plugin's door the desired force is what the engine made of the model's actuator; at the
+    callback's it is the control itself, of shape (steps, nu). By index: what was found in the
+    engine and in Python, of shape (steps, k), columns as in `entries`.
     """
     data = mujoco.MjData(model)
     slot_of = slots(data, actuators)
@@ -94,12 +96,19 @@ def beside(
     for step, control in enumerate(controls):
         data.ctrl[:] = control
         before = copy.copy(data)
-        mujoco.mj_forward(model, before)  # what the callback is about to see, and the torque it makes
+        mujoco.mj_forward(
+            model, before
+        )  # what the callback is about to see, and the torque it makes
         mujoco.mj_step(model, data)
         for at, actuator in actuators.items():
             output = model.actuator_outadr[at]
-            arm = 1.0 if model.actuator_plugin[at] < 0 else actuator.arm_radius  # the callback's is in the gear
-            moving = float(before.actuator_length[output]) / arm, float(before.actuator_velocity[output]) / arm
+            arm = (
+                1.0 if model.actuator_plugin[at] < 0 else actuator.arm_radius
+            )  # the callback's is in the gear
+            moving = (
+                float(before.actuator_length[output]) / arm,
+                float(before.actuator_velocity[output]) / arm,
+            )
             address, limited = model.actuator_ctrladr[at], model.actuator_forcelimited[output]
             asked, range_ = float(control[address]), model.actuator_ctrlrange[address]
             asked = float(np.clip(asked, *range_)) if model.actuator_ctrllimited[address] else asked
@@ -107,13 +116,24 @@ def beside(
                 desired = asked / arm
             else:
                 desired = float(slot_of[at][slot_size(kinds[at])]) * arm
-            inertia = shaft_inertia(model, before, output, 1.0 / arm) if actuator.INERTIA else math.inf
+            inertia = (
+                shaft_inertia(model, before, output, 1.0 / arm) if actuator.INERTIA else math.inf
+            )
             inputs = Inputs(desired, *moving, before.time, at + 1.0, inertia)
-            states[at], torque, signals = actuator.advance(parameters[at], model.opt.timestep, states[at], inputs)
-            torque = float(np.clip(torque / arm, *model.actuator_forcerange[output])) if limited else torque / arm
+            states[at], torque, signals = actuator.advance(
+                parameters[at], model.opt.timestep, states[at], inputs
+            )
+            torque = (
+                float(np.clip(torque / arm, *model.actuator_forcerange[output]))
+                if limited
+                else torque / arm
+            )
             oracle = [*states[at], *signals, torque]
             after = SLOT + len(states[at])  # the candidate state, then the signals
-            found[at][0, step] = *slot_of[at][after : after + len(oracle) - 1], before.actuator_force[output]
+            found[at][0, step] = (
+                *slot_of[at][after : after + len(oracle) - 1],
+                before.actuator_force[output],
+            )
             found[at][1, step] = oracle
     return {at: (both[0], both[1]) for at, both in found.items()}
 
@@ -121,7 +141,12 @@ def beside(
 BELOW_ONE = float(np.nextafter(1.0, 0.0))
 
 
-@check("motor", Check("stable: {motor}", "the family's own bound, a loop's eigenvalues", BELOW_ONE, "instability"))
+@check(
+    "motor",
+    Check(
+        "stable: {motor}", "the family's own bound, a loop's eigenvalues", BELOW_ONE, "instability"
+    ),
+)
 def stable(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
     """What the family says of its parameters; of a loop, of which that is infinite from 1 on, the spectral radius."""
     found = float(actuator.instability(np.array([actuator.numbers]), timestep)[0])
@@ -129,12 +154,17 @@ def stable(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
     yield Case(max(found, radius) if radius < 1.0 else radius, f"at a step of {timestep:g} s")
 
 
-@check("motor", Check("steps: {motor}", "the same functions in plain Python at the recorded speed", STEP_TOLERANCE))
+@check(
+    "motor",
+    Check(
+        "steps: {motor}", "the same functions in plain Python at the recorded speed", STEP_TOLERANCE
+    ),
+)
 def motor_steps(actuator: ActuatorModel, ours: np.ndarray, oracle: np.ndarray) -> Iterator[Case]:
     """A motor in the engine against its own in plain Python, driven by the speed that the model itself reached.
 
-    The Python motor starts at rest and is never corrected; states and signals are compared after every step, and so is
-    the torque that the engine applied.
+    The Python motor starts at rest and is never corrected; states and signals are compared after
+    every step, and so is the torque that the engine applied.
     """
     names = entries(actuator)
     yield Case(
@@ -149,9 +179,13 @@ def motor_checks(model: mujoco.MjModel, quick: bool) -> Iterator[Check | Skipped
     ours = motors(model)
     driven = {one for at in ours for one in sharing(model, at)}
     if foreign := [model.actuator(at).name or str(at) for at in named if at not in driven]:
-        yield Skipped(f"actuators {', '.join(foreign)}", "not motors of codrl_mj, which leaves them alone")
+        yield Skipped(
+            f"actuators {', '.join(foreign)}", "not motors of codrl_mj, which leaves them alone"
+        )
     for text in doubled(without_motors(model, ours), ours):
-        yield Skipped("whether a motor is counted twice", f"this cannot be seen in a compiled model: {text}")
+        yield Skipped(
+            "whether a motor is counted twice", f"this cannot be seen in a compiled model: {text}"
+        )
     running = {}
     for at, actuator in ours.items():
         group = int(model.actuator_group[at])
@@ -163,12 +197,16 @@ def motor_checks(model: mujoco.MjModel, quick: bool) -> Iterator[Check | Skipped
             running[at] = actuator
     for at, actuator in ours.items():
         yield from stable(actuator, model.opt.timestep, motor=named[at])
-    for at, found in beside(model, running, commands(model, 200 if quick else 2000, seed=7)).items():
+    for at, found in beside(
+        model, running, commands(model, 200 if quick else 2000, seed=7)
+    ).items():
         yield from motor_steps(running[at], *found, motor=named[at])
     loops = {}
     for at, actuator in ours.items():
         if not isinstance(actuator, Actuator):
-            yield Skipped(f"responses of {named[at]}", "it is no current loop: there is no oracle for it")
+            yield Skipped(
+                f"responses of {named[at]}", "it is no current loop: there is no oracle for it"
+            )
         elif spectral_radius(actuator, model.opt.timestep) < 1.0:
             loops[named[at]] = Loop(actuator, model.opt.timestep)
         else:
@@ -184,13 +222,17 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     task = find_task(task_name)
     if not task.paper:
         yield Skipped("the paper's actuators", f"it has none: the {STAND_IN} is in their place")
-    actuators = actuators_of(task) if task.actuator == "ideal" else resolve_actuators("default", task)
+    actuators = (
+        actuators_of(task) if task.actuator == "ideal" else resolve_actuators("default", task)
+    )
     model = task_model(Plant(task, actuators, task.motor_inner_steps))
     install_callbacks(model)
     yield from motor_checks(model, quick)
 
 
-_LOOP = dataclasses.replace(EVERY_FEATURE.actuator.controller, max_voltage=1.5, current_bias=0.02, current_noise=0.05)
+_LOOP = dataclasses.replace(
+    EVERY_FEATURE.actuator.controller, max_voltage=1.5, current_bias=0.02, current_noise=0.05
+)
 EXAMPLES: tuple[ActuatorModel, ...] = (
     Actuator(EVERY_FEATURE.actuator.motor, _LOOP, Supply(voltage=1.6, resistance=0.5)),
     Lag(time_constant=0.03, delay=0.013),
@@ -203,19 +245,25 @@ EXAMPLES: tuple[ActuatorModel, ...] = (
 def compiled_checks(quick: bool) -> Iterator[Check]:
     """`advance` of every family, those that commands leave of it too, on swinging rotors under random torques."""
     examples = {type(one): one for one in EXAMPLES}
-    named = [examples.get(family) or family() for family in FAMILIES.values() if family is not Ideal]
+    named = [
+        examples.get(family) or family() for family in FAMILIES.values() if family is not Ideal
+    ]
     driven = [command.actuator for one in named for command in one.commands().values()]
     actuators = list({type(one): one for one in (*driven, *named)}.values())
     for actuator in actuators:
         load_family(type(actuator))
     model = motors_on(SWINGING, actuators, 0.01)
-    found = beside(model, dict(enumerate(actuators)), commands(model, 200 if quick else 2000, seed=7))
+    found = beside(
+        model, dict(enumerate(actuators)), commands(model, 200 if quick else 2000, seed=7)
+    )
     for at, actuator in enumerate(actuators):
         yield from compiled_advance(entries(actuator), *found[at], family=type(actuator).__name__)
 
 
 @check("motor", Check("compiled advance: {family}", "the same function in plain Python", 0.0, UNIT))
-def compiled_advance(names: tuple[str, ...], compiled: np.ndarray, python: np.ndarray) -> Iterator[Case]:
+def compiled_advance(
+    names: tuple[str, ...], compiled: np.ndarray, python: np.ndarray
+) -> Iterator[Case]:
     """Floats that differ, of shape (steps, names), and the first of them."""
     unequal = differing(compiled, python)
     step, entry = divmod(int(np.argmax(unequal)), len(names))

@@ -51,11 +51,15 @@ class Record(NamedTuple):
 
 
 def motors_on(
-    rotor: Rotor, motors: Sequence[ActuatorModel | Motor], timestep: float, integrator: str = "Euler"
+    rotor: Rotor,
+    motors: Sequence[ActuatorModel | Motor],
+    timestep: float,
+    integrator: str = "Euler",
 ) -> mujoco.MjModel:
     """Motors, each on a rotor of its own: ours, with the callbacks installed, or MuJoCo's `<dcmotor>` of a winding.
 
-    Where a `Motor` is given in the place of an actuator, it is MuJoCo's, and its control is the terminal voltage [V].
+    Where a `Motor` is given in the place of an actuator, it is MuJoCo's, and its control is the
+    terminal voltage [V].
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = timestep
@@ -87,7 +91,11 @@ def driven_by_voltage(motor: Motor, substeps: int = 1) -> Actuator:
     return Actuator(
         motor,
         CurrentLoop(
-            kp=0.0, kff=motor.torque_constant, max_voltage=math.inf, bemf_compensation=False, substeps=substeps
+            kp=0.0,
+            kff=motor.torque_constant,
+            max_voltage=math.inf,
+            bemf_compensation=False,
+            substeps=substeps,
         ),
     )
 
@@ -95,19 +103,28 @@ def driven_by_voltage(motor: Motor, substeps: int = 1) -> Actuator:
 def drive(model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None = None) -> Record:
     """Run a model of this module from rest, of motors with a current.
 
-    Controls are of shape (steps,) for all alike or (steps, motors); joint speeds [rad/s], shape (steps,), are set
-    before each step, or left to the engine.
+    Controls are of shape (steps,) for all alike or (steps, motors); joint speeds [rad/s], shape
+    (steps,), are set before each step, or left to the engine.
     """
     data = mujoco.MjData(model)
-    entry = signals_at(Actuator) if model.na == model.nactuator * slot_size(Actuator) else 0  # current comes first
+    entry = (
+        signals_at(Actuator) if model.na == model.nactuator * slot_size(Actuator) else 0
+    )  # current comes first
     currents = np.asarray(model.actuator_actadr) + entry
     rows = np.empty((len(controls), 4, model.nv))
-    for row, control, speed in zip(rows, controls, controls if speeds is None else speeds, strict=True):
+    for row, control, speed in zip(
+        rows, controls, controls if speeds is None else speeds, strict=True
+    ):
         data.ctrl[:] = control
         if speeds is not None:
             data.qvel[:] = speed
         mujoco.mj_step(model, data)
-        row[0], row[1], row[2], row[3] = data.qpos, data.qvel, data.act[currents], data.qfrc_actuator
+        row[0], row[1], row[2], row[3] = (
+            data.qpos,
+            data.qvel,
+            data.act[currents],
+            data.qfrc_actuator,
+        )
     return Record(*rows.swapaxes(0, 1))
 
 
@@ -125,7 +142,13 @@ class Loop(NamedTuple):
 
 EVERY_FEATURE = Loop(
     Actuator(
-        Motor(resistance=1.2, inductance=0.05, torque_constant=0.8, back_emf_constant=0.7, arm_radius=0.5),
+        Motor(
+            resistance=1.2,
+            inductance=0.05,
+            torque_constant=0.8,
+            back_emf_constant=0.7,
+            arm_radius=0.5,
+        ),
         CurrentLoop(
             kp=2.0,
             ki=5.0,
@@ -144,13 +167,20 @@ EVERY_FEATURE = Loop(
 
 def standard_loops() -> dict[str, Loop]:
     """The paper's loop of each of our tasks at the task's inner step, and one with every feature."""
-    paper = {task.name: Loop(task.paper[0], task.step_duration / task.motor_inner_steps) for task in OURS}
+    paper = {
+        task.name: Loop(task.paper[0], task.step_duration / task.motor_inner_steps) for task in OURS
+    }
     return {**paper, "every feature": EVERY_FEATURE}
 
 
 def unlimited(loop: Loop, substeps: int) -> Actuator:
     """The loop's actuator where it is linear: without limit and sensor errors, with so many electrical substeps."""
-    linear = {"substeps": substeps, "max_voltage": math.inf, "current_bias": 0.0, "current_noise": 0.0}
+    linear = {
+        "substeps": substeps,
+        "max_voltage": math.inf,
+        "current_bias": 0.0,
+        "current_noise": 0.0,
+    }
     changes = {f"controller.{name}": value for name, value in linear.items()}
     return loop.actuator.replaced({**changes, "supply": None})
 

@@ -1,7 +1,7 @@
 """The table of checks, and the one runner: the worst of what a check's cases found, where it was, and its picture.
 
-A check is a function of cases: it yields what it compared, case by case, and says nothing of verdicts. `check` enters
-its rows in `TABLE` and makes it one that returns them with what was found.
+A check is a function of cases: it yields what it compared, case by case, and says nothing of
+verdicts. `check` enters its rows in `TABLE` and makes it one that returns them with what was found.
 """
 
 import dataclasses
@@ -16,8 +16,10 @@ import numpy as np
 from codrl_mj.pages.plots import Curve, Plot
 
 ORDER_TOLERANCE = 0.1
-"""Farthest that any end of a slope's 95 % interval may lie from the promised order. A method one order worse misses by
-1; an error that does not vanish, such as a parameter off by 1 %, bends the line until its slope is near 0."""
+"""Farthest that any end of a slope's 95 % interval may lie from the promised order. A method one
+order worse misses by 1; an error that does not vanish, such as a parameter off by 1 %, bends the
+line until its slope is near 0.
+"""
 
 
 REPORT = "this is a fault of codrl_mj, or of this version of MuJoCo or Gymnasium; please report it"
@@ -112,8 +114,9 @@ TABLE: list[Check] = []
 def check(group: str, *rows: Check) -> Callable[[Callable[..., Cases]], Callable[..., list[Check]]]:
     """Enter a function of cases in the table, in a group of the certificate.
 
-    The function yields a `Case` each time, or of several rows a tuple of them, one for each; without a case there is no
-    outcome. Words in the braces of rows are its arguments, or what it is called with besides, by name.
+    The function yields a `Case` each time, or of several rows a tuple of them, one for each;
+    without a case there is no outcome. Words in the braces of rows are its arguments, or what it is
+    called with besides, by name.
     """
     of_group = [dataclasses.replace(row, group=group) for row in rows]
     TABLE.extend(of_group)
@@ -123,11 +126,18 @@ def check(group: str, *rows: Check) -> Callable[[Callable[..., Cases]], Callable
 
         @functools.wraps(cases)
         def made(*arguments: Any, **named: Any) -> list[Check]:
-            words = {name: named.pop(name) for name in list(named) if name not in signature.parameters}
+            words = {
+                name: named.pop(name) for name in list(named) if name not in signature.parameters
+            }
             said = words | signature.bind(*arguments, **named).arguments
-            found = [(case,) if isinstance(case, Case) else case for case in cases(*arguments, **named)]
+            found = [
+                (case,) if isinstance(case, Case) else case for case in cases(*arguments, **named)
+            ]
             of_rows = zip(*found, strict=True)
-            return [outcome(row, said, several) for row, several in zip(of_group, of_rows, strict=bool(found))]
+            return [
+                outcome(row, said, several)
+                for row, several in zip(of_group, of_rows, strict=bool(found))
+            ]
 
         return made
 
@@ -149,7 +159,12 @@ def outcome(row: Check, said: dict[str, Any], cases: Iterable[Case]) -> Check:
     if worst < 0.0:  # nothing was compared
         worst, where = 0.0, EVERYWHERE
     name, oracle = (text.format_map(said) for text in (row.name, row.oracle))
-    found: dict[str, Any] = {"samples": samples, "worst": worst, "where": where, "plots": tuple(plots)}
+    found: dict[str, Any] = {
+        "samples": samples,
+        "worst": worst,
+        "where": where,
+        "plots": tuple(plots),
+    }
     return dataclasses.replace(row, name=name, oracle=oracle, **found)
 
 
@@ -159,8 +174,8 @@ def outcome(row: Check, said: dict[str, Any], cases: Iterable[Case]) -> Check:
 def fit_slope(steps: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
     """The exponent of a cloud of points on logarithmic axes, and half the width of its 95 % interval.
 
-    Least squares on the logarithms, and Student's t at n - 2 degrees of freedom, of at least three steps > 0; an error
-    that is zero or NaN makes both a NaN.
+    Least squares on the logarithms, and Student's t at n - 2 degrees of freedom, of at least three
+    steps > 0; an error that is zero or NaN makes both a NaN.
     """
     from scipy import stats  # the certificate's reader does without
 
@@ -187,9 +202,9 @@ class Family(NamedTuple):
     def judged(self, promised: float) -> tuple[float, str]:
         """How far it is from the promised order, and the finding in words; rounding is left out.
 
-        With fewer than three errors left there is no slope, and the largest may be what the promised order leaves over
-        rounding two steps before it, with as much again for rounding's scatter: `ORDER_TOLERANCE` times its share in
-        that.
+        With fewer than three errors left there is no slope, and the largest may be what the
+        promised order leaves over rounding two steps before it, with as much again for rounding's
+        scatter: `ORDER_TOLERANCE` times its share in that.
         """
         clear = ~(self.errors <= self.rounding) | (self.rounding == 0.0)  # NaN is clear
         spread = f"errors {self.errors[0]:.2g} to {self.errors[-1]:.2g}"
@@ -198,17 +213,29 @@ class Family(NamedTuple):
             distance = abs(slope - promised) + half  # of the farther end of the interval
             said = f"{self.label}: slope {slope:.3f} +- {half:.3f}, {spread}"
             return distance if math.isfinite(distance) else math.inf, said
-        share = float(self.errors.max() / (2.0 * self.rounding * (self.steps[0] / self.steps[2]) ** promised))
+        share = float(
+            self.errors.max() / (2.0 * self.rounding * (self.steps[0] / self.steps[2]) ** promised)
+        )
         share = math.inf if math.isnan(share) else share
-        return ORDER_TOLERANCE * share, f"{self.label}: exact to rounding, {self.rounding:.2g}: {spread}"
+        return (
+            ORDER_TOLERANCE * share,
+            f"{self.label}: exact to rounding, {self.rounding:.2g}: {spread}",
+        )
 
 
-def of_order(promised: float, families: list[Family], title: str, x_label: str, y_label: str) -> Case:
+def of_order(
+    promised: float, families: list[Family], title: str, x_label: str, y_label: str
+) -> Case:
     """How far from the promised order every family's errors vanish, intervals included; drawn with that slope."""
     found = [one.judged(promised) for one in families]
-    curves = [Curve(text.partition(", ")[0], f.steps, f.errors) for f, (_, text) in zip(families, found, strict=True)]
+    curves = [
+        Curve(text.partition(", ")[0], f.steps, f.errors)
+        for f, (_, text) in zip(families, found, strict=True)
+    ]
     first = families[0]
-    guide = 0.5 * first.errors[-1] * (first.steps / first.steps[-1]) ** promised  # beside the errors, not upon them
+    guide = (
+        0.5 * first.errors[-1] * (first.steps / first.steps[-1]) ** promised
+    )  # beside the errors, not upon them
     curves.append(Curve(f"slope {promised:g}, as promised", first.steps, guide, reference=True))
     plot = Plot(title, x_label, y_label, tuple(curves), x_log=True, y_log=True)
     distance, where = max(found, key=lambda one: one[0])

@@ -1,9 +1,9 @@
 """Whole runs under the same commands: MuJoCo with the motor in its callback against Gymnasium with the motor in Python.
 
-A run is judged twice. Up to the horizon of `Task.trials` the difference itself must stay below 1e-9. Over a whole
-episode, where a chaotic task would enlarge even the smallest rounding beyond any fixed bound, the difference is
-measured against what rounding becomes in the oracle itself along this run (`Growth`): what remains is the error made,
-not what chaos made of it.
+A run is judged twice. Up to the horizon of `Task.trials` the difference itself must stay below
+1e-9. Over a whole episode, where a chaotic task would enlarge even the smallest rounding beyond any
+fixed bound, the difference is measured against what rounding becomes in the oracle itself along
+this run (`Growth`): what remains is the error made, not what chaos made of it.
 """
 
 import copy
@@ -23,8 +23,9 @@ from codrl_mj.validation.table import Case, Check, Skipped, check
 TOLERANCE = 1e-9
 """Of the difference: rounding (1e-16), a thousand steps, and the growth of tasks that are not chaotic."""
 ROUNDINGS = 30.0
-"""Largest difference in standard deviations of the oracle's own accumulated rounding, of 2e-16 for each entry and step;
-a step rounds some tens of numbers."""
+"""Largest difference in standard deviations of the oracle's own accumulated rounding, of 2e-16 for
+each entry and step; a step rounds some tens of numbers.
+"""
 
 UNLIMITED_STEPS = 200
 """Environment steps of a run of a task without a time limit."""
@@ -42,8 +43,9 @@ CLOCK = 2
 class Growth:
     """Follows an analytic physics and records how errors grow along its run: what rounding becomes.
 
-    The oracle's step is linearised along the run by finite differences: the state of mechanics and motor is displaced
-    by a small amount along each of its entries, the rest being as in the run. The product of these matrices carries
+    The oracle's step is linearised along the run by finite differences: the state of mechanics and
+    motor is displaced by a small amount along each of its entries, the rest being as in the run.
+    The product of these matrices carries
 
     - one displacement, scaled back after every step: the mean rate of its growth is Benettin's estimate of the largest
       Lyapunov exponent, of the driven system along this run;
@@ -77,12 +79,16 @@ class Growth:
             twin.restore(displaced)
             twin.step(desired_force)
             gap = (twin.snapshot() - end)[:entries]
-            gap[:size] -= 2 * math.pi * np.round(gap[:size] / (2 * math.pi))  # one of them was wrapped
+            gap[:size] -= (
+                2 * math.pi * np.round(gap[:size] / (2 * math.pi))
+            )  # one of them was wrapped
             matrix[:, entry] = gap / apart
         moved = matrix @ self._direction
         length = float(np.linalg.norm(moved))
         self.logarithms.append(self.logarithms[-1] + math.log(max(length, ROUNDING)))
-        self._direction = moved / length if length > ROUNDING else self._direction  # a wall stopped both
+        self._direction = (
+            moved / length if length > ROUNDING else self._direction
+        )  # a wall stopped both
         scale = np.maximum(1.0, np.abs(end[:entries]))
         self._covariance = matrix @ self._covariance @ matrix.T + np.diag((ROUNDING * scale) ** 2)
         self.rounding.append(float((np.sqrt(np.diag(self._covariance)) / scale)[:size].max()))
@@ -94,7 +100,8 @@ def _run(
 ) -> tuple[np.ndarray, list[str], Growth]:
     """One run on both physics, and how errors grow along it.
 
-    The largest difference of state or force after each step, and in what it was; of a step that diverged infinity.
+    The largest difference of state or force after each step, and in what it was; of a step that
+    diverged infinity.
     """
     mujoco, analytic = both(task, actuator, integrator)
     generator = np.random.default_rng(seed)
@@ -131,9 +138,18 @@ def _plot(task: Task, gaps: np.ndarray, growth: Growth, title: str) -> Plot:
     begins = task.step_duration * np.arange(len(growth.logarithms))
     exponent, _ = np.polyfit(begins, growth.logarithms, 1)  # Lyapunov's [1/s]
     curves = (
-        Curve("difference found (0 is drawn at 1e-18)", times, np.maximum(gaps[: len(rounding)], 1e-18)),
+        Curve(
+            "difference found (0 is drawn at 1e-18)",
+            times,
+            np.maximum(gaps[: len(rounding)], 1e-18),
+        ),
         Curve("what rounding becomes in the oracle", times, rounding, reference=True),
-        Curve(f"2e-16 × exp(λt), λ = {exponent:.3g} 1/s", times, ROUNDING * np.exp(exponent * times), reference=True),
+        Curve(
+            f"2e-16 × exp(λt), λ = {exponent:.3g} 1/s",
+            times,
+            ROUNDING * np.exp(exponent * times),
+            reference=True,
+        ),
         Curve(f"allowed: {ROUNDINGS:g} × rounding", times, ROUNDINGS * rounding, reference=True),
     )
     return Plot(title, "time [s]", "difference [relative]", curves, y_log=True)
@@ -152,20 +168,30 @@ def whole_runs(
 ) -> Iterator[tuple[Case, ...]]:
     """Runs under the same random bang-bang commands: the difference itself up to the horizon, and all in roundings.
 
-    The task's ends are ignored, and a divergence fails. `starved` is the paper's motor with 0.5 V and nothing against
-    its back-EMF, both of which its loop hides otherwise. There is a plot of the first run.
+    The task's ends are ignored, and a divergence fails. `starved` is the paper's motor with 0.5 V
+    and nothing against its back-EMF, both of which its loop hides otherwise. There is a plot of the
+    first run.
     """
     actuator = named_actuator("paper" if actuator_name == STARVED else actuator_name, task.name)
     if actuator_name == STARVED:
-        actuator = actuator.replaced({"controller.max_voltage": 0.5, "controller.bemf_compensation": False})
+        actuator = actuator.replaced(
+            {"controller.max_voltage": 0.5, "controller.bemf_compensation": False}
+        )
     steps = min(longest, task.max_episode_steps or UNLIMITED_STEPS)
     horizon = min(steps, (task.trials and task.trials.horizon) or steps)
     for seed in seeds:
         gaps, where, growth = _run(task, actuator, integrator, steps, seed)
         in_roundings = gaps / np.append(growth.rounding, np.ones(len(gaps) - len(growth.rounding)))
         title = f"{task.name}, {integrator}, {actuator_name} actuator"
-        plots = (_plot(task, gaps, growth, title),) if seed == seeds[0] and len(growth.rounding) > 1 else ()
-        yield Case(gaps[:horizon], where.__getitem__, horizon), Case(in_roundings, where.__getitem__, steps, plots)
+        plots = (
+            (_plot(task, gaps, growth, title),)
+            if seed == seeds[0] and len(growth.rounding) > 1
+            else ()
+        )
+        yield (
+            Case(gaps[:horizon], where.__getitem__, horizon),
+            Case(in_roundings, where.__getitem__, steps, plots),
+        )
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:

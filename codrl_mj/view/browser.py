@@ -40,7 +40,9 @@ class Browser:
         self.server.gui.set_panel_label(title)
         self._send_scene()
         self._build()
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        self.server.gui.configure_theme(
+            show_logo=False, show_share_button=False, control_width="medium"
+        )
         self._move()
 
     @property
@@ -96,13 +98,19 @@ class Browser:
         own = hasattr(self.session.env.unwrapped, "physics") and "fixed" in cameras
         view = first_view(model, self._shapes, self._poses, moving, "fixed" if own else None)
         self._frames: dict[int, Any] = {}
-        few = {one.mesh: thinned(*mesh(model, *one.mesh), TRIANGLES // 4) for one in self._shapes if one.mesh}
+        few = {
+            one.mesh: thinned(*mesh(model, *one.mesh), TRIANGLES // 4)
+            for one in self._shapes
+            if one.mesh
+        }
         with self.server.atomic():
             scene.set_up_direction("+z")
             scene.world_axes.visible = False
             for body in sorted({one.body for one in self._shapes}):
                 position, quaternion = self._poses[body, :3], self._poses[body, 3:]
-                frame = scene.add_frame(f"/{body}", show_axes=False, position=position, wxyz=quaternion)
+                frame = scene.add_frame(
+                    f"/{body}", show_axes=False, position=position, wxyz=quaternion
+                )
                 if body in moving:
                     self._frames[body] = frame
             for index, one in enumerate(self._shapes):
@@ -155,7 +163,10 @@ class Browser:
         session = self.session
         state = "waits" if session.waits else "plays" if self.playing else "paused"
         ended = f", {session.ended}" if session.ended else ""
-        text = f"**{session.time:.2f} s** · return {session.total:.1f}{ended} · {state}, {self._real:.2f} × real time"
+        text = (
+            f"**{session.time:.2f} s** · return {session.total:.1f}{ended} · {state},"
+            f" {self._real:.2f} × real time"
+        )
         if self._status.content != text:
             self._status.content = text
         problem = self._refusal or session.problem or ""
@@ -163,7 +174,9 @@ class Browser:
         shown = f"⚠ **{title}:** {_plain(problem)}" if problem else ""
         if self._problem.content != shown:
             self._problem.content, self._problem.visible = shown, bool(shown)
-            for client in self.server.get_clients().values() if shown else ():  # the panel may be scrolled away from it
+            for client in (
+                self.server.get_clients().values() if shown else ()
+            ):  # the panel may be scrolled away from it
                 client.add_notification(title, problem, color="red", auto_close_seconds=8.0)
 
     def _plot(self) -> None:
@@ -171,7 +184,11 @@ class Browser:
         if not kept:
             return
         kept = kept[:: max(1, len(kept) // _POINTS)]
-        motor = self.session.recorder.motor_names.index(self._motor.value) if self._motor is not None else 0
+        motor = (
+            self.session.recorder.motor_names.index(self._motor.value)
+            if self._motor is not None
+            else 0
+        )
         times = np.array([when for when, _ in kept])
         values = np.array([row[motor] for _, row in kept])
         for columns, handle in self._plots:
@@ -187,26 +204,41 @@ class Browser:
         buttons = gui.add_button_group("", tuple(deeds), hint="keys P, N and R")
         buttons.on_click(lambda _: self._ask(object(), deeds[buttons.value]))
         for (label, deed), key in zip(deeds.items(), ("P", "N", "R"), strict=True):
-            gui.add_command(label, hotkey=key).on_trigger(lambda _, deed=deed: self._ask(object(), deed))
+            gui.add_command(label, hotkey=key).on_trigger(
+                lambda _, deed=deed: self._ask(object(), deed)
+            )
         policy = gui.add_dropdown("policy", tuple(session.policies), initial_value=session.chosen)
         policy.on_update(lambda _: self._ask("policy", lambda: session.choose(policy.value)))
         speed = gui.add_slider("speed", 0.05, 4.0, 0.05, 1.0)
         speed.on_update(lambda _: setattr(self, "_speed", speed.value))
-        again = gui.add_checkbox("begin anew at the end", True, hint="also at the time limit; otherwise it goes on")
+        again = gui.add_checkbox(
+            "begin anew at the end", True, hint="also at the time limit; otherwise it goes on"
+        )
         again.on_update(lambda _: setattr(session, "again", again.value))
         self._pushes()
         self._signals()
-        for pattern, actuator in session.config.driven.items():  # a folder for each part of what drives a motor
+        for (
+            pattern,
+            actuator,
+        ) in session.config.driven.items():  # a folder for each part of what drives a motor
             several = f" {pattern}" if len(session.config.driven) > 1 else ""
             own = actuator.family or type(actuator).__name__
-            change, found = functools.partial(session.set_actuator, pattern), controls(actuator, _SUPPLY)
-            for part, fields in itertools.groupby(found, lambda one: one.path[0] if len(one.path) > 1 else own):  # noqa: B023
+            change, found = (
+                functools.partial(session.set_actuator, pattern),
+                controls(actuator, _SUPPLY),
+            )
+            for part, fields in itertools.groupby(
+                found,
+                lambda one: one.path[0] if len(one.path) > 1 else own,  # noqa: B023
+            ):
                 self._settings(f"{part}{several}", fields, change)
             if not found:
                 gui.add_markdown(f"Nothing can be set of {own}{several}: begin with `--actuator`.")
         disturbances = session.config.disturbances
         ends = {"command_delay": _DELAY_STEPS * session.recorder.step_duration}
-        self._settings("delay and disturbances", controls(disturbances, ends=ends), session.set_disturbance)
+        self._settings(
+            "delay and disturbances", controls(disturbances, ends=ends), session.set_disturbance
+        )
 
     def _pushes(self) -> None:
         gui, session = self.server.gui, self.session
@@ -216,7 +248,9 @@ class Browser:
             body = gui.add_dropdown("body", tuple(session.bodies))
             axis = gui.add_dropdown("along", tuple(_AXES))
             weight = float(session.model.body_mass.sum() * 9.81)
-            force = gui.add_slider("force [N]", 0.0, _round(5 * weight), _round(weight / 40), _round(weight))
+            force = gui.add_slider(
+                "force [N]", 0.0, _round(5 * weight), _round(weight / 40), _round(weight)
+            )
 
             signs = {"Push back": -1.0, "Push forth": 1.0}
             buttons = gui.add_button_group("", tuple(signs))
@@ -235,9 +269,14 @@ class Browser:
             "actual_force": "force, torque at the joint",
         }
         for actuator in session.config.driven.values():
-            units |= {name: f"{name.split('_')[-1]} [{unit}]" for name, unit in actuator.SIGNAL_UNITS.items()}
+            units |= {
+                name: f"{name.split('_')[-1]} [{unit}]"
+                for name, unit in actuator.SIGNAL_UNITS.items()
+            }
         groups: dict[str, list[str]] = {}
-        for name in sorted(session.recorder.trace_names, key=lambda name: not name.startswith(_WANTED)):
+        for name in sorted(
+            session.recorder.trace_names, key=lambda name: not name.startswith(_WANTED)
+        ):
             if name in units:
                 groups.setdefault(units[name], []).append(name)
         with gui.add_folder("signals"):
@@ -255,12 +294,20 @@ class Browser:
                     scales={"x": uplot.Scale(time=False, auto=True)},
                     height=170,
                 )
-                self._plots.append(([session.recorder.trace_names.index(name) for name in names], handle))
+                self._plots.append(
+                    ([session.recorder.trace_names.index(name) for name in names], handle)
+                )
 
-    def _settings(self, title: str, found: Iterable[Control], change: Callable[[tuple[str, ...], Any], None]) -> None:
+    def _settings(
+        self, title: str, found: Iterable[Control], change: Callable[[tuple[str, ...], Any], None]
+    ) -> None:
         """A folder with what has a slider, and within it one with what has to be typed."""
         gui, found = self.server.gui, list(found)
-        slid = [one for one in found if one.high is not None or one.options or isinstance(one.value, bool)]
+        slid = [
+            one
+            for one in found
+            if one.high is not None or one.options or isinstance(one.value, bool)
+        ]
         typed = [one for one in found if one not in slid]
         with gui.add_folder(title, expand_by_default=False):
             for one in slid:
@@ -289,7 +336,9 @@ class Browser:
             handle = gui.add_slider(
                 label, low, high, _round((high - low) / 200), value, hint=(hint or "") + end or None
             )
-        handle.on_update(lambda _: self._ask(one.path, lambda: change(one.path, one.parsed(handle.value))))
+        handle.on_update(
+            lambda _: self._ask(one.path, lambda: change(one.path, one.parsed(handle.value)))
+        )
 
     # -- what is asked for -----------------------------------------------------------------------------------------
 
@@ -311,7 +360,9 @@ def _triangles(one: Shape, extent: float) -> tuple[np.ndarray, np.ndarray]:
     size = one.size
     if one.kind == "plane":
         x, y = (half if half > 0 else 20 * extent for half in size[:2])
-        return np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+        return np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]), np.array(
+            [[0, 1, 2], [0, 2, 3]]
+        )
     if one.kind == "box":
         made = trimesh.creation.box(2 * np.array(size))
     elif one.kind == "ellipsoid":
@@ -326,7 +377,8 @@ def _triangles(one: Shape, extent: float) -> tuple[np.ndarray, np.ndarray]:
 def drawable(values: np.ndarray) -> np.ndarray:
     """Values of a plot, of any shape, as uPlot can draw them: finite, and equal or apart by 1e-6 of the largest.
 
-    Where all differ by rounding errors alone, its search for ticks does not end before the memory does.
+    Where all differ by rounding errors alone, its search for ticks does not end before the memory
+    does.
     """
     values = np.nan_to_num(values, posinf=_HUGE, neginf=-_HUGE).clip(-_HUGE, _HUGE)
     step = 1e-6 * np.abs(values).max(initial=0.0)

@@ -33,8 +33,13 @@ class LocalServer(viser.ViserServer):
     def __init__(self, port: int) -> None:
         """Begin to listen at a port or, where it is taken, the next free one."""
         if not 0 <= port < 65536:
-            raise ValueError(f"port = {port}: must be 0 to 65535; 8080 is the default, 0 any that is free")
-        with _checked_requests(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a table of addresses
+            raise ValueError(
+                f"port = {port}: must be 0 to 65535; 8080 is the default, 0 any that is free"
+            )
+        with (
+            _checked_requests(),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):  # viser prints a table of addresses
             super().__init__(host=HOST, port=port, verbose=False)
 
     def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
@@ -54,7 +59,9 @@ def _checked_requests() -> Iterator[None]:
     def serve(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
         def checked(connection: Any, request: Request) -> Response | None:
             if not allowed(request.headers):
-                return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", Headers({"Content-Length": "0"}), b"")
+                return Response(
+                    http.HTTPStatus.FORBIDDEN, "Forbidden", Headers({"Content-Length": "0"}), b""
+                )
             if request.path.partition("?")[0] != "/":
                 return process_request(connection, request)
             request.headers.pop("Accept-Encoding", None)  # text is to be put into the page

@@ -20,7 +20,11 @@ from codrl_mj.evaluation import RandomPolicy
 from codrl_mj.fields import field_docs, parts
 
 _FOREVER = 10**9  # environment steps
-_DIVERGED = mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC
+_DIVERGED = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
 HISTORY = 10.0
 """What of the signals is remembered [s]."""
 PUSH_DURATION = 0.1
@@ -66,15 +70,17 @@ def controls(
 ) -> list[Control]:
     """Numbers, words and flags in an actuator or disturbances, and in its parts, of which `path` leads to this one.
 
-    The slider of an infinite voltage ends at `scale` [V], without which infinite fields are left out; that of a field
-    that is 0 where `ends` says so by its name.
+    The slider of an infinite voltage ends at `scale` [V], without which infinite fields are left
+    out; that of a field that is 0 where `ends` says so by its name.
     """
     kind: Any = type(settings)
     found, nested, docs = [], parts(kind), field_docs(kind)
     for field in dataclasses.fields(settings):
         value, own, about = getattr(settings, field.name), (*path, field.name), docs.get(field.name)
         if field.name in nested:
-            found += controls(field.metadata.get("absent") if value is None else value, scale, ends, own)
+            found += controls(
+                field.metadata.get("absent") if value is None else value, scale, ends, own
+            )
         elif "options" in field.metadata:
             found.append(Control(own, "", value, options=field.metadata["options"], about=about))
         elif isinstance(value, bool):
@@ -83,7 +89,14 @@ def controls(
             unit = field.metadata.get("unit", "")
             low, high = field.metadata.get("between", (None, None))
             low, high = _slider(value, low, high, scale if unit == "V" else None)
-            one = Control(own, unit, value, low, ends.get(field.name, high) if value == 0 else high, about=about)
+            one = Control(
+                own,
+                unit,
+                value,
+                low,
+                ends.get(field.name, high) if value == 0 else high,
+                about=about,
+            )
             found += [] if one.endless and one.high is None else [one]
     return found
 
@@ -103,17 +116,20 @@ def _slider(
 class Session:
     """An environment, what acts in it, and what it did lately.
 
-    Settings that cannot be simulated, unstable ones among them, are not: `problem` says why, and steps wait until they
-    are set otherwise. So they do after a simulation left the finite numbers, until a reset.
+    Settings that cannot be simulated, unstable ones among them, are not: `problem` says why, and
+    steps wait until they are set otherwise. So they do after a simulation left the finite numbers,
+    until a reset.
     """
 
-    def __init__(self, config: Any, policies: Mapping[str, Callable[[], Any]], seed: int = 0) -> None:
+    def __init__(
+        self, config: Any, policies: Mapping[str, Callable[[], Any]], seed: int = 0
+    ) -> None:
         """Build the environment and start an episode.
 
         Args:
             config: its `EnvConfig`.
-            policies: by name, made when they are chosen; `random`, and `zero` where an action does nothing, are there
-                besides. The first one acts.
+            policies: by name, made when they are chosen; `random`, and `zero` where an action does
+                nothing, are there besides. The first one acts.
             seed: of the first episode, and of random actions.
 
         Raises:
@@ -128,9 +144,14 @@ class Session:
         """Time [s], and a row of the recorder's `trace_names` for each motor."""
         self._seed, self._diverged, self._pushes = seed, False, {}  # type: ignore[var-annotated]
         self.env = self._made()
-        self.policies = {**policies, "random": lambda: RandomPolicy(self.env.action_space, self._seed)}
+        self.policies = {
+            **policies,
+            "random": lambda: RandomPolicy(self.env.action_space, self._seed),
+        }
         if (action := self._nothing()) is not None:
-            still = SimpleNamespace(predict=lambda seen, **_: (np.array([action] * len(seen)), None))
+            still = SimpleNamespace(
+                predict=lambda seen, **_: (np.array([action] * len(seen)), None)
+            )
             self.policies["zero"] = lambda: still
         self.choose(next(iter(self.policies)))
         self.reset()
@@ -151,7 +172,11 @@ class Session:
     def bodies(self) -> list[str]:
         """Names of the bodies that can be pushed, the last of a chain first."""
         model = self.model
-        moves = [body for body in range(1, model.nbody) if model.body_weldid[body] and model.body_subtreemass[body] > 0]
+        moves = [
+            body
+            for body in range(1, model.nbody)
+            if model.body_weldid[body] and model.body_subtreemass[body] > 0
+        ]
         return [model.body(body).name for body in reversed(moves) if model.body(body).name]
 
     @property
@@ -179,17 +204,23 @@ class Session:
 
         Raises:
             FileNotFoundError: its run has none.
-            ValueError: unknown, or it observes or commands something else than this environment has.
+            ValueError: unknown, or it observes or commands something else than this environment
+                has.
         """
         policy = self.policies[name]()
         try:
             space = self.env.observation_space
             action, _ = policy.predict(np.zeros((1, *space.shape), space.dtype), deterministic=True)
-            fits = self.env.action_space.contains(np.asarray(action[0], self.env.action_space.dtype))
+            fits = self.env.action_space.contains(
+                np.asarray(action[0], self.env.action_space.dtype)
+            )
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"policy {name}: does not fit this environment: {error}") from None
         if not fits:
-            raise ValueError(f"policy {name}: its actions, such as {action[0]}, are none of {self.env.action_space}")
+            raise ValueError(
+                f"policy {name}: its actions, such as {action[0]}, are none of"
+                f" {self.env.action_space}"
+            )
         self.policy, self.chosen = policy, name
 
     def push(self, body: str, force: float, axis: int = 0) -> None:
@@ -209,13 +240,20 @@ class Session:
         for name in reversed(path):
             value = {name: value}
         self._rebuild(
-            lambda: {"actuator": {**self.config.driven, pattern: actuator_over(self.config.driven[pattern], value)}}
+            lambda: {
+                "actuator": {
+                    **self.config.driven,
+                    pattern: actuator_over(self.config.driven[pattern], value),
+                }
+            }
         )
 
     def set_disturbance(self, path: tuple[str, ...], value: Any) -> None:
         """Set a field of the disturbances."""
         (name,) = path
-        self._rebuild(lambda: {"disturbances": dataclasses.replace(self.config.disturbances, **{name: value})})
+        self._rebuild(
+            lambda: {"disturbances": dataclasses.replace(self.config.disturbances, **{name: value})}
+        )
 
     def step(self) -> bool:
         """Advance by one environment step, if it can be simulated.
@@ -233,7 +271,9 @@ class Session:
             if self.time + 1e-9 >= end:
                 del self._pushes[body]
                 data.xfrc_applied[body] = 0.0
-        action, _ = self.policy.predict(np.asarray(self.observation)[np.newaxis], deterministic=True)
+        action, _ = self.policy.predict(
+            np.asarray(self.observation)[np.newaxis], deterministic=True
+        )
         try:
             self.observation, reward, terminated, truncated, _ = self.env.step(action[0])
             # from numbers that are none it begins anew by itself
@@ -251,7 +291,11 @@ class Session:
             self.signals.popleft()
         self.total += float(reward)
         self._steps += 1
-        self.ended = "ended" if terminated or truncated else "past the time limit" * (self._steps >= self._limit)
+        self.ended = (
+            "ended"
+            if terminated or truncated
+            else "past the time limit" * (self._steps >= self._limit)
+        )
         self._posed()
         return True
 
@@ -260,7 +304,10 @@ class Session:
     def _made(self) -> Any:
         env: Any = self.config.make()
         if getattr(env.unwrapped, "model", None) is None:
-            raise ValueError(f"{self.config.task} has no MuJoCo model to be shown; physics must be mujoco, its default")
+            raise ValueError(
+                f"{self.config.task} has no MuJoCo model to be shown; physics must be mujoco, its"
+                " default"
+            )
         self.recorder: Any = env.get_wrapper_attr("recorder")
         return env
 
@@ -298,7 +345,9 @@ class Session:
         if isinstance(space, spaces.Box):
             return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
         if isinstance(space, spaces.Discrete) and setup is not None:
-            forces = {action: np.abs(setup.commands.force(action)).max() for action in range(int(space.n))}
+            forces = {
+                action: np.abs(setup.commands.force(action)).max() for action in range(int(space.n))
+            }
             least = min(forces, key=lambda action: forces[action])
             return least if math.isclose(forces[least], 0.0, abs_tol=1e-12) else None
         return None

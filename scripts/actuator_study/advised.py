@@ -14,12 +14,19 @@ from codrl_mj.study.questions import MARGIN
 
 def tested(task: str) -> dict[str, tuple[str, Any]]:
     """Test -> what to call the actuator, and the actuator, of all that are none of the doses."""
-    found = {"good motor": arms.GOOD[task]} | ({"marginal motor": arms.MARGINAL[task]} if task in arms.MARGINAL else {})
-    called = {test: (motor_name(motor), posed(task, motor).actuator) for test, motor in found.items()}
+    found = {"good motor": arms.GOOD[task]} | (
+        {"marginal motor": arms.MARGINAL[task]} if task in arms.MARGINAL else {}
+    )
+    called = {
+        test: (motor_name(motor), posed(task, motor).actuator) for test, motor in found.items()
+    }
     if task not in arms.LOOPED:
         return called
     loops = {loop: arms.designed(task) if loop == "designed" else loop for loop in LOOPS}
-    return called | {loop: (f"paper's motor, {loop} loop", posed(task, one).actuator) for loop, one in loops.items()}
+    return called | {
+        loop: (f"paper's motor, {loop} loop", posed(task, one).actuator)
+        for loop, one in loops.items()
+    }
 
 
 LOOPS = ("weaker", "paper", "designed")
@@ -41,7 +48,11 @@ def measured(evidence: Evidence, task: str, test: str) -> dict[str, Prospect]:
         name: evidence.outcome(task, arm, there, "ideal" if arm == "ideal" else None)
         for name, (arm, there) in trained.items()
     }
-    return {name: Prospect(outcome, outcome) for name, outcome in outcomes.items() if outcome is not None}
+    return {
+        name: Prospect(outcome, outcome)
+        for name, outcome in outcomes.items()
+        if outcome is not None
+    }
 
 
 def judged(said: str, options: Mapping[str, Prospect]) -> str:
@@ -75,7 +86,9 @@ def rows(evidence: Evidence) -> Iterator[dict[str, Any]]:
                 "measured_failed": seen.failed,
                 "measured_success_lost": seen.success_lost.mean,
                 "said": found.verdict,
-                "measured": decide(options) if THROUGH in options or seen.spared else "not trained through",
+                "measured": (
+                    decide(options) if THROUGH in options or seen.spared else "not trained through"
+                ),
                 "judged": judged(found.verdict or MEASURE, options),
             }
 

@@ -12,8 +12,10 @@ from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import named_actuator
 
 TRAINED = ("pendulum", "furuta")
-"""The tasks on which doses are trained through: those whose score every dose moves, and that have no ceiling nearby.
-(CartPole's is reached by ideal-trained policies under every dose but lag and delay.)"""
+"""The tasks on which doses are trained through: those whose score every dose moves, and that have
+no ceiling nearby. (CartPole's is reached by ideal-trained policies under every dose but lag and
+delay.)
+"""
 LOOPED = ("pendulum", "cartpole")
 """The tasks on which loops around the paper's motor are compared."""
 DRAWN = ("lag", "weakness", "supply", "noise")
@@ -27,7 +29,9 @@ GOOD: dict[str, dict[str, Any]] = {
     "mountain_car_continuous": {"name": "faulhaber-1331-006", "motor": {"gear_ratio": 1038.0}},
 }
 """Task -> the smallest motor of the catalogue that `codrl-mj motor choose` finds sufficient, with its gear."""
-MARGINAL: dict[str, dict[str, Any]] = {task: known["marginal motor"] for task, known in REAL.items()}
+MARGINAL: dict[str, dict[str, Any]] = {
+    task: known["marginal motor"] for task, known in REAL.items()
+}
 """Task -> a motor that it calls `try it`."""
 
 
@@ -43,13 +47,19 @@ def drawn(task: str, axis: str, trained: float | None = None) -> Arm:
 
     `trained` is the dose that others are trained through, where it is not the axis' own.
     """
-    most = AXES[axis].at(task, drawn_up_to(axis, AXES[axis].trained[task] if trained is None else trained))
+    most = AXES[axis].at(
+        task, drawn_up_to(axis, AXES[axis].trained[task] if trained is None else trained)
+    )
     none, actuator = AXES[axis].at(task, 0.0).actuator, most.actuator
     text = {
         "lag": lambda: f"time_constant=uniform(0, {actuator.time_constant:g})",
         "weakness": lambda: f"gain=uniform({actuator.gain:g}, 1)",
-        "supply": lambda: f"supply.voltage=uniform({actuator.supply.voltage:g}, {none.supply.voltage:g})",
-        "noise": lambda: f"controller.current_noise=uniform(0, {actuator.controller.current_noise:g})",
+        "supply": lambda: (
+            f"supply.voltage=uniform({actuator.supply.voltage:g}, {none.supply.voltage:g})"
+        ),
+        "noise": lambda: (
+            f"controller.current_noise=uniform(0, {actuator.controller.current_noise:g})"
+        ),
     }[axis]()
     return arm(task, f"{axis}, drawn", dataclasses.replace(most, randomize=(text,)))
 

@@ -33,8 +33,8 @@ def windup() -> dict[str, list[tuple[Trial, Trial]]]:
 def paper_loops(task: str) -> dict[str, EnvConfig]:
     """The paper's motor and loop otherwise than the paper has them, by name.
 
-    The integration step is varied for motor and mechanics alike. The study's is a tenth of the policy's step, the
-    paper's the whole of it.
+    The integration step is varied for motor and mechanics alike. The study's is a tenth of the
+    policy's step, the paper's the whole of it.
     """
     nominal, step = posed(task, "paper"), find_task(task).step_duration
     motor = nominal.actuator.motor
@@ -53,10 +53,16 @@ def around_the_paper() -> dict[str, list[Trial]]:
     return {
         f"{task}, {name}": [
             on_loop(arm, "paper"),
-            *(Trial(arm, f"paper, {otherwise}", env) for otherwise, env in paper_loops(task).items()),
+            *(
+                Trial(arm, f"paper, {otherwise}", env)
+                for otherwise, env in paper_loops(task).items()
+            ),
         ]
         for task in arms.LOOPED
-        for name, arm in (("ideal-trained", ideal(task)), ("trained on it", through_loop(task, "paper")))
+        for name, arm in (
+            ("ideal-trained", ideal(task)),
+            ("trained on it", through_loop(task, "paper")),
+        )
     }
 
 

@@ -9,7 +9,16 @@ import numpy as np
 from actuator_study import arms
 from actuator_study.units import THINGS, dose_text, size
 from codrl_mj.evaluation.measures import bootstrap_mean
-from codrl_mj.study.advice import BUY, IDEAL, MEASURE, RANDOMISE, THROUGH, decide, known, tests_through
+from codrl_mj.study.advice import (
+    BUY,
+    IDEAL,
+    MEASURE,
+    RANDOMISE,
+    THROUGH,
+    decide,
+    known,
+    tests_through,
+)
 from codrl_mj.study.doses import AXES, SECONDS
 from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.pages import COLOURS, MARKERS, TITLES, legend, save
@@ -17,13 +26,20 @@ from codrl_mj.study.questions import Scores
 from codrl_mj.study.trials import Trial
 
 _LOWEST = -0.1  # of the span; what is worse is as lost
-_REGIONS = {IDEAL: "#d9f0e3", RANDOMISE: "#dbe9f6", THROUGH: "#fdebc8", BUY: "#f6d5cc", MEASURE: "#eeeeee"}
+_REGIONS = {
+    IDEAL: "#d9f0e3",
+    RANDOMISE: "#dbe9f6",
+    THROUGH: "#fdebc8",
+    BUY: "#f6d5cc",
+    MEASURE: "#eeeeee",
+}
 
 
 def losses(path: Path, evidence: Evidence) -> bool:
     """Draw what ideal-trained policies lose, a panel for each axis, a row for each task, a column for each dose.
 
-    A cell has the mean loss, and below it how many policies lose more than `FAILED`, where any does.
+    A cell has the mean loss, and below it how many policies lose more than `FAILED`, where any
+    does.
 
     Returns:
         Whether anything could be drawn.
@@ -41,10 +57,14 @@ def losses(path: Path, evidence: Evidence) -> bool:
                     continue
                 outcome, drawn = found.outcome, True
                 means[row, column] = outcome.loss.mean
-                text = f"{outcome.loss.mean:z.2f}" + (f"\n{outcome.failed:.0%} fail" if outcome.failed else "")
+                text = f"{outcome.loss.mean:z.2f}" + (
+                    f"\n{outcome.failed:.0%} fail" if outcome.failed else ""
+                )
                 dark = "white" if outcome.loss.mean > 0.45 else "0.15"
                 panel.text(column, row, text, ha="center", va="center", fontsize=6.5, color=dark)
-        shown = panel.imshow(np.clip(means, 0.0, 1.0), cmap="YlOrBr", vmin=0.0, vmax=1.0, aspect="auto")
+        shown = panel.imshow(
+            np.clip(means, 0.0, 1.0), cmap="YlOrBr", vmin=0.0, vmax=1.0, aspect="auto"
+        )
         panel.set_xticks(range(len(axis.doses) - 1), [f"{dose:g}" for dose in axis.doses[1:]])
         named = [f"{TITLES[task]}\n{size(task)}" for task in SECONDS]
         panel.set_yticks(range(len(SECONDS)), named if number % 3 == 0 else [], fontsize=8)
@@ -62,7 +82,12 @@ def insured(path: Path, evidence: Evidence) -> bool:
     """
     from matplotlib.figure import Figure
 
-    kinds = {"ideal": "ideal forces", "generic": "random actuators", "drawn": "drawn doses", "matched": "that dose"}
+    kinds = {
+        "ideal": "ideal forces",
+        "generic": "random actuators",
+        "drawn": "drawn doses",
+        "matched": "that dose",
+    }
     figure = Figure(figsize=(10.0, 5.2), layout="constrained")
     panels: Any = figure.subplots(2, 1, sharey=True)
     drawn = False
@@ -70,11 +95,22 @@ def insured(path: Path, evidence: Evidence) -> bool:
         for place, (name, axis) in enumerate(AXES.items()):
             trained = {"drawn": f"{name}, drawn", "matched": name}
             for number, (kind, label) in enumerate(kinds.items()):
-                found = evidence.outcome(task, trained.get(kind, kind), f"{name} {axis.trained[task]:g}")
+                found = evidence.outcome(
+                    task, trained.get(kind, kind), f"{name} {axis.trained[task]:g}"
+                )
                 if found is not None:
                     drawn = True
-                    dots(panel, place + 0.19 * (number - 1.5), 1.0 - found.lost, COLOURS[number], label)
-        named = [f"{thing} {dose_text(task, name, AXES[name].trained[task])}" for name, thing in THINGS.items()]
+                    dots(
+                        panel,
+                        place + 0.19 * (number - 1.5),
+                        1.0 - found.lost,
+                        COLOURS[number],
+                        label,
+                    )
+        named = [
+            f"{thing} {dose_text(task, name, AXES[name].trained[task])}"
+            for name, thing in THINGS.items()
+        ]
         panel.set_xticks(range(len(AXES)), named)
         panel.set(title=TITLES[task], ylabel="score [share of the span]")
         panel.grid(axis="y", color="0.9")
@@ -85,7 +121,9 @@ def insured(path: Path, evidence: Evidence) -> bool:
     return drawn
 
 
-def dots(panel: Any, at: float, scores: Sequence[float] | np.ndarray, colour: str, label: str) -> None:
+def dots(
+    panel: Any, at: float, scores: Sequence[float] | np.ndarray, colour: str, label: str
+) -> None:
     """Draw every policy's score as a dot, and a line at their mean; what is below the panel is drawn at its end."""
     clipped = np.sort(np.maximum(scores, _LOWEST))
     spread = np.linspace(-0.045, 0.045, len(clipped))
@@ -93,7 +131,9 @@ def dots(panel: Any, at: float, scores: Sequence[float] | np.ndarray, colour: st
     panel.plot([at - 0.06, at + 0.06], [np.mean(clipped)] * 2, color=colour, lw=1.5)
 
 
-def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Trial]]], title: str) -> None:
+def bars(
+    path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Trial]]], title: str
+) -> None:
     """Draw scores of trials in groups, every policy as a dot, and the mean with its 95 % interval.
 
     Args:
@@ -115,7 +155,9 @@ def bars(path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Tr
                 kind = labels.index(label)
                 colour, marker = COLOURS[kind % len(COLOURS)], MARKERS[kind % len(MARKERS)]
                 seen = np.maximum(values, _LOWEST)
-                axes.plot(np.full(len(seen), at + 0.06), seen, ".", color=colour, markersize=3, alpha=0.6)
+                axes.plot(
+                    np.full(len(seen), at + 0.06), seen, ".", color=colour, markersize=3, alpha=0.6
+                )
                 _bars(axes, np.array([at]), [bootstrap_mean(values)], colour, marker, label)
     axes.set_xticks(range(len(groups)), groups)
     axes.set(ylabel="score [share of the span]", title=title, xlim=(-0.5, len(groups) - 0.5))
@@ -138,7 +180,11 @@ def chart(path: Path, evidence: Evidence) -> bool:
     from matplotlib.patches import Patch
 
     lags, lacks = np.geomspace(0.05, 8.0, 41), np.linspace(0.0, 0.8, 33)
-    tasks = [task for task in SECONDS if all(evidence.loss(task, axis, 0.0) for axis in ("lag", "supply"))]
+    tasks = [
+        task
+        for task in SECONDS
+        if all(evidence.loss(task, axis, 0.0) for axis in ("lag", "supply"))
+    ]
     if not tasks:
         return False
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
@@ -149,7 +195,9 @@ def chart(path: Path, evidence: Evidence) -> bool:
         regions = np.array(
             [
                 [
-                    list(_REGIONS).index(decide(known(evidence, task, none | {"lag": lag, "supply": lack}, points)))
+                    list(_REGIONS).index(
+                        decide(known(evidence, task, none | {"lag": lag, "supply": lack}, points))
+                    )
                     for lag in lags
                 ]
                 for lack in lacks
@@ -157,19 +205,38 @@ def chart(path: Path, evidence: Evidence) -> bool:
         )
         seen.update(regions.flat)
         colours = ListedColormap(list(_REGIONS.values()))
-        panel.pcolormesh(lags, 1.0 - lacks, regions, cmap=colours, vmin=-0.5, vmax=len(_REGIONS) - 0.5, rasterized=True)
+        panel.pcolormesh(
+            lags,
+            1.0 - lacks,
+            regions,
+            cmap=colours,
+            vmin=-0.5,
+            vmax=len(_REGIONS) - 0.5,
+            rasterized=True,
+        )
         if task not in arms.TRAINED:
-            panel.contourf(lags, 1.0 - lacks, regions, levels=[0.5, 99], colors="none", hatches=["//"])
+            panel.contourf(
+                lags, 1.0 - lacks, regions, levels=[0.5, 99], colors="none", hatches=["//"]
+            )
         panel.set(title=TITLES[task], xscale="log")
         panel.set_xticks([0.1, 0.3, 1.0, 3.0], ["0.1", "0.3", "1", "3"])
         panel.minorticks_off()
     for panel in panels[3:]:
-        panel.set_xlabel("time constant of the loop, a third of\nits settling time to 5 % [policy steps]")
+        panel.set_xlabel(
+            "time constant of the loop, a third of\nits settling time to 5 % [policy steps]"
+        )
     for panel in panels[::3]:
         panel.set_ylabel("voltage there is [needed voltage]")
     shown = [one for number, one in enumerate(_REGIONS.items()) if number in seen]
     handles = [Patch(facecolor=colour, edgecolor="0.6", label=name) for name, colour in shown]
-    handles.append(Patch(facecolor="white", edgecolor="0.4", hatch="//", label="trained through whole motors at most"))
+    handles.append(
+        Patch(
+            facecolor="white",
+            edgecolor="0.4",
+            hatch="//",
+            label="trained through whole motors at most",
+        )
+    )
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize="small")
     save(figure, path)
     return True
@@ -179,7 +246,9 @@ def _values(scores: Scores, trial: Trial) -> np.ndarray:
     return np.array(list(scores.of(trial).values()))
 
 
-def _bars(axes: Any, places: np.ndarray, means: Sequence[Any], colour: str, marker: str, label: str) -> None:
+def _bars(
+    axes: Any, places: np.ndarray, means: Sequence[Any], colour: str, marker: str, label: str
+) -> None:
     """Means with their intervals; what is below the figure is drawn at its edge."""
     middle = np.maximum([one.mean for one in means], _LOWEST)
     low = np.maximum(middle - np.maximum([one.low for one in means], _LOWEST), 0.0)

@@ -10,7 +10,14 @@ from typing import Any
 import numpy as np
 
 from actuator_study import advised, arms, figures
-from actuator_study.questions import on_loop, on_motor, primary, secondary, through_loop, through_motor
+from actuator_study.questions import (
+    on_loop,
+    on_motor,
+    primary,
+    secondary,
+    through_loop,
+    through_motor,
+)
 from actuator_study.units import THINGS, dose_text, scale, short, size
 from codrl_mj.runs.files import write_json
 from codrl_mj.study.advice import BUY, IDEAL, RANDOMISE, THROUGH
@@ -45,7 +52,10 @@ def write(collected: Collected, out: Path) -> list[Path]:
     Returns:
         The files that were written.
     """
-    folder, scores = out / FOLDER, Scores(collected, FLOORS, [at_home(ideal(task)) for task in SECONDS])
+    folder, scores = (
+        out / FOLDER,
+        Scores(collected, FLOORS, [at_home(ideal(task)) for task in SECONDS]),
+    )
     first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
     tables = write_tables(folder, collected, scores, first, others)
     evidence = Evidence.read(*(path for study in STUDIES if (path := out / study / RUNS).is_file()))
@@ -69,7 +79,11 @@ def write(collected: Collected, out: Path) -> list[Path]:
 
 
 def write_tables(
-    folder: Path, collected: Collected, scores: Scores, first: Sequence[Verdict], others: Sequence[Verdict]
+    folder: Path,
+    collected: Collected,
+    scores: Scores,
+    first: Sequence[Verdict],
+    others: Sequence[Verdict],
 ) -> list[Path]:
     """Write a row for every policy and test, for every trial and for every question, and what the trainings took."""
     tables = {
@@ -86,7 +100,9 @@ def write_tables(
 def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
     """The figures by name, of which there is something to draw."""
     made = {"losses": figures.losses, "insured": figures.insured, "chart": figures.chart}
-    found = {name: path for name, draw in made.items() if draw(path := folder / f"{name}.svg", evidence)}
+    found = {
+        name: path for name, draw in made.items() if draw(path := folder / f"{name}.svg", evidence)
+    }
     found |= {name: folder / f"{name}.svg" for name in ("tune", "motors")}
     loops: dict[str, list[tuple[str, Trial]]] = {
         f"{TITLES[task]},\n{loop}": [
@@ -106,7 +122,10 @@ def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
             *(
                 [
                     ("ideal-trained, on the marginal motor", on_motor(home, "marginal")),
-                    ("trained through the marginal motor", on_motor(through_motor(task), "marginal")),
+                    (
+                        "trained through the marginal motor",
+                        on_motor(through_motor(task), "marginal"),
+                    ),
                 ]
                 if task in arms.MARGINAL
                 else []
@@ -126,13 +145,20 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
     for task in SECONDS:
         rows.append([f"{TITLES[task]}: {size(task)}"])
         for name, axis in AXES.items():
-            known = [(dose, one.outcome) for dose in axis.doses[1:] if (one := evidence.loss(task, name, dose))]
+            known = [
+                (dose, one.outcome)
+                for dose in axis.doses[1:]
+                if (one := evidence.loss(task, name, dose))
+            ]
             borne = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].spared, known)]
             hurt = next(((dose, one) for dose, one in known if one.hurt), None)
             factor, of = scale(task, name)
             text = f"≤{short(factor * borne[-1] if borne else 0.0)}"
             if hurt is not None:
-                text += f", ≥{short(factor * hurt[0])} {of} ({round(hurt[1].failed * len(hurt[1].lost))})"
+                text += (
+                    f", ≥{short(factor * hurt[0])} {of}"
+                    f" ({round(hurt[1].failed * len(hurt[1].lost))})"
+                )
             else:
                 text += f" {of}"
             rows[-1].append(text if known else "–")
@@ -177,7 +203,9 @@ def _motors(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
         for test, (name, _) in advised.tested(task).items():
             if test.endswith("motor"):
                 told = advised.measured(evidence, task, test)
-                cells = [_lost(told[kind].most) if kind in told else "–" for kind in (IDEAL, THROUGH)]
+                cells = [
+                    _lost(told[kind].most) if kind in told else "–" for kind in (IDEAL, THROUGH)
+                ]
                 rows.append([TITLES[task], name, test.removesuffix(" motor"), *cells])
     header = ["task", "motor, gear", "", "trained on ideal forces", "trained through it"]
     return f"""## Off-the-shelf motors
@@ -195,24 +223,43 @@ def _lost(outcome: Outcome | None) -> str:
         return "–"
     mean, low, high = outcome.loss
     count = len(outcome.lost)
-    failed = f"{round(outcome.failed * count)}" if count == 20 else f"{round(outcome.failed * count)} of {count}"
-    return f"{mean:z.2f} [{low:z.2f}, {high:z.2f}]; {failed}; {100 * outcome.success_lost.mean:z.0f} %"
+    failed = (
+        f"{round(outcome.failed * count)}"
+        if count == 20
+        else f"{round(outcome.failed * count)} of {count}"
+    )
+    return (
+        f"{mean:z.2f} [{low:z.2f}, {high:z.2f}]; {failed}; {100 * outcome.success_lost.mean:z.0f} %"
+    )
 
 
-def _advised(evidence: Evidence, said: Sequence[Mapping[str, Any]], drawn: Mapping[str, Path]) -> str:
+def _advised(
+    evidence: Evidence, said: Sequence[Mapping[str, Any]], drawn: Mapping[str, Path]
+) -> str:
     """What `codrl-mj advise` says of every actuator that was tested, and how far off it is."""
     if not said:
         return ""
     rows = []
     for one in said:
         if one["judged"] != "right":
-            numbers = f"{'≥ ' * one['beyond']}{one['predicted_mean']:z.2f}", f"{one['measured_mean']:z.2f}"
-            rows.append([TITLES[one["task"]], one["actuator"], *numbers, one["said"], one["measured"]])
+            numbers = (
+                f"{'≥ ' * one['beyond']}{one['predicted_mean']:z.2f}",
+                f"{one['measured_mean']:z.2f}",
+            )
+            rows.append(
+                [TITLES[one["task"]], one["actuator"], *numbers, one["said"], one["measured"]]
+            )
     errors = [abs(one["predicted_mean"] - one["measured_mean"]) for one in said]
-    large = [error for error, one in zip(errors, said, strict=True) if one["measured_mean"] > MARGIN] or [0.0]
+    large = [
+        error for error, one in zip(errors, said, strict=True) if one["measured_mean"] > MARGIN
+    ] or [0.0]
     told = [one["judged"] for one in said]
     right = collections.Counter(one["said"] for one in said if one["judged"] == "right")
-    never = [f"*{verdict}*" for verdict in (RANDOMISE, THROUGH, BUY) if verdict not in {one["said"] for one in said}]
+    never = [
+        f"*{verdict}*"
+        for verdict in (RANDOMISE, THROUGH, BUY)
+        if verdict not in {one["said"] for one in said}
+    ]
     left = advised.left_out(evidence)
     header = ["task", "actuator", "predicted", "measured", "advise says", "measurement says"]
     text = f"""Of {len(told)} actuators that none of the doses was taken from, `codrl-mj advise` ([how](../advise.md))
@@ -237,14 +284,29 @@ def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
     rows = []
     for verdict in verdicts:
         says = verdict.question.statement.replace(_EACH, " *")
-        if verdict.outcome == "open" and (seeds := verdict.seeds_to_close(len(verdicts))) is not None:
+        if (
+            verdict.outcome == "open"
+            and (seeds := verdict.seeds_to_close(len(verdicts))) is not None
+        ):
             says += f" (about {seeds} seeds would tell)"
         tested, wanted = verdict.strata
         if tested < wanted:
             says += f" ({tested} of {wanted} comparisons have runs)"
-        rows.append([verdict.question.name, verdict.outcome, effect_text(verdict), p_text(verdict.corrected), says])
+        rows.append(
+            [
+                verdict.question.name,
+                verdict.outcome,
+                effect_text(verdict),
+                p_text(verdict.corrected),
+                says,
+            ]
+        )
     header = ["", "holds", "effect [95 %]", "corrected p", "says"]
-    wrong = [one for one in others if " 25 % over nominal" in one.question.statement.replace("-", "").replace("+", "")]
+    wrong = [
+        one
+        for one in others
+        if " 25 % over nominal" in one.question.statement.replace("-", "").replace("+", "")
+    ]
     sizes = [abs(one.effect.mean) for one in wrong if not np.isnan(one.effect.mean)] or [0.0]
     return f"""## The twelve hypotheses
 
@@ -282,7 +344,9 @@ def decided_table(verdicts: Sequence[Verdict], titles: Mapping[str, str]) -> str
         decided = [verdict for verdict in mine if verdict.outcome != "open"]
         beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
         rows.append([title, *map(str, (len(mine), len(decided), beyond))])
-    return markdown_table(["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"], rows, numbers=3)
+    return markdown_table(
+        ["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"], rows, numbers=3
+    )
 
 
 def _secondary(verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
@@ -307,8 +371,11 @@ def _missing(collected: Collected) -> str:
             [
                 "## What is missing",
                 "",
-                f"{collected.totals.missing} trainings and tests, of which "
-                f"{len(collected.failures)} failed. `python scripts/study_actuators.py --dry-run` lists them.",
+                (
+                    f"{collected.totals.missing} trainings and tests, of which"
+                    f" {len(collected.failures)} failed. `python scripts/study_actuators.py"
+                    " --dry-run` lists them."
+                ),
                 *shown,
             ]
         )
@@ -320,8 +387,12 @@ def _method(collected: Collected, scores: Scores) -> str:
     grid, totals = collected.grid, collected.totals
     done, wanted = totals.trainings, len(grid.cells)
     tested, tests = sum(map(len, collected.evaluations.values())), len(grid.deployments)
-    codes = ", ".join(f"`{code}` ({count})" for code, count in sorted(totals.codes.items())) or "none"
-    known = [f"{task} {FLOORS[task]:g} to {ceiling:.1f}" for task, ceiling in scores.ceilings.items()]
+    codes = (
+        ", ".join(f"`{code}` ({count})" for code, count in sorted(totals.codes.items())) or "none"
+    )
+    known = [
+        f"{task} {FLOORS[task]:g} to {ceiling:.1f}" for task, ceiling in scores.ceilings.items()
+    ]
     runs = max(len(grid.seeds_of(grid.arms[0])), 2)
     about = f"""By [the plan](plan.md): {done} of {wanted} trainings ({totals.seconds / 3600:.1f} hours of one core) and
 {tested} of {tests} tests; code with its runs: {codes}. `scripts/study_actuators.py` ([how](../studies.md)) writes this
@@ -335,5 +406,7 @@ count once on every task. Intervals are by Student's t, p of permutation tests, 
 with a margin of {MARGIN:g}; primary ones are corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds
 a difference of {detectable(runs, LEVEL / 12):.2f} standard deviations is found with a chance of 80 % at the strictest
 level."""
-    wrapped = (textwrap.fill(" ".join(each.split()), 120, break_long_words=False) for each in (about, text))
+    wrapped = (
+        textwrap.fill(" ".join(each.split()), 120, break_long_words=False) for each in (about, text)
+    )
     return "## How it was measured\n\n" + "\n\n".join(wrapped) + "\n"

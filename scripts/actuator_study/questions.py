@@ -6,7 +6,17 @@ from collections.abc import Iterable
 from typing import Any
 
 from actuator_study import arms
-from actuator_study.arms import DRAWN, GOOD, LOOPED, MARGINAL, TRAINED, dosed, matched, otherwise, undosed
+from actuator_study.arms import (
+    DRAWN,
+    GOOD,
+    LOOPED,
+    MARGINAL,
+    TRAINED,
+    dosed,
+    matched,
+    otherwise,
+    undosed,
+)
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.doses import AXES, SECONDS, arm, at_home, generic, ideal, posed
@@ -21,7 +31,10 @@ def _trained_dose(arm: Arm, axis: str) -> Trial:
 
 def _contrasts(axis: str, one: Any, other: Any) -> tuple[Contrast, ...]:
     """At the axis' trained dose, on every task: arms made by functions of the task."""
-    return tuple(Contrast(_trained_dose(one(task), axis), _trained_dose(other(task), axis)) for task in TRAINED)
+    return tuple(
+        Contrast(_trained_dose(one(task), axis), _trained_dose(other(task), axis))
+        for task in TRAINED
+    )
 
 
 @functools.cache
@@ -31,7 +44,9 @@ def _generic(task: str) -> Arm:
 
 def on_loop(arm: Arm, loop: str) -> Trial:
     """Policies tested on the paper's motor under a loop."""
-    return Trial(arm, loop, posed(arm.task, arms.designed(arm.task) if loop == "designed" else loop))
+    return Trial(
+        arm, loop, posed(arm.task, arms.designed(arm.task) if loop == "designed" else loop)
+    )
 
 
 def through_loop(task: str, loop: str) -> Arm:
@@ -56,17 +71,24 @@ WRONG: dict[str, tuple[str, float]] = {
     for name in ("resistance", "inductance")
     for factor in (0.5, 0.75, 0.9, 1.1, 1.25, 1.5)
 }
-"""What of the motor is otherwise than in training, by what factor. A torque constant that the loop does not know of is
-an axis of its own, `weakness`."""
+"""What of the motor is otherwise than in training, by what factor. A torque constant that the loop
+does not know of is an axis of its own, `weakness`.
+"""
 
 
 def wrong_motors(task: str) -> dict[str, EnvConfig]:
     """The actuator `weaker`, otherwise than trained through, by name: `WRONG`, and shares of the largest force."""
-    nominal, step, force = posed(task, "weaker"), find_task(task).step_duration, find_task(task).max_force
+    nominal, step, force = (
+        posed(task, "weaker"),
+        find_task(task).step_duration,
+        find_task(task).max_force,
+    )
     motor = nominal.actuator.motor
 
     def pushed(share: float) -> EnvConfig:
-        pulses = Disturbances(pulse_force=share * force, pulse_duration=step, pulse_interval=10 * step)
+        pulses = Disturbances(
+            pulse_force=share * force, pulse_duration=step, pulse_interval=10 * step
+        )
         return dataclasses.replace(nominal, disturbances=pulses)
 
     def rubbed(share: float) -> EnvConfig:
@@ -101,7 +123,9 @@ def identified(task: str) -> Arm:
 def _mean_wrong(task: str, names: Iterable[str]) -> list[Contrast]:
     nominal = through_loop(task, "weaker")
     motors = wrong_motors(task)
-    return [Contrast(Trial(nominal, name, motors[name]), on_loop(nominal, "weaker")) for name in names]
+    return [
+        Contrast(Trial(nominal, name, motors[name]), on_loop(nominal, "weaker")) for name in names
+    ]
 
 
 @functools.cache
@@ -114,8 +138,8 @@ def primary() -> list[Question]:
             Question(
                 f"P{number}",
                 "matters",
-                f"{AXES[axis].title}: policies trained through it score higher on it than policies trained on ideal "
-                "forces",
+                f"{AXES[axis].title}: policies trained through it score higher on it than policies"
+                " trained on ideal forces",
                 _contrasts(axis, lambda task, axis=axis: matched(task, axis), ideal),
             )
             for number, axis in numbered
@@ -123,8 +147,8 @@ def primary() -> list[Question]:
         Question(
             "P7",
             "matters",
-            "Over all six: training through the very actuator scores higher than generic robustification as the plan "
-            "has it",
+            "Over all six: training through the very actuator scores higher than generic"
+            " robustification as the plan has it",
             tuple(
                 pair
                 for axis in AXES
@@ -134,7 +158,8 @@ def primary() -> list[Question]:
         Question(
             "P8",
             "matters",
-            "Over four: policies trained on drawn doses score as high as those trained on the very dose",
+            "Over four: policies trained on drawn doses score as high as those trained on the very"
+            " dose",
             tuple(
                 pair
                 for axis in DRAWN
@@ -149,17 +174,21 @@ def primary() -> list[Question]:
         Question(
             "P9",
             "tune",
-            "A designed loop under ideal-trained policies scores higher than a detuned one under policies that were "
-            "trained through it",
+            "A designed loop under ideal-trained policies scores higher than a detuned one under"
+            " policies that were trained through it",
             tuple(
-                Contrast(on_loop(ideal(task), "designed"), on_loop(through_loop(task, "weaker"), "weaker"))
+                Contrast(
+                    on_loop(ideal(task), "designed"),
+                    on_loop(through_loop(task, "weaker"), "weaker"),
+                )
                 for task in LOOPED
             ),
         ),
         Question(
             "P10",
             "wrong",
-            "Policies trained through a motor score as high where its resistance or inductance is 25 % off",
+            "Policies trained through a motor score as high where its resistance or inductance is"
+            " 25 % off",
             tuple(pair for task in LOOPED for pair in _mean_wrong(task, quarter)),
             "equivalent",
         ),
@@ -167,15 +196,20 @@ def primary() -> list[Question]:
             "P11",
             "motors",
             "On a good motor that exists, ideal-trained policies score as high as on ideal forces",
-            tuple(Contrast(on_motor(ideal(task), "good"), at_home(ideal(task))) for task in SECONDS),
+            tuple(
+                Contrast(on_motor(ideal(task), "good"), at_home(ideal(task))) for task in SECONDS
+            ),
             "equivalent",
         ),
         Question(
             "P12",
             "motors",
-            "On a marginal motor that exists, policies trained through it score higher than ideal-trained ones",
+            "On a marginal motor that exists, policies trained through it score higher than"
+            " ideal-trained ones",
             tuple(
-                Contrast(on_motor(through_motor(task), "marginal"), on_motor(ideal(task), "marginal"))
+                Contrast(
+                    on_motor(through_motor(task), "marginal"), on_motor(ideal(task), "marginal")
+                )
                 for task in MARGINAL
             ),
         ),
@@ -199,32 +233,53 @@ def secondary() -> list[Question]:
                 pair = _trained_dose(one, axis), _trained_dose(other, axis)
                 found.append(("matters", f"{pair[0].name}, over {other.name}", *pair))
         for axis in DRAWN:
-            pair = _trained_dose(arms.drawn(task, axis), axis), _trained_dose(matched(task, axis), axis)
+            pair = (
+                _trained_dose(arms.drawn(task, axis), axis),
+                _trained_dose(matched(task, axis), axis),
+            )
             found.append(("matters", f"{task}, {axis}: drawn over matched", *pair))
     for task in LOOPED:
         home, nominal, open_ = ideal(task), through_loop(task, "weaker"), identified(task)
         for loop in ("weaker", "paper", "designed"):
             says = f"{task}, {loop} loop: trained through it over ideal-trained"
-            found.append(("tune", says, on_loop(through_loop(task, loop), loop), on_loop(home, loop)))
+            found.append(
+                ("tune", says, on_loop(through_loop(task, loop), loop), on_loop(home, loop))
+            )
         says = f"{task}: designed loop over the paper's, ideal-trained"
         found.append(("tune", says, on_loop(home, "designed"), on_loop(home, "paper")))
         for name, env in wrong_motors(task).items():
             there = Trial(nominal, name, env)
-            found.append(("wrong", f"{task}, {name} over nominal", there, on_loop(nominal, "weaker")))
-            found.append(("wrong", f"{task}, {name}: drawn over nominal", Trial(open_, name, env), there))
+            found.append(
+                ("wrong", f"{task}, {name} over nominal", there, on_loop(nominal, "weaker"))
+            )
+            found.append(
+                ("wrong", f"{task}, {name}: drawn over nominal", Trial(open_, name, env), there)
+            )
     for task in SECONDS:
         home = ideal(task)
-        found.append(("motors", f"{task}: good motor over ideal", on_motor(home, "good"), at_home(home)))
+        found.append(
+            ("motors", f"{task}: good motor over ideal", on_motor(home, "good"), at_home(home))
+        )
     for task in MARGINAL:
         there = on_motor(ideal(task), "marginal")
         found.append(("motors", f"{task}: marginal motor over ideal", there, at_home(ideal(task))))
         says = f"{task}, marginal motor: trained through it over ideal-trained"
         found.append(("motors", says, on_motor(through_motor(task), "marginal"), there))
-    told = [through_motor(task, "current and reference observed", observe_actuator=True) for task in TRAINED]
+    told = [
+        through_motor(task, "current and reference observed", observe_actuator=True)
+        for task in TRAINED
+    ]
     # on Pendulum the marginal drive's current limit would bind the torque arm alone
     for arm_told in (*told, through_motor("furuta", "voltage", action="voltage")):
         plain = on_motor(through_motor(arm_told.task), "marginal")
-        found.append(("command", f"{arm_told.name}, over torque and no more", on_motor(arm_told, "marginal"), plain))
+        found.append(
+            (
+                "command",
+                f"{arm_told.name}, over torque and no more",
+                on_motor(arm_told, "marginal"),
+                plain,
+            )
+        )
     return [
         Question(f"S{number}", section, says, (Contrast(one, other),))
         for number, (section, says, one, other) in enumerate(found, start=1)

@@ -18,8 +18,9 @@ from codrl_mj.study.trials import Grid
 class ActuatorStudy(Program):
     """Run the study of what an actuator costs, or go on with it, and write its page: docs/studies.md.
 
-    What is finished is not computed again, so the same command resumes a study, adds seeds to it, and writes its page
-    anew. Example: python scripts/study_actuators.py --dry-run, or with --tasks pendulum --seeds 3 --jobs 2
+    What is finished is not computed again, so the same command resumes a study, adds seeds to it,
+    and writes its page anew. Example: python scripts/study_actuators.py --dry-run, or with --tasks
+    pendulum --seeds 3 --jobs 2
     """
 
     root: Path = Path("runs/actuators")
@@ -45,9 +46,15 @@ class ActuatorStudy(Program):
         chosen = [trial for trial in every.values() if trial.arm.task in self.tasks]
         if self.total_steps is not None:
             for place, trial in enumerate(chosen):
-                short = dataclasses.replace(trial.arm.config, total_steps=self.total_steps, total_episodes=None)
-                chosen[place] = dataclasses.replace(trial, arm=dataclasses.replace(trial.arm, config=short))
-        return Grid(self.root, tuple(chosen), lambda _: range(self.seeds), self.episodes, self.out / FOLDER)
+                short = dataclasses.replace(
+                    trial.arm.config, total_steps=self.total_steps, total_episodes=None
+                )
+                chosen[place] = dataclasses.replace(
+                    trial, arm=dataclasses.replace(trial.arm, config=short)
+                )
+        return Grid(
+            self.root, tuple(chosen), lambda _: range(self.seeds), self.episodes, self.out / FOLDER
+        )
 
     def write(self) -> tuple[Iterable[Path], Mapping[str, str]]:
         """The page of all results that there are, and what failed."""

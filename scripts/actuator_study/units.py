@@ -24,7 +24,9 @@ def scale(task: str, axis: str) -> tuple[float, str]:
     """What a dose is to be multiplied by, and its unit then."""
     if axis in ("lag", "delay"):
         return 1000.0 * find_task(task).step_duration, "ms"
-    return (100.0, "%") if axis in ("weakness", "supply") else (find_task(task).max_force, unit(task))
+    return (
+        (100.0, "%") if axis in ("weakness", "supply") else (find_task(task).max_force, unit(task))
+    )
 
 
 def short(value: float) -> str:
@@ -40,4 +42,6 @@ def dose_text(task: str, axis: str, dose: float) -> str:
 
 def size(task: str) -> str:
     """What doses of a task are shares of: its policy's step and its largest force."""
-    return f"{1000 * find_task(task).step_duration:g} ms, {find_task(task).max_force:g} {unit(task)}"
+    return (
+        f"{1000 * find_task(task).step_duration:g} ms, {find_task(task).max_force:g} {unit(task)}"
+    )

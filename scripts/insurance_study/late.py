@@ -1,7 +1,7 @@
 """An actuator of the study's own: a lag that remembers commands for four steps of the policy, and can show them.
 
-The package's `Lag` remembers eight integration steps, which is less than the delays that are drawn here. What it does
-is the same: a test holds one against the other.
+The package's `Lag` remembers eight integration steps, which is less than the delays that are drawn
+here. What it does is the same: a test holds one against the other.
 """
 
 import dataclasses
@@ -36,7 +36,9 @@ class Signals(NamedTuple):
     command_4: float
 
 
-def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+def advance(
+    parameters: Any, timestep: float, state: State, inputs: Inputs
+) -> tuple[State, float, Signals]:
     """As `codrl_mj.actuators.lag.advance`, of commands that are held for `held` steps."""
     newest, since = inputs.desired_torque, state.since
     commands = (newest, state.c1, state.c2, state.c3, state.c4)
@@ -48,15 +50,26 @@ def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> t
     near = min(max(math.ceil((whole - since) / parameters.held - 1e-9), 0), 4)
     far = min(max(math.ceil((whole + 1.0 - since) / parameters.held - 1e-9), 0), 4)
     arrived = parameters.gain * (commands[near] + fraction * (commands[far] - commands[near]))
-    decay = math.exp(-timestep / parameters.time_constant) if parameters.time_constant > 0.0 else 0.0
+    decay = (
+        math.exp(-timestep / parameters.time_constant) if parameters.time_constant > 0.0 else 0.0
+    )
     torque = arrived + (state.torque - arrived) * decay
     later = since + 1.0 if since + 1.5 < parameters.held else 0.0
     one = parameters.largest
     shown = Signals(commands[0] / one, commands[1] / one, commands[2] / one, commands[3] / one)
-    return State(torque, later, commands[0], commands[1], commands[2], commands[3], commands[4]), torque, shown
+    return (
+        State(torque, later, commands[0], commands[1], commands[2], commands[3], commands[4]),
+        torque,
+        shown,
+    )
 
 
-def observe(parameters: Any, timestep: float, signals: Signals, inputs: Inputs) -> tuple[float, float, float, float]:  # noqa: ARG001 - a family's
+def observe(
+    parameters: Any,  # noqa: ARG001
+    timestep: float,  # noqa: ARG001
+    signals: Signals,
+    inputs: Inputs,  # noqa: ARG001
+) -> tuple[float, float, float, float]:
     """The last commands: what a policy could have kept for itself."""
     return signals.command_1, signals.command_2, signals.command_3, signals.command_4
 
@@ -93,4 +106,6 @@ class Late(ActuatorModel):
             ValueError: the delay is more than `LONGEST` steps of the policy.
         """
         if self.delay > LONGEST * self.held * timestep * (1 + 1e-9):
-            raise ValueError(f"Late.delay = {self.delay:g}: must be <= {LONGEST * self.held * timestep:g} s")
+            raise ValueError(
+                f"Late.delay = {self.delay:g}: must be <= {LONGEST * self.held * timestep:g} s"
+            )

@@ -26,7 +26,11 @@ def learning_rows(collected: Collected, published: Path) -> list[dict[str, Any]]
             found.append(dict(known[folder.name]))
         elif (folder / RESULT).is_file():
             task, _, trained = name.partition(": ")
-            found.append({"task": task, "trained": trained, "seed": seed} | _tenths(folder) | {"run": folder.name})
+            found.append(
+                {"task": task, "trained": trained, "seed": seed}
+                | _tenths(folder)
+                | {"run": folder.name}
+            )
     return found
 
 
@@ -37,11 +41,16 @@ def _tenths(folder: Path) -> dict[str, Any]:
     ends = np.array([float(row["steps"]) for row in episodes])
     returns = np.array([float(row["return"]) for row in episodes])
     tenth = np.minimum(np.ceil(10.0 * ends / steps), 10.0)
-    means = [float(returns[tenth == one].mean()) if (tenth == one).any() else None for one in range(1, 11)]
+    means = [
+        float(returns[tenth == one].mean()) if (tenth == one).any() else None
+        for one in range(1, 11)
+    ]
     return {"steps": steps} | dict(zip(TENTHS, means, strict=True))
 
 
-def still_rising(rows: Sequence[Mapping[str, Any]], spans: Mapping[str, float], margin: float) -> tuple[list[str], int]:
+def still_rising(
+    rows: Sequence[Mapping[str, Any]], spans: Mapping[str, float], margin: float
+) -> tuple[list[str], int]:
     """The arms whose mean return of the last tenth is above that of the eighth by a margin, in shares of spans.
 
     Returns:
@@ -49,7 +58,12 @@ def still_rising(rows: Sequence[Mapping[str, Any]], spans: Mapping[str, float], 
     """
     arms: dict[str, list[float]] = {}
     for row in rows:
-        last, before = (float(row[TENTHS[at]]) if row[TENTHS[at]] not in (None, "") else math.nan for at in (9, 7))
+        last, before = (
+            float(row[TENTHS[at]]) if row[TENTHS[at]] not in (None, "") else math.nan
+            for at in (9, 7)
+        )
         if row["task"] in spans and not math.isnan(last - before):
-            arms.setdefault(f"{row['task']}: {row['trained']}", []).append((last - before) / spans[row["task"]])
+            arms.setdefault(f"{row['task']}: {row['trained']}", []).append(
+                (last - before) / spans[row["task"]]
+            )
     return [name for name, rises in arms.items() if float(np.mean(rises)) > margin], len(arms)

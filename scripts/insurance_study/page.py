@@ -19,12 +19,31 @@ from actuator_study.page import (
 )
 from actuator_study.units import THINGS, dose_text
 from codrl_mj.study.doses import AXES, FLOORS, at_home, ideal
-from codrl_mj.study.pages import COLOURS, TITLES, conclusions, legend, markdown_table, save, write_csv, write_page
+from codrl_mj.study.pages import (
+    COLOURS,
+    TITLES,
+    conclusions,
+    legend,
+    markdown_table,
+    save,
+    write_csv,
+    write_page,
+)
 from codrl_mj.study.questions import MARGIN, Scores, Verdict, judge
 from codrl_mj.study.trials import FAILED, RUNS, Collected, Trial
 from codrl_mj.tasks import find_task
 from insurance_study.learning import LEARNING, learning_rows, still_rising
-from insurance_study.questions import DOSES, KINDS, REMEMBERED, TASKS, home, primary, reach, secondary, under
+from insurance_study.questions import (
+    DOSES,
+    KINDS,
+    REMEMBERED,
+    TASKS,
+    home,
+    primary,
+    reach,
+    secondary,
+    under,
+)
 
 PAGE, FOLDER, FIGURE = "insurance.md", "insurance", "insured.svg"
 """The page, the folder beside it with its figure and tables, and the figure."""
@@ -64,7 +83,11 @@ class Found(NamedTuple):
     @property
     def text(self) -> str:
         """Mean, median, how many fail, success."""
-        return self._told(f", {np.median(self.scores):z.2f}", f" of {self.scores.size}") if self.scores.size else "–"
+        return (
+            self._told(f", {np.median(self.scores):z.2f}", f" of {self.scores.size}")
+            if self.scores.size
+            else "–"
+        )
 
     @property
     def short(self) -> str:
@@ -92,7 +115,10 @@ def write(collected: Collected, out: Path) -> list[Path]:
     Returns:
         The files that were written.
     """
-    folder, scores = out / FOLDER, Scores(collected, FLOORS, [at_home(ideal(task)) for task in TASKS])
+    folder, scores = (
+        out / FOLDER,
+        Scores(collected, FLOORS, [at_home(ideal(task)) for task in TASKS]),
+    )
     first = judge(scores, primary(), primary=True, least=PLANNED)
     others = judge(scores, secondary(), least=PLANNED)
     tables = write_tables(folder, collected, scores, first, others)
@@ -120,15 +146,24 @@ def _things(collected: Collected, scores: Scores) -> str:
     for task in TASKS:
         rows = []
         for axis, thing in THINGS.items():
-            kinds = {kind: KINDS[kind](task, axis) for kind in _SHOWN if axis in _AXES.get(kind, AXES)}
-            there = {kind: found(collected, scores, [under(trained, axis)]) for kind, trained in kinds.items()}
+            kinds = {
+                kind: KINDS[kind](task, axis) for kind in _SHOWN if axis in _AXES.get(kind, AXES)
+            }
+            there = {
+                kind: found(collected, scores, [under(trained, axis)])
+                for kind, trained in kinds.items()
+            }
             means = {kind: np.mean(one.scores) for kind, one in there.items() if one.scores.size}
             far = {"lag": "", "delay": "", "weakness": "±"}  # what random actuators draw
-            drawn_to = f" ({far[axis]}{dose_text(task, axis, reach(task, axis))})" if axis in far else ""
+            drawn_to = (
+                f" ({far[axis]}{dose_text(task, axis, reach(task, axis))})" if axis in far else ""
+            )
             cells = [f"{thing} {dose_text(task, axis, DOSES[task][axis])}{drawn_to}"]
             for kind in _SHOWN:
                 text = there[kind].short.replace(" ", "\u00a0") if kind in there else "–"
-                cells.append(f"**{text}**" if kind in means and means[kind] == max(means.values()) else text)
+                cells.append(
+                    f"**{text}**" if kind in means and means[kind] == max(means.values()) else text
+                )
             rows.append(cells)
         title = f"{TITLES[task]}, a step of {1000 * find_task(task).step_duration:g} ms"
         tables.append(markdown_table([title, *_SHOWN.values()], rows))
@@ -157,7 +192,10 @@ def _kinds(collected: Collected, scores: Scores) -> str:
             cells.append(f"{np.mean(lost):z.2f}" if lost.size else "–")
             cells.append(found(collected, scores, there).text)
         rows.append(cells)
-    header = ["trained on", *(text for task in TASKS for text in (f"{TITLES[task]}: ideal", "six doses"))]
+    header = [
+        "trained on",
+        *(text for task in TASKS for text in (f"{TITLES[task]}: ideal", "six doses")),
+    ]
     return f"""## Every kind of training, on the mean
 
 Mean score on ideal forces. Then on the six doses above, or those of them that are named: mean, median; how many tests
@@ -172,15 +210,30 @@ def draw(path: Path, scores: Scores) -> None:
 
     figure = Figure(figsize=(11.0, 8.4), layout="constrained")
     panels: Any = figure.subplots(len(TASKS), 1, sharey=True)
-    shown = {"ideal": 0, "random": 1, "drawn": 2, "matched": 3, "remembering": 4, "pushes": 5}  # colours of the kinds
+    shown = {
+        "ideal": 0,
+        "random": 1,
+        "drawn": 2,
+        "matched": 3,
+        "remembering": 4,
+        "pushes": 5,
+    }  # colours of the kinds
     for panel, task in zip(panels, TASKS, strict=True):
         for place, axis in enumerate(AXES):
             for number, kind in enumerate(kind for kind in SAYS if kind in shown):
                 if axis in _AXES.get(kind, AXES):
                     values = list(scores.of(under(KINDS[kind](task, axis), axis)).values())
                     if values:
-                        dots(panel, place + 0.14 * (number - 2.5), values, COLOURS[shown[kind]], SAYS[kind])
-        doses = [f"{thing} {dose_text(task, name, DOSES[task][name])}" for name, thing in THINGS.items()]
+                        dots(
+                            panel,
+                            place + 0.14 * (number - 2.5),
+                            values,
+                            COLOURS[shown[kind]],
+                            SAYS[kind],
+                        )
+        doses = [
+            f"{thing} {dose_text(task, name, DOSES[task][name])}" for name, thing in THINGS.items()
+        ]
         panel.set_xticks(range(len(AXES)), doses)
         panel.set(title=TITLES[task], ylabel="score [share of the span]")
         panel.grid(axis="y", color="0.9")
@@ -196,7 +249,12 @@ def _verdicts(verdicts: Sequence[Verdict], scores: Scores) -> str:
         tested, wanted = verdict.strata
         if tested < wanted:
             says += f" ({tested} of {wanted} comparisons have runs)"
-        judged = [verdict.outcome, effect_text(verdict), _by_task(verdict, scores), p_text(verdict.corrected)]
+        judged = [
+            verdict.outcome,
+            effect_text(verdict),
+            _by_task(verdict, scores),
+            p_text(verdict.corrected),
+        ]
         rows.append([verdict.question.name, *judged, str(min(verdict.runs)), says])
     header = ["", "holds", "effect [95 %]", "by task", "corrected p", "policies", "says"]
     return f"""## The ten hypotheses
@@ -213,9 +271,15 @@ def _by_task(verdict: Verdict, scores: Scores) -> str:
     """The mean effect on each task, of the contrasts that have runs."""
     texts = []
     for task in TASKS:
-        pairs = [pair for pair in verdict.question.contrasts if pair.one.arm.task == task and scores.stratum([pair])]
+        pairs = [
+            pair
+            for pair in verdict.question.contrasts
+            if pair.one.arm.task == task and scores.stratum([pair])
+        ]
         stratum = scores.stratum(pairs) if pairs else None
-        texts.append("–" if stratum is None else f"{np.mean(stratum.one) - np.mean(stratum.other):+.2f}")
+        texts.append(
+            "–" if stratum is None else f"{np.mean(stratum.one) - np.mean(stratum.other):+.2f}"
+        )
     return ", ".join(texts)
 
 
@@ -239,4 +303,8 @@ failures, [every comparison]({FOLDER}/{HYPOTHESES}), and [what was returned in t
 training]({FOLDER}/{LEARNING}). Of {count} kinds of training {len(rising)} had not levelled off
 ({"; ".join(rising) or "none"}): in their last tenth they return more than in the eighth, on the mean by more than
 {MARGIN:g} of the span."""
-    return "## How it was measured\n\n" + textwrap.fill(" ".join(text.split()), 120, break_long_words=False) + "\n"
+    return (
+        "## How it was measured\n\n"
+        + textwrap.fill(" ".join(text.split()), 120, break_long_words=False)
+        + "\n"
+    )

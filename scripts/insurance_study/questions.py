@@ -18,8 +18,9 @@ TASKS = ("pendulum", "furuta", "acrobot")
 DOSES: Mapping[str, Mapping[str, float]] = {
     task: {axis: one.trained[task] for axis, one in AXES.items()} for task in TASKS
 }
-"""Task -> axis -> the dose that is trained through and tested: on Acrobot the smallest that surely hurts ideal-trained
-policies, or, where none does, the largest."""
+"""Task -> axis -> the dose that is trained through and tested: on Acrobot the smallest that surely
+hurts ideal-trained policies, or, where none does, the largest.
+"""
 HARMLESS: Mapping[str, Mapping[str, float]] = {
     "pendulum": {"lag": 0.5, "weakness": 0.0, "delay": 0.5},
     "furuta": {"lag": 0.25, "weakness": 0.1, "delay": 0.0},
@@ -38,11 +39,17 @@ def reach(task: str, axis: str) -> float:
 def late(task: str, **fields: float) -> Late:
     """The actuator of the random and of the remembering arms; without fields it is ideal."""
     definition = find_task(task)
-    return Late(held=round(definition.step_duration / timestep(task)), largest=definition.max_force, **fields)
+    return Late(
+        held=round(definition.step_duration / timestep(task)),
+        largest=definition.max_force,
+        **fields,
+    )
 
 
 @functools.cache
-def generic(task: str, share: float = 1.0, named: str = "random", pushed: bool = True, late_too: bool = True) -> Arm:
+def generic(
+    task: str, share: float = 1.0, named: str = "random", pushed: bool = True, late_too: bool = True
+) -> Arm:
     """Trained on random strength, lag and delay, and random pushes: on a share of what the rule says."""
     step, force = find_task(task).step_duration, find_task(task).max_force
     most = {axis: share * reach(task, axis) for axis in ("lag", "weakness", "delay")}
@@ -52,7 +59,9 @@ def generic(task: str, share: float = 1.0, named: str = "random", pushed: bool =
             "time_constant": f"uniform(0, {most['lag'] * step:g})",
             "delay": f"uniform(0, {most['delay'] * step:g})",
         }
-    pushes = Disturbances(pulse_force=0.25 * share * force, pulse_duration=step, pulse_interval=10 * step)
+    pushes = Disturbances(
+        pulse_force=0.25 * share * force, pulse_duration=step, pulse_interval=10 * step
+    )
     fields: dict[str, Any] = {"disturbances": pushes} if pushed else {}
     return arm(task, named, posed(task, late(task), randomize=drawn, **fields))
 
@@ -95,7 +104,11 @@ def drawn(task: str, axis: str) -> Arm:
 def remembered(task: str, axis: str, dose: float) -> EnvConfig:
     """A lag or a delay under a policy that sees its last four commands."""
     seconds = dose * find_task(task).step_duration
-    return posed(task, late(task, **{{"lag": "time_constant"}.get(axis, axis): seconds}), observe_actuator=True)
+    return posed(
+        task,
+        late(task, **{{"lag": "time_constant"}.get(axis, axis): seconds}),
+        observe_actuator=True,
+    )
 
 
 @functools.cache
@@ -141,7 +154,9 @@ KINDS: Mapping[str, Kind] = {
 """Name -> (task, axis) -> what was trained."""
 
 
-def pairs(one: str, other: str, axes: Iterable[str] = AXES, tasks: Iterable[str] = TASKS) -> tuple[Contrast, ...]:
+def pairs(
+    one: str, other: str, axes: Iterable[str] = AXES, tasks: Iterable[str] = TASKS
+) -> tuple[Contrast, ...]:
     """Two kinds at the trained doses."""
     return tuple(
         Contrast(under(KINDS[one](task, axis), axis), under(KINDS[other](task, axis), axis))
@@ -152,17 +167,49 @@ def pairs(one: str, other: str, axes: Iterable[str] = AXES, tasks: Iterable[str]
 
 def at_homes(one: str, axes: Iterable[str], tasks: Iterable[str] = TASKS) -> tuple[Contrast, ...]:
     """What a kind scores on ideal forces, over what ideal-trained policies do."""
-    return tuple(Contrast(home(KINDS[one](task, axis)), home(ideal(task))) for task in tasks for axis in axes)
+    return tuple(
+        Contrast(home(KINDS[one](task, axis)), home(ideal(task))) for task in tasks for axis in axes
+    )
 
 
 COMPARED: Mapping[str, tuple[str, str, tuple[str, ...], str]] = {
-    "I1": ("matched", "random", tuple(AXES), "training through the very dose scores higher than random actuators"),
+    "I1": (
+        "matched",
+        "random",
+        tuple(AXES),
+        "training through the very dose scores higher than random actuators",
+    ),
     "I2": ("random", "ideal", tuple(AXES), "random actuators score higher than ideal forces"),
-    "I5": ("drawn", "random", DRAWN, "doses of the very thing, drawn, score higher than random actuators"),
-    "I6": ("random", "pushes", tuple(AXES), "random actuators score higher than random pushes alone"),
-    "I7": ("random", "strength", tuple(AXES), "random actuators score higher than random strength alone"),
-    "I8": ("remembering", "matched", REMEMBERED, "seeing its last commands lets a policy score higher"),
-    "I9": ("random", "half", tuple(AXES), "random actuators score higher than those of half the reach"),
+    "I5": (
+        "drawn",
+        "random",
+        DRAWN,
+        "doses of the very thing, drawn, score higher than random actuators",
+    ),
+    "I6": (
+        "random",
+        "pushes",
+        tuple(AXES),
+        "random actuators score higher than random pushes alone",
+    ),
+    "I7": (
+        "random",
+        "strength",
+        tuple(AXES),
+        "random actuators score higher than random strength alone",
+    ),
+    "I8": (
+        "remembering",
+        "matched",
+        REMEMBERED,
+        "seeing its last commands lets a policy score higher",
+    ),
+    "I9": (
+        "random",
+        "half",
+        tuple(AXES),
+        "random actuators score higher than those of half the reach",
+    ),
     "I10": ("double", "random", tuple(AXES), "random actuators of twice the reach score higher"),
 }
 """Hypothesis -> kind, other kind, axes, what it says: at the trained doses, pooled over axes and tasks."""
@@ -177,10 +224,12 @@ AT_HOME: Mapping[str, tuple[str, tuple[str, ...], str]] = {
 def primary() -> list[Question]:
     """The ten that are corrected together."""
     better = [
-        Question(name, "insured", says, pairs(one, other, axes)) for name, (one, other, axes, says) in COMPARED.items()
+        Question(name, "insured", says, pairs(one, other, axes))
+        for name, (one, other, axes, says) in COMPARED.items()
     ]
     equal = [
-        Question(name, "home", says, at_homes(kind, axes), "equivalent") for name, (kind, axes, says) in AT_HOME.items()
+        Question(name, "home", says, at_homes(kind, axes), "equivalent")
+        for name, (kind, axes, says) in AT_HOME.items()
     ]
     return sorted(better + equal, key=lambda one: int(one.name[1:]))
 
@@ -189,7 +238,10 @@ def primary() -> list[Question]:
 def secondary() -> list[Question]:
     """All others, each of one task: each axis by itself, other doses, and what each kind costs at home."""
     found: list[tuple[str, str, tuple[Contrast, ...]]] = []
-    every, at_home_too = tuple(AXES), (("matched", tuple(AXES)), ("drawn", DRAWN), ("remembering", REMEMBERED))
+    every, at_home_too = (
+        tuple(AXES),
+        (("matched", tuple(AXES)), ("drawn", DRAWN), ("remembering", REMEMBERED)),
+    )
     for task in TASKS:
         found += [
             ("insured", f"{task}, {axis}: {one} over {other}", pairs(one, other, [axis], [task]))
@@ -201,15 +253,27 @@ def secondary() -> list[Question]:
             for one in ("random", "half", "double", "pushes", "strength")
         ]
         found += [
-            ("home", f"{task}, ideal forces: {axis}, {one} over ideal", at_homes(one, [axis], [task]))
+            (
+                "home",
+                f"{task}, ideal forces: {axis}, {one} over ideal",
+                at_homes(one, [axis], [task]),
+            )
             for one, axes in at_home_too
             for axis in axes
         ]
         for one, axes in (("random", every), ("matched", every), ("drawn", DRAWN)):
             for axis in axes:
                 for which, dose in neighbours(task, axis).items():
-                    pair = Contrast(under(KINDS[one](task, axis), axis, dose), under(ideal(task), axis, dose))
-                    found.append(("other doses", f"{task}, {axis} {dose:g} ({which}): {one} over ideal", (pair,)))
+                    pair = Contrast(
+                        under(KINDS[one](task, axis), axis, dose), under(ideal(task), axis, dose)
+                    )
+                    found.append(
+                        (
+                            "other doses",
+                            f"{task}, {axis} {dose:g} ({which}): {one} over ideal",
+                            (pair,),
+                        )
+                    )
     return [Question(f"S{number}", *one) for number, one in enumerate(found, start=1)]
 
 

@@ -40,7 +40,11 @@ class InsuranceStudy(Program):
     @property
     def grid(self) -> Grid:
         """Its trainings and tests."""
-        chosen = [one for one in trials() if one.arm.task in self.tasks and (new(one) or not self.new_only)]
+        chosen = [
+            one
+            for one in trials()
+            if one.arm.task in self.tasks and (new(one) or not self.new_only)
+        ]
         seeds = range(self.first_seed, self.first_seed + self.seeds)
         return Grid(self.root, tuple(chosen), lambda _: seeds, self.episodes, self.out / FOLDER)
 

@@ -53,7 +53,9 @@ class PaperArm(Arm):
 
     def cut_off(self, episodes: int) -> "PaperArm":
         """The same, stopped after that many training episodes already: for trying things out."""
-        return dataclasses.replace(self, config=dataclasses.replace(self.config, total_episodes=episodes))
+        return dataclasses.replace(
+            self, config=dataclasses.replace(self.config, total_episodes=episodes)
+        )
 
 
 FAST: Actuator = dataclasses.replace(

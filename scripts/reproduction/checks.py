@@ -1,8 +1,9 @@
 """Whether what was reported is what is found: checks as pure functions of values over seeds.
 
-What was reported is one number, as a rule from one run or one episode. What is found is a sample over seeds. One rule
-judges bounds and comparisons: the 95 % interval lies inside (*confirmed*), outside (*not confirmed*), or across
-(*open*). What was said of one run or one episode, and could be one of ours, is only *compatible*.
+What was reported is one number, as a rule from one run or one episode. What is found is a sample
+over seeds. One rule judges bounds and comparisons: the 95 % interval lies inside (*confirmed*),
+outside (*not confirmed*), or across (*open*). What was said of one run or one episode, and could be
+one of ours, is only *compatible*.
 """
 
 import dataclasses
@@ -56,7 +57,9 @@ class Check:
         """Judge one value for each seed of every arm, shape (n,)."""
         samples = min(map(len, values))
         if samples < self.least:
-            reason = "one seed: it takes two to say how runs differ" if samples else "no published value"
+            reason = (
+                "one seed: it takes two to say how runs differ" if samples else "no published value"
+            )
             return Verdict(NOT_TESTABLE, reason, samples=samples)
         return self.judge(*values)._replace(samples=samples)
 
@@ -103,7 +106,8 @@ def same(margin: float, paired: bool = False) -> Check:
 
     Args:
         margin: difference that does not matter.
-        paired: whether the n-th values of both belong together, as those of one seed on two kinds of physics do.
+        paired: whether the n-th values of both belong together, as those of one seed on two kinds
+            of physics do.
     """
     kind = "paired t" if paired else "Welch"
     criterion = f"the 95 % interval of the difference ({kind}) is within ±{number(margin)}"
@@ -136,8 +140,13 @@ def one_run(figure: float) -> Check:
 
     def judge(values: np.ndarray) -> Verdict:
         low, high = prediction_interval(values)
-        reason = f"95 % of single runs lie from {number(low)} to {number(high)} (Student's prediction interval)"
-        return Verdict(COMPATIBLE if low <= figure <= high else NOT_CONFIRMED, reason, mean_interval(values))
+        reason = (
+            f"95 % of single runs lie from {number(low)} to {number(high)} (Student's prediction"
+            " interval)"
+        )
+        return Verdict(
+            COMPATIBLE if low <= figure <= high else NOT_CONFIRMED, reason, mean_interval(values)
+        )
 
     criterion = f"{number(figure)} is within the range of 95 % of single runs"
     return Check("one run", figure, figure, criterion, judge)
@@ -146,8 +155,8 @@ def one_run(figure: float) -> Check:
 def one_episode(figure: float) -> Check:
     """A time [s] that was read off one episode could be one of our episodes'.
 
-    It is judged by an array for each seed: times of test episodes [s], infinite where the goal was not reached. What is
-    measured is the mean over seeds of the median over episodes that arrive.
+    It is judged by an array for each seed: times of test episodes [s], infinite where the goal was
+    not reached. What is measured is the mean over seeds of the median over episodes that arrive.
     """
 
     def judge(times: list[np.ndarray]) -> Verdict:
@@ -171,10 +180,15 @@ def every_seed(limit: float) -> Check:
 
     def judge(values: np.ndarray) -> Verdict:
         beyond = int(np.sum(values > limit))
-        reason = f"{beyond} of {len(values)} seeds are beyond; the largest has {number(float(np.max(values)))}"
+        reason = (
+            f"{beyond} of {len(values)} seeds are beyond; the largest has"
+            f" {number(float(np.max(values)))}"
+        )
         return Verdict(NOT_CONFIRMED if beyond else CONFIRMED, reason, mean_interval(values))
 
-    return Check("every seed", -math.inf, limit, f"at most {number(limit)} in every seed", judge, least=1)
+    return Check(
+        "every seed", -math.inf, limit, f"at most {number(limit)} in every seed", judge, least=1
+    )
 
 
 def medians(times: list[np.ndarray]) -> np.ndarray:
@@ -186,7 +200,8 @@ def medians(times: list[np.ndarray]) -> np.ndarray:
 def prediction_interval(values: np.ndarray) -> tuple[float, float]:
     """Where one more value of the same normal distribution lies with a probability of 95 %.
 
-    mean -+ t * s * sqrt(1 + 1/n), with Student's t of n - 1 degrees of freedom and the sample's standard deviation s.
+    mean -+ t * s * sqrt(1 + 1/n), with Student's t of n - 1 degrees of freedom and the sample's
+    standard deviation s.
 
     Args:
         values: shape (n,), n >= 2.
@@ -210,4 +225,10 @@ def central_range(values: np.ndarray) -> tuple[float, float]:
 
 def number(value: float) -> str:
     """A number as text: three digits, four from 100 on, or all before the point."""
-    return f"{value:.3g}" if abs(value) < 100 else f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"
+    return (
+        f"{value:.3g}"
+        if abs(value) < 100
+        else f"{value:.4g}"
+        if abs(value) < 1000
+        else f"{value:.0f}"
+    )

@@ -1,7 +1,8 @@
 """What is reported about the paper's experiments: each number with its source, and the check that judges it.
 
-The paper (arXiv 2507.00268) shows one run of each experiment; its numbers are read off figures. A statement is judged
-by published rows alone (`reproduction.rows`), so whoever has them can judge it again.
+The paper (arXiv 2507.00268) shows one run of each experiment; its numbers are read off figures. A
+statement is judged by published rows alone (`reproduction.rows`), so whoever has them can judge it
+again.
 """
 
 import dataclasses
@@ -10,7 +11,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from reproduction.checks import Check, Verdict, every_seed, higher, number, one_episode, one_run, same, within
+from reproduction.checks import (
+    Check,
+    Verdict,
+    every_seed,
+    higher,
+    number,
+    one_episode,
+    one_run,
+    same,
+    within,
+)
 from reproduction.rows import Row, times_of
 from reproduction.value_iteration import TASK as VALUE_TASK
 
@@ -74,7 +85,9 @@ class Claim:
     def arms(self) -> tuple[str, ...]:
         """Names of the arm that it is about, or of the two that it compares."""
         kinds = [(motor, physics) for physics in self.physics for motor in self.motors]
-        return tuple(f"{self.task}, {self.settings}, {motor}, {physics}" for motor, physics in kinds)
+        return tuple(
+            f"{self.task}, {self.settings}, {motor}, {physics}" for motor, physics in kinds
+        )
 
     def judge(self, rows: Mapping[str, Sequence[Row]]) -> Verdict:
         """The verdict by the published rows of every arm, by its name; of pairs by the first row of each seed."""
@@ -87,7 +100,9 @@ class Claim:
 
     def without_motor(self, rows: Mapping[str, Sequence[Row]]) -> float | None:
         """The mean of what is judged where there is no motor; None if it is not known, compared, or of the motor."""
-        column = {TIMES: "time_to_goal"}.get(self.measure, self.measure.column)  # medians are known of more trainings
+        column = {TIMES: "time_to_goal"}.get(
+            self.measure, self.measure.column
+        )  # medians are known of more trainings
         ideal = rows.get(f"{self.task}, {self.settings}, ideal, mujoco", ())
         values = [float(row[column]) for row in ideal if row[column]]
         if not values or len(self.arms) > 1 or self.measure in (TRACKING, LARGEST_ERROR):
@@ -110,7 +125,9 @@ _Row = tuple[str, str, str, Measure, Sequence[str], Check]
 """A claim's figure, statement and number, what is judged, its motors, and how."""
 
 
-def _paper(task: str, *rows: _Row, settings: Sequence[str] = ("paper",), counted: bool = True) -> list[Claim]:
+def _paper(
+    task: str, *rows: _Row, settings: Sequence[str] = ("paper",), counted: bool = True
+) -> list[Claim]:
     """What the paper says of a task; where its settings do not learn, the repaired ones count."""
     return [
         Claim(task, PAPER_SAYS, *row[:4], of, tuple(row[4]), row[5], counted and of == settings[-1])
@@ -123,7 +140,18 @@ def _same_physics(task: str, motors: Sequence[str]) -> list[Claim]:
     """MuJoCo and Gymnasium's own equations give the same results, seed by seed."""
     check, both = same(SIMILAR_RETURN[task], paired=True), ("mujoco", "analytic")
     return [
-        Claim(task, PORT, "", f"{motor}: MuJoCo less Gymnasium", "0", LAST, "paper", (motor,), check, physics=both)
+        Claim(
+            task,
+            PORT,
+            "",
+            f"{motor}: MuJoCo less Gymnasium",
+            "0",
+            LAST,
+            "paper",
+            (motor,),
+            check,
+            physics=both,
+        )
         for motor in motors
     ]
 
@@ -136,7 +164,9 @@ _RIVALS = (("no motor", "75 s sooner", "ideal"), ("gains 2, 10, 1e-6", "15 s soo
 def _beats(measure: Measure) -> list[_Row]:
     """The paper's gains against both rivals; a step is a second and costs 1."""
     check = higher(SIMILAR_RETURN["mountain_car"])
-    return [("", f"beats {rival}", by, measure, (*_MOTOR, other), check) for rival, by, other in _RIVALS]
+    return [
+        ("", f"beats {rival}", by, measure, (*_MOTOR, other), check) for rival, by, other in _RIVALS
+    ]
 
 
 _PERFECT, _TRACKED = within(high=ALMOST_PERFECT), "torque error"
@@ -149,7 +179,14 @@ CLAIMS: tuple[Claim, ...] = (
     ),
     *_paper(
         "pendulum",
-        ("5a", "return, less ideal's", "similar", RETURN, ("paper gains", "ideal"), same(SIMILAR_RETURN["pendulum"])),
+        (
+            "5a",
+            "return, less ideal's",
+            "similar",
+            RETURN,
+            ("paper gains", "ideal"),
+            same(SIMILAR_RETURN["pendulum"]),
+        ),
         settings=("repaired",),
     ),
     *_paper(
@@ -197,4 +234,8 @@ def needed(arm: str) -> set[str]:
 
 def as_text(measure: Measure, value: float) -> str:
     """A measured value with its unit."""
-    return f"{number(100 * value)} %" if measure.unit == "share" else f"{number(value)} {measure.unit}".strip()
+    return (
+        f"{number(100 * value)} %"
+        if measure.unit == "share"
+        else f"{number(value)} {measure.unit}".strip()
+    )

@@ -16,7 +16,10 @@ from reproduction.rows import LAST, Trained, epochs_of, run_tests
 CURVES, STATES, TORQUES = "curves.csv", "states.csv", "torques.csv"
 """The tables: learning curves; the states of a test episode; desired and actual torque at its beginning."""
 POINTS = 125  # of a learning curve, at most
-SHORT, FEW = 1.0, 20  # s; policy steps: of an episode's torque as much is shown as the longer of both
+SHORT, FEW = (
+    1.0,
+    20,
+)  # s; policy steps: of an episode's torque as much is shown as the longer of both
 
 ENTRIES = ("state_1", "state_2", "state_3", "state_4")
 """Columns of a state's entries, in the order of the task's `state_names`."""
@@ -32,8 +35,8 @@ def about(arm: PaperArm) -> dict[str, str]:
 def curve_rows(arm: PaperArm, runs: Mapping[int, Trained]) -> Table:
     """Learning curves of an arm's runs, at least one: means over seeds and their 95 % bands.
 
-    Of returns the running mean over episodes; of PPO, whose rollouts are the paper's epochs, mean return, mean length
-    and number of episodes over epochs.
+    Of returns the running mean over episodes; of PPO, whose rollouts are the paper's epochs, mean
+    return, mean length and number of episodes over epochs.
     """
     if arm.config.agent.name == "ppo":
         every = [epochs_of(arm, run) for run in runs.values()]
@@ -51,7 +54,9 @@ def curve_rows(arm: PaperArm, runs: Mapping[int, Trained]) -> Table:
         kept = np.arange(step - 1, values.shape[1], step)
         for place, *point in zip(kept + 1, *band(values[:, kept]), strict=True):
             numbers = dict(zip(("mean", "low", "high"), map(_short, point), strict=True))
-            rows.append(about(arm) | {"curve": name, "seeds": str(len(runs)), "at": str(place)} | numbers)
+            rows.append(
+                about(arm) | {"curve": name, "seeds": str(len(runs)), "at": str(place)} | numbers
+            )
     return rows
 
 
@@ -75,7 +80,12 @@ def torque_rows(arm: PaperArm, episode: Episode) -> Table:
     shown = max(FEW * inner, round(SHORT / episode.timestep))
     pairs = zip(desired[:shown], actual[:shown], strict=True)
     return [
-        about(arm) | {"time": _short(n * episode.timestep), "desired": _short(one), "actual": _short(other)}
+        about(arm)
+        | {
+            "time": _short(n * episode.timestep),
+            "desired": _short(one),
+            "actual": _short(other),
+        }
         for n, (one, other) in enumerate(pairs)
     ]
 
@@ -90,7 +100,9 @@ def gather_tables(
         if arm.physics != "mujoco":
             continue
         mine = runs.get(arm.name, {})
-        old = {name: [row for row in rows if _of(row) == about(arm)] for name, rows in before.items()}
+        old = {
+            name: [row for row in rows if _of(row) == about(arm)] for name, rows in before.items()
+        }
         seeds = max((int(row["seeds"]) for row in old[CURVES]), default=0)
         tables[CURVES] += curve_rows(arm, mine) if mine and len(mine) >= seeds else old[CURVES]
         if mine and (0 in mine or not old[STATES]):

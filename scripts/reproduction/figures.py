@@ -10,16 +10,31 @@ import numpy as np
 from codrl_mj.films.strip import ACTUAL, DESIRED
 from codrl_mj.study.doses import CENTRE_RADIUS
 from codrl_mj.study.pages import COLOURS, legend, save
-from codrl_mj.tasks import acrobot, cartpole, find_task, mountain_car, mountain_car_continuous, pendulum
+from codrl_mj.tasks import (
+    acrobot,
+    cartpole,
+    find_task,
+    mountain_car,
+    mountain_car_continuous,
+    pendulum,
+)
 from reproduction.drawn import ENTRIES, Table, arms_of, column
 from reproduction.rows import LAST
 from reproduction.value_iteration import Optimum
 
-STYLES = {"ideal": (COLOURS[0], "--"), "paper gains": (COLOURS[2], "-"), "fast gains": (COLOURS[1], "-.")}
+STYLES = {
+    "ideal": (COLOURS[0], "--"),
+    "paper gains": (COLOURS[2], "-"),
+    "fast gains": (COLOURS[1], "-."),
+}
 """Of an arm, by its motor: colour and dashes."""
 SETTINGS = {"paper": "as printed", "repaired": "repaired"}
 """What settings are called."""
-LEARNED = {"returns": "mean return", "lengths": "mean length\n[steps]", "counts": "number of\nepisodes"}
+LEARNED = {
+    "returns": "mean return",
+    "lengths": "mean length\n[steps]",
+    "counts": "number of\nepisodes",
+}
 """What learning curves are called."""
 _ERROR = COLOURS[3]
 _WIDTH = 8.0  # in
@@ -43,18 +58,25 @@ def _entry(label: str, index: int, *marks: float) -> StateCurve:
 
 def _entries(task: str, marks: Mapping[int, tuple[float, ...]]) -> list[StateCurve]:
     """Every entry of a task's state."""
-    return [_entry(name, index, *marks.get(index, ())) for index, name in enumerate(find_task(task).state_names)]
+    return [
+        _entry(name, index, *marks.get(index, ()))
+        for index, name in enumerate(find_task(task).state_names)
+    ]
 
 
 CURVES: dict[str, list[StateCurve]] = {
     "pendulum": [
         StateCurve("height x = cos θ [m]", lambda state: np.cos(state[0]), (1.0,)),
         StateCurve("y = sin θ [m]", lambda state: np.sin(state[0]), (0.0,)),
-        StateCurve("θ [rad], wrapped", lambda state: _unbroken(pendulum.upright_angle(state)), (0.0,)),
+        StateCurve(
+            "θ [rad], wrapped", lambda state: _unbroken(pendulum.upright_angle(state)), (0.0,)
+        ),
         _entry("θ_dot [rad/s]", 1, 0.0),
     ],
     "mountain_car": _entries("mountain_car", {0: (mountain_car.GOAL,)}),
-    "mountain_car_continuous": _entries("mountain_car_continuous", {0: (mountain_car_continuous.GOAL,)}),
+    "mountain_car_continuous": _entries(
+        "mountain_car_continuous", {0: (mountain_car_continuous.GOAL,)}
+    ),
     "acrobot": [
         StateCurve(
             "-cos θ1\n- cos(θ1 + θ2) [m]",
@@ -67,7 +89,8 @@ CURVES: dict[str, list[StateCurve]] = {
         _entry("θ2_dot [rad/s]", 3),
     ],
     "cartpole": _entries(
-        "cartpole", {0: (-CENTRE_RADIUS, CENTRE_RADIUS), 2: (-cartpole.ANGLE_LIMIT, cartpole.ANGLE_LIMIT)}
+        "cartpole",
+        {0: (-CENTRE_RADIUS, CENTRE_RADIUS), 2: (-cartpole.ANGLE_LIMIT, cartpole.ANGLE_LIMIT)},
     ),
 }
 """What is drawn of each task's states: the paper's curves, and every entry of the state."""
@@ -99,11 +122,23 @@ def draw_learning(path: Path, task: str, curves: Table) -> bool:
     for axes, name in zip(all_axes[:, 0], names, strict=True):
         for (settings, motor), rows in arms.items():
             shown = [row for row in rows if row["curve"] == name]
-            places, mean, low, high = (column(shown, part) for part in ("at", "mean", "low", "high"))
+            places, mean, low, high = (
+                column(shown, part) for part in ("at", "mean", "low", "high")
+            )
             colour, dashes = STYLES[motor]
-            label = f"{motor}{f', {SETTINGS[settings]}' if repaired else ''} ({shown[0]['seeds']} seeds)"
+            label = (
+                f"{motor}{f', {SETTINGS[settings]}' if repaired else ''} ({shown[0]['seeds']}"
+                " seeds)"
+            )
             faint = repaired and settings == "paper"
-            axes.plot(places, mean, color=colour, linestyle=dashes, linewidth=0.8 if faint else 1.6, label=label)
+            axes.plot(
+                places,
+                mean,
+                color=colour,
+                linestyle=dashes,
+                linewidth=0.8 if faint else 1.6,
+                label=label,
+            )
             axes.fill_between(places, low, high, color=colour, alpha=0.2, linewidth=0)
         axes.set(ylabel=LEARNED[name], yscale="log" if name == "counts" else "linear")
         axes.yaxis.label.set_fontsize("small" if len(names) > 1 else "medium")
@@ -134,8 +169,18 @@ def draw_torque(path: Path, task: str, torques: Table) -> bool:
         times, desired, actual = (column(rows, name) for name in ("time", "desired", "actual"))
         edges = np.append(times, times[-1] + times[1])
         axes.stairs(actual, edges, color=ACTUAL, linewidth=1.8, label="actual", baseline=None)
-        axes.stairs(desired, edges, color=DESIRED, linewidth=0.9, linestyle="--", label="desired", baseline=None)
-        axes.stairs(desired - actual, edges, color=_ERROR, label="error: desired - actual", baseline=None)
+        axes.stairs(
+            desired,
+            edges,
+            color=DESIRED,
+            linewidth=0.9,
+            linestyle="--",
+            label="desired",
+            baseline=None,
+        )
+        axes.stairs(
+            desired - actual, edges, color=_ERROR, label="error: desired - actual", baseline=None
+        )
         axes.set(ylabel=f"torque [N·m],\n{motor}")
     all_axes[-1, 0].set_xlabel("time [s]")
     legend(figure, 3)
@@ -165,7 +210,13 @@ def draw_states(path: Path, task: str, states: Table) -> bool:
         for motor, rows in arms.items():
             colour, dashes = STYLES[motor]
             state = np.array([column(rows, entry) for entry in entries])
-            axes.plot(column(rows, "time"), curve.values(state), color=colour, linestyle=dashes, label=motor)
+            axes.plot(
+                column(rows, "time"),
+                curve.values(state),
+                color=colour,
+                linestyle=dashes,
+                label=motor,
+            )
         axes.set_ylabel(curve.label.replace("_dot", "'"), fontsize="small")
     all_axes[-1, 0].set_xlabel("time [s]")
     legend(figure, 3)
@@ -193,18 +244,34 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
     worth.set_xscale("log")
     worth.invert_xaxis()
     marked = [one.discount for one in optima]
-    worth.set_xticks([1 - discount for discount in marked], [f"{discount:g}" for discount in marked], rotation=45)
+    worth.set_xticks(
+        [1 - discount for discount in marked], [f"{discount:g}" for discount in marked], rotation=45
+    )
     worth.set_xticks([], minor=True)
     worth.axvline(1 - marked[0], color=COLOURS[2], linestyle="--", linewidth=1)
-    worth.annotate("the paper's", (1 - marked[0], 0.5 * max(values.values())), rotation=90, ha="right", va="center")
+    worth.annotate(
+        "the paper's",
+        (1 - marked[0], 0.5 * max(values.values())),
+        rotation=90,
+        ha="right",
+        va="center",
+    )
     worth.set(xlabel="discount factor", ylabel="value of the start")
     dashes = ("-", ":", "--", "-.", (0, (5, 1, 1, 1, 1, 1)))
     for index, one in enumerate(optima):
         times = np.concatenate([[0.0], one.episode.time])
         style = dashes[index % len(dashes)]
-        drive.plot(times, one.episode.state[:, 0], color=COLOURS[index], linestyle=style, label=f"{one.discount:g}")
+        drive.plot(
+            times,
+            one.episode.state[:, 0],
+            color=COLOURS[index],
+            linestyle=style,
+            label=f"{one.discount:g}",
+        )
     drive.axhline(mountain_car_continuous.GOAL, color="0.6", linewidth=0.8)
-    drive.set(xlabel="time [s]", ylabel="x [m]", xlim=(0, 120), title="best policy at discount factor")
+    drive.set(
+        xlabel="time [s]", ylabel="x [m]", xlim=(0, 120), title="best policy at discount factor"
+    )
     legend(figure, 5)
     save(figure, path)
 

@@ -13,7 +13,17 @@ from reproduction.arms import ARMS, PaperArm
 from reproduction.checks import Verdict
 from reproduction.claims import CLAIMS, PAPER_SAYS, Claim, needed
 from reproduction.drawn import Table, gather_tables
-from reproduction.rows import RUNS, Row, Trained, complete, identity, joined, read_rows, read_trained, run_row
+from reproduction.rows import (
+    RUNS,
+    Row,
+    Trained,
+    complete,
+    identity,
+    joined,
+    read_rows,
+    read_trained,
+    run_row,
+)
 from reproduction.value_iteration import DISCOUNTS, TASK, Mesh, Model, Optimum, optimum, values_over
 
 VALUE_DISCOUNTS = tuple(1 - 0.2 * 0.8**step for step in range(24))
@@ -96,7 +106,9 @@ def arm_rows(
     arm: PaperArm, at_hand: Mapping[int, Trained], before: Mapping[tuple[str, ...], Sequence[Row]]
 ) -> dict[int, list[Row]]:
     """An arm's rows by seed: those that are published, and of runs at hand that are not."""
-    rows = {int(of[-1]): list(found) for of, found in before.items() if of == identity(arm, int(of[-1]))}
+    rows = {
+        int(of[-1]): list(found) for of, found in before.items() if of == identity(arm, int(of[-1]))
+    }
     for seed, run in at_hand.items():
         mine = rows.get(seed, [])
         if not complete([row for row in mine if row["run"] == run.folder.name], needed(arm.name)):
@@ -108,9 +120,15 @@ def claim_rows(verdicts: Sequence[tuple[Claim, Verdict]]) -> list[dict[str, Any]
     """Claims and their verdicts; p corrected for all comparisons of the same source (Holm)."""
     corrected: dict[int, float] = {}
     for ours in (False, True):
-        compared = [n for n, (claim, verdict) in enumerate(verdicts) if _compared(claim, verdict, ours)]
-        corrected |= dict(zip(compared, holm([verdicts[n][1].p or 0.0 for n in compared]).tolist(), strict=True))
-    return [_claim_row(claim, verdict, corrected.get(n)) for n, (claim, verdict) in enumerate(verdicts)]
+        compared = [
+            n for n, (claim, verdict) in enumerate(verdicts) if _compared(claim, verdict, ours)
+        ]
+        corrected |= dict(
+            zip(compared, holm([verdicts[n][1].p or 0.0 for n in compared]).tolist(), strict=True)
+        )
+    return [
+        _claim_row(claim, verdict, corrected.get(n)) for n, (claim, verdict) in enumerate(verdicts)
+    ]
 
 
 def _compared(claim: Claim, verdict: Verdict, ours: bool) -> bool:
@@ -152,7 +170,9 @@ def write_files(findings: Findings, folder: Path) -> list[Path]:
         write_csv(folder / name, list(rows))
     rest = {name: getattr(findings, name) for name in ("plan", "missing", "failures")} | {
         "value_iteration": [one.as_mapping() for one in findings.optima],
-        "values_of_start": [{"discount": discount, "value": value} for discount, value in findings.values.items()],
+        "values_of_start": [
+            {"discount": discount, "value": value} for discount, value in findings.values.items()
+        ],
     }
     write_json(folder / EVERYTHING, rest)
     return [folder / name for name in (*tables, EVERYTHING)]

@@ -71,7 +71,9 @@ def statements_table(findings: Findings) -> str:
         claim, verdict = list(judged.values())[-1]
         if not claim.counted:
             continue
-        cells = [_ours(findings, *judged[of]) if of in judged else "" for of in ("paper", "repaired")]
+        cells = [
+            _ours(findings, *judged[of]) if of in judged else "" for of in ("paper", "repaired")
+        ]
         cells += [_without(findings, claim)]
         if claim.motors == ("ideal",):
             cells = ["", "", cells[0]]
@@ -79,7 +81,15 @@ def statements_table(findings: Findings) -> str:
         title = f"*{TITLES[task]}*: " if task != before else ""
         rows.append([title + claim.statement, claim.figure, _minus(claim.says), *cells, outcome])
         before = task
-    header = ["statement", "figure", "the paper", "ours, its settings", "repaired", "no motor", "verdict"]
+    header = [
+        "statement",
+        "figure",
+        "the paper",
+        "ours, its settings",
+        "repaired",
+        "no motor",
+        "verdict",
+    ]
     return markdown_table(header, rows)
 
 
@@ -97,10 +107,15 @@ def _ours(findings: Findings, claim: Claim, verdict: Verdict) -> str:
 
 
 def _without(findings: Findings, claim: Claim) -> str:
-    mean, ideal = claim.without_motor(findings.runs), f"{claim.task}, {claim.settings}, ideal, mujoco"
+    mean, ideal = (
+        claim.without_motor(findings.runs),
+        f"{claim.task}, {claim.settings}, ideal, mujoco",
+    )
     if mean is None:
         return ""
-    return _minus(as_text(claim.measure, mean)) + (_after(findings, ideal) if claim.measure is UPRIGHT else "")
+    return _minus(as_text(claim.measure, mean)) + (
+        _after(findings, ideal) if claim.measure is UPRIGHT else ""
+    )
 
 
 def _after(findings: Findings, arm: str) -> str:
@@ -158,8 +173,16 @@ def _how(findings: Findings) -> str:
     """How it was measured, and where the numbers are."""
     rows = [row for of_arm in findings.runs.values() for row in of_arm]
     hours = sum(float(row["seconds"]) for row in rows) / 3600
-    files = ((CLAIM_ROWS, "verdicts"), (RUNS, "trainings"), (CURVES, "curves"), (EVERYTHING, "the rest"))
-    links, episodes = ", ".join(f"[{name}]({FOLDER}/{file})" for file, name in files), findings.plan["test_episodes"]
+    files = (
+        (CLAIM_ROWS, "verdicts"),
+        (RUNS, "trainings"),
+        (CURVES, "curves"),
+        (EVERYTHING, "the rest"),
+    )
+    links, episodes = (
+        ", ".join(f"[{name}]({FOLDER}/{file})" for file, name in files),
+        findings.plan["test_episodes"],
+    )
     return f"""## How it was measured
 
 {len(rows)} trainings, {hours:.1f} hours of one core; every policy tested greedily in {episodes} episodes on the
@@ -170,11 +193,16 @@ actuator of its training. `scripts/reproduce.py` ([how](../reproduction.md)) wri
 
 def _missing(findings: Findings) -> str:
     """What is not there, and what went wrong."""
-    lines: Iterable[str] = [f"- {name}: seeds {numbers_as_text(seeds)}" for name, seeds in findings.missing.items()]
+    lines: Iterable[str] = [
+        f"- {name}: seeds {numbers_as_text(seeds)}" for name, seeds in findings.missing.items()
+    ]
     lines = [*lines, *(f"- {name} failed: {error}" for name, error in findings.failures.items())]
     if not lines:
         return ""
     return "\n".join(["## What is missing\n", _MISSING, *lines, ""])
 
 
-_MISSING = "Planned, and either not trained or without what is published now; verdicts are of the others.\n"
+_MISSING = (
+    "Planned, and either not trained or without what is published now; verdicts are of the"
+    " others.\n"
+)

@@ -25,8 +25,8 @@ LAST = 50
 """Training episodes that the paper takes its means over."""
 FULL_LENGTH = 4000.0  # steps of an epoch
 FULL_RETURN = 3800.0  # of an epoch, that "approaches 4000"
-# upright and still, by what full torque can do: it just holds the rod at 0.41 rad, of which this is half, and changes
-# its speed by so much within a step
+# upright and still, by what full torque can do: it just holds the rod at 0.41 rad, of which this is
+# half, and changes its speed by so much within a step
 UPRIGHT_ANGLE = 0.2  # rad
 UPRIGHT_SPEED = 3 * MAX_TORQUE * 0.05  # rad/s: torque * step / (m l^2 / 3)
 RUNS = "runs.csv"
@@ -37,8 +37,10 @@ TESTED = (
 )
 """Measures of the test in a row, as docs/evaluation.md has them: means, and the median time to the goal."""
 FURTHER = ("centred", "long_epoch", "paid_epoch", "upright", "times")
-"""Those of single tasks: share of steps near the centre, first epochs, share of episodes that end upright; and the
-times of all test episodes to the goal, or upright [s], `-` where it was not reached."""
+"""Those of single tasks: share of steps near the centre, first epochs, share of episodes that end
+upright; and the times of all test episodes to the goal, or upright [s], `-` where it was not
+reached.
+"""
 COLUMNS = (
     *("task", "settings", "motor", "gains", "physics", "seed", "run", "seconds", f"last_{LAST}"),
     *(*TESTED, *FURTHER),
@@ -123,17 +125,25 @@ def read_trained(arm: PaperArm, found: Collected) -> dict[int, Trained]:
     runs = {}
     for seed in found.grid.seeds_of(arm):
         folder, by_test = found.folders.get((arm.name, seed)), arm.trials.items()
-        if folder is not None and all(seed in found.evaluations[trial.name] for _, trial in by_test):
+        if folder is not None and all(
+            seed in found.evaluations[trial.name] for _, trial in by_test
+        ):
             tests = {test: found.evaluations[trial.name][seed] for test, trial in by_test}
-            runs[seed] = Trained(folder, read_episodes(folder / EPISODES), tests, training_seconds(folder))
+            runs[seed] = Trained(
+                folder, read_episodes(folder / EPISODES), tests, training_seconds(folder)
+            )
     return runs
 
 
 def run_row(arm: PaperArm, seed: int, run: Trained) -> Row:
     """The row of a finished run."""
-    row: dict[str, Any] = {name: getattr(arm, name) for name in ("task", "settings", "motor", "gains", "physics")}
+    row: dict[str, Any] = {
+        name: getattr(arm, name) for name in ("task", "settings", "motor", "gains", "physics")
+    }
     row |= {"seed": seed, "run": run.folder.name, "seconds": run.seconds}
-    row |= {f"last_{LAST}": float(run.column("return")[-LAST:].mean()) if len(run.episodes) else None}
+    row |= {
+        f"last_{LAST}": float(run.column("return")[-LAST:].mean()) if len(run.episodes) else None
+    }
     row |= {name: plain(run.tests[TEST][name]) for name in TESTED} | dict.fromkeys(FURTHER)
     if CENTRE in run.tests:
         row["centred"] = plain(run.tests[CENTRE]["returns"]) / TASKS[arm.task].max_episode_steps
@@ -159,7 +169,9 @@ def upright_since(episode: Episode) -> float | None:
     angle, speed = np.abs(upright_angle(episode.state.T)), np.abs(episode.state[:, 1])
     step = float(episode.time[0])
     since = holds_since((angle <= UPRIGHT_ANGLE) & (speed <= UPRIGHT_SPEED)) * step
-    return since if since + GOAL_HOLD < episode.time[-1] + 0.5 * step else None  # half a step: rounding
+    return (
+        since if since + GOAL_HOLD < episode.time[-1] + 0.5 * step else None
+    )  # half a step: rounding
 
 
 def first(reached: np.ndarray) -> int:

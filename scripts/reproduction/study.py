@@ -29,13 +29,16 @@ _COLOURS = {CONFIRMED: "green", COMPATIBLE: "cyan", NOT_CONFIRMED: "red"}
 class Reproduction(Program):
     """Do the paper's experiments again, judge what it reports, and write a page: docs/reproduction.md.
 
-    What is published is not computed again: the same command resumes and adds seeds, whose rows are published as they
-    finish. Example: python scripts/reproduce.py --dry-run, or with pendulum --settings repaired --seeds 20 --jobs 2
+    What is published is not computed again: the same command resumes and adds seeds, whose rows are
+    published as they finish. Example: python scripts/reproduce.py --dry-run, or with pendulum
+    --settings repaired --seeds 20 --jobs 2
     """
 
     tasks: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
-        tyro.conf.arg(metavar="{" + ",".join(TASKS) + "}", help="Whose experiments; all if none is named."),
+        tyro.conf.arg(
+            metavar="{" + ",".join(TASKS) + "}", help="Whose experiments; all if none is named."
+        ),
     ] = TASKS
     settings: tuple[str, ...] = ("paper", "repaired")
     """Of the agents: those that the paper prints, and those that learn where these do not."""
@@ -77,7 +80,11 @@ class Reproduction(Program):
 
         def left(arm: Any) -> range:
             columns, planned = needed(arm.name), self._seeds(arm)
-            lacking = (seed for seed in range(planned) if not complete(rows.get(identity(arm, seed), ()), columns))
+            lacking = (
+                seed
+                for seed in range(planned)
+                if not complete(rows.get(identity(arm, seed), ()), columns)
+            )
             return range(next(lacking, planned), planned)
 
         seeds = {arm.name: left(arm) for arm in every.arms}
@@ -107,9 +114,15 @@ class Reproduction(Program):
         """The page of what there is; the verdicts are printed too."""
         findings = self.findings()
         files = write(findings, self.out)
-        table = Table("task", "said by", "what is reported", "ours [95 %]", "seeds", "verdict", box=None)
+        table = Table(
+            "task", "said by", "what is reported", "ours [95 %]", "seeds", "verdict", box=None
+        )
         for claim, verdict in findings.verdicts:
-            ours = "–" if verdict.measured is None else "{} [{}, {}]".format(*map(number, verdict.measured))
+            ours = (
+                "–"
+                if verdict.measured is None
+                else "{} [{}, {}]".format(*map(number, verdict.measured))
+            )
             says = f"{claim.statement}: {claim.says} ({claim.settings})"
             outcome = f"[{_COLOURS.get(verdict.outcome, 'yellow')}]{verdict.outcome}[/]"
             table.add_row(claim.task, claim.source, says, ours, str(verdict.samples), outcome)

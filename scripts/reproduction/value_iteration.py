@@ -1,7 +1,7 @@
 """Value iteration of the continuous mountain car: what the best policy is worth, and does, at a discount factor.
 
-The dynamics are the installed Gymnasium environment's, driven by `codrl_mj.physics.analytic`; reward and end are the
-task's. Nothing of them is written down here again.
+The dynamics are the installed Gymnasium environment's, driven by `codrl_mj.physics.analytic`;
+reward and end are the task's. Nothing of them is written down here again.
 """
 
 import dataclasses
@@ -66,17 +66,26 @@ class Model:
         assert task.twin is not None
         step = task.twin()
         self.grid = grid
-        points = np.stack([axis.ravel() for axis in np.meshgrid(*grid.axes, indexing="ij")], axis=-1)
+        points = np.stack(
+            [axis.ravel() for axis in np.meshgrid(*grid.axes, indexing="ij")], axis=-1
+        )
         after = np.array(
-            [[step(point, force, task.step_duration, "") for point in points] for force in grid.actions.tolist()]
+            [
+                [step(point, force, task.step_duration, "") for point in points]
+                for force in grid.actions.tolist()
+            ]
         )
         entries = after.reshape(-1, 2).T
         ends = np.asarray(task.terminated(entries))
         force = np.repeat(grid.actions, len(points))
         before = np.tile(points, (grid.forces, 1)).T
-        self.rewards = np.asarray(task.reward(before, force, entries, task.options())).reshape(grid.forces, -1)
+        self.rewards = np.asarray(task.reward(before, force, entries, task.options())).reshape(
+            grid.forces, -1
+        )
         """Reward of every force at every point, shape (A, S)."""
-        self.transitions = sparse.diags_array((~ends).astype(float)) @ interpolation(grid, entries.T)
+        self.transitions = sparse.diags_array((~ends).astype(float)) @ interpolation(
+            grid, entries.T
+        )
         """Weights of the points' values in what comes after, shape (A*S, S); none where the episode ends."""
 
 
@@ -102,14 +111,18 @@ def interpolation(grid: Mesh, states: np.ndarray) -> Any:
     return sparse.csr_array((np.concatenate(weights), (rows, np.concatenate(columns))), shape=shape)
 
 
-def iterate(rewards: np.ndarray, transitions: Any, discount: float, accuracy: float = 1e-4) -> np.ndarray:
+def iterate(
+    rewards: np.ndarray, transitions: Any, discount: float, accuracy: float = 1e-4
+) -> np.ndarray:
     """Value iteration: the values of every action at every state, Q = r + discount * P max Q.
 
-    It ends when the last change times discount/(1 - discount), which bounds the error left, is below the accuracy.
+    It ends when the last change times discount/(1 - discount), which bounds the error left, is
+    below the accuracy.
 
     Args:
         rewards: shape (A, S).
-        transitions: probabilities of the states that come next, shape (A*S, S); rows of 0 where the episode ends.
+        transitions: probabilities of the states that come next, shape (A*S, S); rows of 0 where the
+            episode ends.
         discount: from 0 to below 1.
         accuracy: of the values.
 
@@ -187,7 +200,9 @@ def optimum(model: Model, discount: float, episodes: int = 20) -> Optimum:
     """
     of_actions = iterate(model.rewards, model.transitions, discount)
     ran = run_episodes(
-        Greedy(model.grid, of_actions), EnvConfig(TASK, None, physics="analytic").make, episodes=episodes
+        Greedy(model.grid, of_actions),
+        EnvConfig(TASK, None, physics="analytic").make,
+        episodes=episodes,
     )
     lengths = np.array([len(episode.reward) for episode in ran if episode.terminated])
     return Optimum(
@@ -208,4 +223,7 @@ def start_value(model: Model, of_actions: np.ndarray) -> float:
 
 def values_over(model: Model, discounts: Sequence[float]) -> dict[float, float]:
     """Values of x = -0.5 m at rest by discount factor."""
-    return {discount: start_value(model, iterate(model.rewards, model.transitions, discount)) for discount in discounts}
+    return {
+        discount: start_value(model, iterate(model.rewards, model.transitions, discount))
+        for discount in discounts
+    }

@@ -54,7 +54,9 @@ actuators = st.builds(Actuator, motor=motors, controller=controllers)
 
 def _with_sensor(actuator, bias, noise):
     errors = {"current_bias": bias, "current_noise": noise}
-    return dataclasses.replace(actuator, controller=dataclasses.replace(actuator.controller, **errors))
+    return dataclasses.replace(
+        actuator, controller=dataclasses.replace(actuator.controller, **errors)
+    )
 
 
 supplies = st.none() | st.builds(
@@ -91,7 +93,12 @@ sampled_loops = st.builds(
     bemf_compensation=st.booleans(),
     max_current=between(0.1, 100) | st.just(float("inf")),
 )
-drives = st.builds(Drive, gear_motors, sampled_loops, st.none() | st.builds(Supply, between(1, 60), zero_or(1e-3, 0.1)))
+drives = st.builds(
+    Drive,
+    gear_motors,
+    sampled_loops,
+    st.none() | st.builds(Supply, between(1, 60), zero_or(1e-3, 0.1)),
+)
 """Motors that could be bought."""
 of_every_family = st.one_of(
     every_actuator,
@@ -99,7 +106,10 @@ of_every_family = st.one_of(
     st.just(IDEAL),
     st.builds(Lag, time_constant=zero_or(1e-3, 5), delay=zero_or(1e-3, 5)),
     st.builds(
-        TorqueSpeed, stall_torque=between(1e-3, 50), no_load_speed=between(0.1, 500), max_torque=between(1e-3, 50)
+        TorqueSpeed,
+        stall_torque=between(1e-3, 50),
+        no_load_speed=between(0.1, 500),
+        max_torque=between(1e-3, 50),
     ),
 )
 """Actuators of all our families."""

@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Inputs, Motor, Supply, find_family, parameters_type
+from codrl_mj.actuators import (
+    Actuator,
+    CurrentLoop,
+    Inputs,
+    Motor,
+    Supply,
+    find_family,
+    parameters_type,
+)
 from codrl_mj.actuators.model import family_name
 from tests.actuators.strategies import actuators, between, supplies
 from tests.reference import of_actuator
@@ -21,11 +29,15 @@ timesteps = between(1e-4, 0.1)
 def advance(actuator, dt, state, torque, speed):
     """State, torque and signals after a step."""
     parameters = parameters_type(type(actuator))(*actuator.numbers)
-    return actuator.advance(parameters, dt, actuator.State(*state), Inputs(torque, 0.0, speed, 0.0, 0.0))
+    return actuator.advance(
+        parameters, dt, actuator.State(*state), Inputs(torque, 0.0, speed, 0.0, 0.0)
+    )
 
 
 def with_substeps(actuator, substeps):
-    return dataclasses.replace(actuator, controller=dataclasses.replace(actuator.controller, substeps=substeps))
+    return dataclasses.replace(
+        actuator, controller=dataclasses.replace(actuator.controller, substeps=substeps)
+    )
 
 
 def available(actuator, current):
@@ -39,22 +51,40 @@ def available(actuator, current):
 
 
 @given(actuators, supplies, timesteps, states, between(-20, 20), between(-20, 20))
-def test_a_step_is_the_papers_under_the_voltage_that_is_left(actuator, supply, dt, state, force, velocity):
+def test_a_step_is_the_papers_under_the_voltage_that_is_left(
+    actuator, supply, dt, state, force, velocity
+):
     actuator = dataclasses.replace(with_substeps(actuator, 1), supply=supply)
     arm, limit = actuator.arm_radius, available(actuator, state[0])
     after, torque, signals = advance(actuator, dt, state, force * arm, velocity / arm)
-    current, integral, error, voltage, delivered = of_actuator(actuator, limit)(dt, *state, force, velocity)
-    # relative to the largest terms, before the limit: a rounding error is no smaller where terms cancel
+    current, integral, error, voltage, delivered = of_actuator(actuator, limit)(
+        dt, *state, force, velocity
+    )
+    # relative to the largest terms, before the limit: a rounding error is no smaller where terms
+    # cancel
     motor, loop = actuator.motor, actuator.controller
-    i_ref, emf = abs(force * arm / motor.torque_constant), motor.back_emf_constant * abs(velocity / arm)
+    i_ref, emf = (
+        abs(force * arm / motor.torque_constant),
+        motor.back_emf_constant * abs(velocity / arm),
+    )
     e_size = i_ref + abs(state[0])
     d_size = (e_size + abs(state[2])) / (dt + loop.derivative_time_constant)
-    u_size = loop.kp * e_size + loop.ki * (abs(state[1]) + e_size * dt) + loop.kd * d_size + loop.kff * i_ref + emf
-    i_size = abs(state[0]) + dt / motor.inductance * (u_size + emf + motor.resistance * abs(state[0]))
+    u_size = (
+        loop.kp * e_size
+        + loop.ki * (abs(state[1]) + e_size * dt)
+        + loop.kd * d_size
+        + loop.kff * i_ref
+        + emf
+    )
+    i_size = abs(state[0]) + dt / motor.inductance * (
+        u_size + emf + motor.resistance * abs(state[0])
+    )
     assert abs(signals.voltage - voltage) <= 1e-12 * u_size
     assert abs(after.current - current) <= 1e-12 * i_size
     assert abs(torque / arm - delivered) <= 1e-12 * motor.torque_constant * i_size / arm
-    assert after.integral == pytest.approx(integral, rel=1e-12, abs=1e-12 * (abs(state[1]) + e_size * dt))
+    assert after.integral == pytest.approx(
+        integral, rel=1e-12, abs=1e-12 * (abs(state[1]) + e_size * dt)
+    )
     assert after.error == pytest.approx(error, rel=1e-12, abs=1e-12 * (e_size + abs(state[2])))
     assert signals.current == after.current
     assert signals.reference_current == force * arm / motor.torque_constant
@@ -63,7 +93,9 @@ def test_a_step_is_the_papers_under_the_voltage_that_is_left(actuator, supply, d
 
 
 @given(actuators, supplies, timesteps, states, between(-20, 20), between(-20, 20))
-def test_substeps_are_that_many_steps_each_with_its_own_sag(actuator, supply, dt, state, torque, speed):
+def test_substeps_are_that_many_steps_each_with_its_own_sag(
+    actuator, supply, dt, state, torque, speed
+):
     actuator = dataclasses.replace(actuator, supply=supply)
     count, after = actuator.controller.substeps, state
     for _ in range(count):
@@ -82,8 +114,12 @@ def test_integral_and_derivative_are_scipys_backward_euler_filters(constant, dt)
     filtering = CurrentLoop(kp=0.0, kd=1.0, max_voltage=math.inf, derivative_time_constant=constant)
     integral, previous, found = 0.0, 0.0, []
     for error in ERRORS:
-        (_, integral, _), *_ = advance(Actuator(controller=leaking), dt, (0.0, integral, 0.0), error, 0.0)
-        (*_, previous), _, signals = advance(Actuator(controller=filtering), dt, (0.0, 0.0, previous), error, 0.0)
+        (_, integral, _), *_ = advance(
+            Actuator(controller=leaking), dt, (0.0, integral, 0.0), error, 0.0
+        )
+        (*_, previous), _, signals = advance(
+            Actuator(controller=filtering), dt, (0.0, 0.0, previous), error, 0.0
+        )
         found.append((integral, signals.voltage))
     for ours, system in zip(
         np.transpose(found), (([1.0], [1.0, constant]), ([1.0, 0.0], [constant, 1.0])), strict=True
@@ -102,12 +138,24 @@ RESTS = {  # name: actuator, torque, speed, steps of 10 ms, current
     "stall": (Actuator(STALLED, STIFF), 1e5, 0.0, 600, 12.0 / 2.0),
     "the supply is the limit": (Actuator(STALLED, STIFF, Supply(6.0)), 1e5, 0.0, 600, 6.0 / 2.0),
     "V/(R + Rs)": (Actuator(STALLED, STIFF, Supply(12.0, 1.0)), 1e5, 0.0, 600, 12.0 / 3.0),
-    "the supply has the controller's voltage": (Actuator(STALLED, STIFF, Supply(math.inf, 1.0)), 1e5, 0.0, 600, 4.0),
+    "the supply has the controller's voltage": (
+        Actuator(STALLED, STIFF, Supply(math.inf, 1.0)),
+        1e5,
+        0.0,
+        600,
+        4.0,
+    ),
     "it sags to more than the controller uses": (
         Actuator(STALLED, CurrentLoop(kp=1e6, max_voltage=6.0), Supply(12.0, 1.0)),
         *(1e5, 0.0, 600, 6.0 / 2.0),
     ),
-    "a first-order lag after 10 steps": (Actuator(Motor(2.0, 0.4), STIFF), 1e5, 0.0, 10, 6.0 * (1.0 - 0.95**10)),
+    "a first-order lag after 10 steps": (
+        Actuator(Motor(2.0, 0.4), STIFF),
+        1e5,
+        0.0,
+        10,
+        6.0 * (1.0 - 0.95**10),
+    ),
     "no load": (Actuator(LINE, STIFF), 1e5, 12.0 / 0.06, 500, 0.0),
     "driven beyond it": (Actuator(LINE, STIFF), 1e5, 13.0 / 0.06, 500, -1.0 / 1.5),
     "the datasheet's line": (Actuator(LINE, STIFF), 1e5, -50.0, 500, (12.0 + 0.06 * 50.0) / 1.5),
@@ -119,7 +167,13 @@ RESTS = {  # name: actuator, torque, speed, steps of 10 ms, current
         *(1.7, 0.0, 1300, 1.7 * 3.5 / 4.5),
     ),
     "feed-forward of R": (Actuator(Motor(3.0), CurrentLoop(kp=0.0, kff=3.0)), 1.1, 0.0, 2000, 1.1),
-    "deadbeat: kp + R = L/dt, kff = R": (Actuator(Motor(1.0, 0.05), CurrentLoop(kp=4.0, kff=1.0)), 1.3, 0.0, 1, 1.3),
+    "deadbeat: kp + R = L/dt, kff = R": (
+        Actuator(Motor(1.0, 0.05), CurrentLoop(kp=4.0, kff=1.0)),
+        1.3,
+        0.0,
+        1,
+        1.3,
+    ),
 }
 
 
@@ -138,20 +192,30 @@ def test_it_ends_where_the_closed_form_says(name, sign):
 
 def test_a_resistance_under_which_the_saturated_current_oscillates_is_refused_with_its_bound():
     # i' = i + (V - Rs*i - R*i)*dt/L: the pole 1 - (R + Rs)*dt/L is -1 at Rs = 2*L/dt - R = 3
-    allowed, refused = (Actuator(supply=Supply(resistance=resistance)) for resistance in (2.99, 3.0))
+    allowed, refused = (
+        Actuator(supply=Supply(resistance=resistance)) for resistance in (2.99, 3.0)
+    )
     assert allowed.check(0.05) is None
     radii = Actuator.instability(np.array([allowed.numbers, refused.numbers]), 0.05)
     np.testing.assert_array_equal(radii < 1.0, [True, False])
-    with pytest.raises(ValueError, match=r"supply\.resistance = 3: must be < 2\*L/dt - R = 3 ohm .* of 0\.05 s"):
+    with pytest.raises(
+        ValueError, match=r"supply\.resistance = 3: must be < 2\*L/dt - R = 3 ohm .* of 0\.05 s"
+    ):
         refused.check(0.05)
     assert with_substeps(refused, 2).check(0.05) is None  # the remedy
 
 
 def test_it_says_what_it_is_made_of():
     actuator = Actuator(Motor(2.0, 0.3, 0.5, arm_radius=0.15), CurrentLoop(max_voltage=math.inf))
-    assert (actuator.winding, actuator.arm_radius, actuator.voltage_limit) == ((2.0, 0.3), 0.15, math.inf)
+    assert (actuator.winding, actuator.arm_radius, actuator.voltage_limit) == (
+        (2.0, 0.3),
+        0.15,
+        math.inf,
+    )
     assert actuator.motor.electrical_time_constant == 0.15
-    limits = [Actuator(supply=supply).voltage_limit for supply in (None, Supply(12.0), Supply(48.0, 1.0))]
+    limits = [
+        Actuator(supply=supply).voltage_limit for supply in (None, Supply(12.0), Supply(48.0, 1.0))
+    ]
     assert limits == [24.0, 12.0, 24.0]
     command = actuator.commands()["current"]
     assert command.actuator is actuator
@@ -165,10 +229,18 @@ def test_it_says_what_it_is_made_of():
 # -- under a commanded voltage ------------------------------------------------------------------------------
 
 
-@given(actuators, supplies, between(1e-4, 0.05), between(-20, 20), between(-150, 150), between(-20, 20))
-def test_the_terminal_voltage_is_the_command_within_what_is_left(actuator, supply, dt, current, volts, speed):
+@given(
+    actuators, supplies, between(1e-4, 0.05), between(-20, 20), between(-150, 150), between(-20, 20)
+)
+def test_the_terminal_voltage_is_the_command_within_what_is_left(
+    actuator, supply, dt, current, volts, speed
+):
     actuator = dataclasses.replace(actuator, supply=supply)
-    command, motor, substeps = actuator.commands()["voltage"], actuator.motor, actuator.controller.substeps
+    command, motor, substeps = (
+        actuator.commands()["voltage"],
+        actuator.motor,
+        actuator.controller.substeps,
+    )
     state, delivered, signals = advance(
         command.actuator, dt, (current, 0.0, 0.0), volts * command.torque_per_unit, speed
     )
@@ -179,26 +251,46 @@ def test_the_terminal_voltage_is_the_command_within_what_is_left(actuator, suppl
         drop = motor.back_emf_constant * speed + motor.resistance * expected
         expected += (voltage - drop) / motor.inductance * (dt / substeps)
         sag = 0.0 if supply is None else supply.resistance
-        size += dt / motor.inductance * (abs(volts) + abs(motor.back_emf_constant * speed)) + abs(expected)
+        size += dt / motor.inductance * (abs(volts) + abs(motor.back_emf_constant * speed)) + abs(
+            expected
+        )
         size *= 1 + (motor.resistance + sag) * dt / motor.inductance
     assert signals.voltage == pytest.approx(voltage, rel=1e-12, abs=1e-12 * size * (sag > 0.0))
     assert state.current == pytest.approx(expected, rel=1e-12, abs=1e-12 * size)
     assert delivered == motor.torque_constant * state.current
-    assert signals.reference_current == signals.current == state.current  # what follows counts as asked for
+    assert (
+        signals.reference_current == signals.current == state.current
+    )  # what follows counts as asked for
 
 
 def test_under_a_voltage_only_the_winding_is_left_and_the_sensor_drives_nothing():
-    actuator = Actuator(controller=CurrentLoop(5.0, 3.0, 1e-3, substeps=2, integral_leak=1.0, current_bias=0.5))
+    actuator = Actuator(
+        controller=CurrentLoop(5.0, 3.0, 1e-3, substeps=2, integral_leak=1.0, current_bias=0.5)
+    )
     command = actuator.commands()["voltage"]
     driven, loop = command.actuator, command.actuator.controller
     assert (actuator.tracks, driven.tracks) == (True, False)
-    assert (loop.kp, loop.ki, loop.kd, loop.integral_leak, loop.bemf_compensation) == (0, 0, 0, 0, False)
+    assert (loop.kp, loop.ki, loop.kd, loop.integral_leak, loop.bemf_compensation) == (
+        0,
+        0,
+        0,
+        0,
+        False,
+    )
     assert (loop.substeps, command.limit) == (2, 24.0)
-    kept = {"motor.resistance", "motor.inductance", "motor.back_emf_constant", "controller.substeps"}
+    kept = {
+        "motor.resistance",
+        "motor.inductance",
+        "motor.back_emf_constant",
+        "controller.substeps",
+    }
     fields = {f"motor.{field.name}" for field in dataclasses.fields(Motor)}
     fields |= {f"controller.{field.name}" for field in dataclasses.fields(CurrentLoop)}
     assert {*command.fixed} == fields - kept
     assert advance(driven, 0.01, (1.0, 0.0, 0.0), 7.0, 2.0)[2].voltage == 7.0
-    parameters, rest = parameters_type(type(driven))(*driven.numbers), Inputs(0.0, 0.0, 0.0, 0.0, 0.0)
+    parameters, rest = (
+        parameters_type(type(driven))(*driven.numbers),
+        Inputs(0.0, 0.0, 0.0, 0.0, 0.0),
+    )
     assert driven.observe(parameters, 0.01, driven.Signals(1.5, 1.5, 7.0, 0.0), rest) == (2.0, 2.0)
     assert find_family(family_name(type(driven))) is type(driven)

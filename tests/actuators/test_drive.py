@@ -17,7 +17,8 @@ from codrl_mj.actuators import Drive, GearMotor, Inputs, SampledLoop, Supply, pa
 from codrl_mj.actuators.sampled import designed_gains, jump, run_samples
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 
-# R [ohm], L [H], K [N*m/A], V [V]: maxon EC45 flat, DCX22L; Faulhaber 1331T; T-motor AK80-6; QUBE-Servo 2; PMG-132
+# R [ohm], L [H], K [N*m/A], V [V]: maxon EC45 flat, DCX22L; Faulhaber 1331T; T-motor AK80-6;
+# QUBE-Servo 2; PMG-132
 WINDINGS = {
     "ec45": (0.464, 0.322e-3, 25.1e-3, 24.0),
     "dcx22l": (0.168, 0.018e-3, 6.95e-3, 9.0),
@@ -44,14 +45,20 @@ def responses(one, timestep, torques, speeds):
     parameters, state = parameters_type(Drive)(*one.numbers), one.State(*[0.0] * 9)
     found = []
     for torque, speed in zip(torques, speeds, strict=True):
-        state, delivered, signals = one.advance(parameters, timestep, state, Inputs(torque, 0.0, speed, 0.0, 0.0))
+        state, delivered, signals = one.advance(
+            parameters, timestep, state, Inputs(torque, 0.0, speed, 0.0, 0.0)
+        )
         found.append((state, delivered, signals))
     return found
 
 
 def limits_of(signals):
     """Names of the limits that a step met; `saturated` says whether there are any."""
-    met = [name for name in ("voltage", "current", "temperature") if getattr(signals, f"{name}_saturated")]
+    met = [
+        name
+        for name in ("voltage", "current", "temperature")
+        if getattr(signals, f"{name}_saturated")
+    ]
     assert signals.saturated == float(bool(met))
     return " ".join(met)
 
@@ -64,7 +71,9 @@ def test_the_winding_is_exact_and_what_is_delivered_is_its_mean(name, compensate
     one, timestep, rng = drive(name, bemf_compensation=compensated), 0.002, np.random.default_rng(0)
     torques = rng.uniform(-2, 2, 20) * constant * voltage / resistance
     speeds = rng.uniform(-1, 1, 20) * voltage / constant
-    kp, ki = designed_gains(resistance, inductance, 1 / 20e3, 2 * math.pi * DEFAULT_BANDWIDTH * 20e3)
+    kp, ki = designed_gains(
+        resistance, inductance, 1 / 20e3, 2 * math.pi * DEFAULT_BANDWIDTH * 20e3
+    )
     a, b = -resistance / inductance, 1 / inductance
     exact = expm(np.array([[a, 0, b], [1, 0, 0], [0, 0, 0]]) / 20e3)  # of current, charge, voltage
     current, integral = 0.0, 0.0
@@ -96,17 +105,24 @@ def test_the_winding_is_exact_and_what_is_delivered_is_its_mean(name, compensate
     ],
     ids=["closed_form", "uncompensated", "stepped", "limited", "voltage"],
 )
-def test_what_is_drawn_is_heat_work_and_field_as_a_fine_integration_has_them(loop, supply, commanded):
+def test_what_is_drawn_is_heat_work_and_field_as_a_fine_integration_has_them(
+    loop, supply, commanded
+):
     """Volts times amperes and R*i^2 within the samples, by scipy under the voltages of a loop that is seen in each."""
     resistance, inductance, constant, voltage = WINDINGS["qube"]
     one, samples, rng = drive("qube", **loop), 40, np.random.default_rng(2)
     one = dataclasses.replace(one, supply=Supply(voltage, supply))
-    torques = rng.uniform(-1.5, 1.5, 5) * constant * (voltage if commanded else voltage / resistance)
+    torques = (
+        rng.uniform(-1.5, 1.5, 5) * constant * (voltage if commanded else voltage / resistance)
+    )
     speeds = rng.uniform(-0.8, 0.8, 5) * voltage / constant
     one = one.commands()["voltage"].actuator if commanded else one
     whole = [step[2] for step in responses(one, samples / 20e3, torques, speeds)]
     fine = responses(one, 1 / 20e3, np.repeat(torques, samples), np.repeat(speeds, samples))
-    volts, starts = [step[2].voltage for step in fine], np.append(0.0, [step[0].current for step in fine])
+    volts, starts = (
+        [step[2].voltage for step in fine],
+        np.append(0.0, [step[0].current for step in fine]),
+    )
     energies = []
     for number, back_emf in enumerate(np.repeat(constant * speeds, samples)):
 
@@ -117,8 +133,12 @@ def test_what_is_drawn_is_heat_work_and_field_as_a_fine_integration_has_them(loo
         energies.append(found.y[1:, -1])
     drawn, heat = np.array(energies).reshape(5, samples, 2).sum(axis=1).T * 20e3 / samples
     watts = voltage**2 / resistance
-    np.testing.assert_allclose([step.electrical_power for step in whole], drawn, rtol=0, atol=1e-9 * watts)
-    np.testing.assert_allclose([step.copper_loss for step in whole], heat, rtol=0, atol=1e-9 * watts)
+    np.testing.assert_allclose(
+        [step.electrical_power for step in whole], drawn, rtol=0, atol=1e-9 * watts
+    )
+    np.testing.assert_allclose(
+        [step.copper_loss for step in whole], heat, rtol=0, atol=1e-9 * watts
+    )
     moved = constant * speeds * [step.current for step in whole]
     field = np.diff(0.5 * inductance * starts[::samples] ** 2) * 20e3 / samples
     balance = [step.electrical_power - step.copper_loss for step in whole] - moved - field
@@ -147,7 +167,9 @@ def test_the_closed_form_is_the_stepping(name, rate, bandwidth, samples, command
     parameters = parameters_type(Drive)(*drive(name, rate).numbers)
     current, integral, stepped, volts = 0.0, 0.0, 0.0, 0.0
     for reference, back_emf in commands:
-        reference, back_emf = ((2 * one - 1) * amplitude * voltage for one in (reference, 0.4 * back_emf))
+        reference, back_emf = (
+            (2 * one - 1) * amplitude * voltage for one in (reference, 0.4 * back_emf)
+        )
         reference /= resistance
         limits = ((sign * voltage - back_emf) / resistance for sign in (-1, 1))
         current, integral, total, drawn, _ = jump(
@@ -171,7 +193,9 @@ def loop_of(one, gains):
     decay = math.exp(-motor.resistance * time / motor.inductance)
     plant = control.TransferFunction([(1 - decay) / motor.resistance], [1, -decay], time)
     pi = control.TransferFunction([kp + ki, -kp], [1, -1], time)
-    return pi * plant * control.TransferFunction([1], [1, 0] if one.controller.delayed else [1], time)
+    return (
+        pi * plant * control.TransferFunction([1], [1, 0] if one.controller.delayed else [1], time)
+    )
 
 
 @every_winding
@@ -201,24 +225,33 @@ def test_the_margins_are_those_of_the_design(name):
 
 
 @pytest.mark.parametrize(
-    ("anti_windup", "least", "most"), [("back_calculation", 0, 1), ("clamping", 0, 3), ("none", 15, 60)]
+    ("anti_windup", "least", "most"),
+    [("back_calculation", 0, 1), ("clamping", 0, 3), ("none", 15, 60)],
 )
-def test_after_what_could_not_be_reached_it_recovers_within_a_millisecond_or_not(anti_windup, least, most):
+def test_after_what_could_not_be_reached_it_recovers_within_a_millisecond_or_not(
+    anti_windup, least, most
+):
     """20 ms of a current that the voltage cannot make at this speed, then one that it can."""
     resistance, _, constant, voltage = WINDINGS["qube"]
     one, speed = drive("qube", anti_windup=anti_windup), 0.5 * voltage / constant
     amperes = voltage / resistance * np.array([0.9] * 400 + [0.2] * 2000)
-    currents = np.array([step[0].current for step in responses(one, 1 / 20e3, constant * amperes, [speed] * 2400)])
+    currents = np.array(
+        [step[0].current for step in responses(one, 1 / 20e3, constant * amperes, [speed] * 2400)]
+    )
     wrong = np.abs(currents[400:] / amperes[400:] - 1.0) > 0.05
     assert least <= np.flatnonzero(wrong)[-1] / 20 <= most  # [ms]
 
 
 def test_the_gear_turns_torque_speed_inertia_and_friction():
-    motor = GearMotor(rotor_inertia=2e-6, gear_ratio=10.0, coulomb_friction=1e-3, viscous_friction=1e-5)
+    motor = GearMotor(
+        rotor_inertia=2e-6, gear_ratio=10.0, coulomb_friction=1e-3, viscous_friction=1e-5
+    )
     one = Drive(motor)
     assert one.arm_radius == 0.1
     np.testing.assert_allclose(one.additions, (2e-4, 1e-3, 1e-2))
-    np.testing.assert_allclose(Drive(dataclasses.replace(motor, arm_radius=0.5)).additions, (8e-4, 4e-3, 2e-2))
+    np.testing.assert_allclose(
+        Drive(dataclasses.replace(motor, arm_radius=0.5)).additions, (8e-4, 4e-3, 2e-2)
+    )
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -252,12 +285,18 @@ def test_the_largest_current_is_kept():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: GearMotor(gear_ratio=0), r"GearMotor\.gear_ratio = 0: must be a finite number > 0"),
+        (
+            lambda: GearMotor(gear_ratio=0),
+            r"GearMotor\.gear_ratio = 0: must be a finite number > 0",
+        ),
         (
             lambda: SampledLoop(anti_windup="yes"),
             r"anti_windup = 'yes': must be one of back_calculation, clamping, none",
         ),
-        (lambda: SampledLoop(10e3, bandwidth=5e3), r"bandwidth = 5000: must be <= 1591.55 Hz at sample_rate = 10000"),
+        (
+            lambda: SampledLoop(10e3, bandwidth=5e3),
+            r"bandwidth = 5000: must be <= 1591.55 Hz at sample_rate = 10000",
+        ),
         (lambda: Drive(supply=24.0), r"Drive\.supply = 24\.0: must be a Supply"),
         (
             lambda: Drive().check(0.00123),
@@ -277,20 +316,32 @@ def test_bad_input_is_refused(make, message):
 
 def test_a_datasheet_makes_a_motor():
     motor = GearMotor.from_datasheet(
-        resistance="0.464 ohm", inductance="0.322 mH", torque_constant="25.1 mN*m/A", rotor_inertia="135 g*cm^2"
+        resistance="0.464 ohm",
+        inductance="0.322 mH",
+        torque_constant="25.1 mN*m/A",
+        rotor_inertia="135 g*cm^2",
     )
-    assert dataclasses.astuple(motor)[:5] == pytest.approx((0.464, 0.322e-3, 0.0251, 0.0251, 1.35e-5), rel=1e-12)
+    assert dataclasses.astuple(motor)[:5] == pytest.approx(
+        (0.464, 0.322e-3, 0.0251, 0.0251, 1.35e-5), rel=1e-12
+    )
 
 
-# name: gear ratio, rotor inertia, and a load [kg*m^2] that is light for it: its speed cannot be held for 20 ms
-STIFF = {"dcx22l": (35.0, 9.37e-7, 2e-3), "ak80-6": (6.0, 6.07e-5, 2e-2), "1331t": (43.0, 0.71e-7, 2e-4)}
+# name: gear ratio, rotor inertia, and a load [kg*m^2] that is light for it: its speed cannot be
+# held for 20 ms
+STIFF = {
+    "dcx22l": (35.0, 9.37e-7, 2e-3),
+    "ak80-6": (6.0, 6.07e-5, 2e-2),
+    "1331t": (43.0, 0.71e-7, 2e-4),
+}
 
 
 def stiff(name, told):
     """A motor that is told what it moves [kg*m^2]; 0: by the model."""
     resistance, inductance, constant, voltage = WINDINGS[name]
     ratio, inertia, _ = STIFF[name]
-    motor = GearMotor(resistance, inductance, constant, constant, inertia, gear_ratio=ratio, load_inertia=told)
+    motor = GearMotor(
+        resistance, inductance, constant, constant, inertia, gear_ratio=ratio, load_inertia=told
+    )
     return Drive(motor, SampledLoop(20e3), Supply(voltage))
 
 
@@ -302,7 +353,9 @@ def links(name, timestep, count):
         body = body.add_body(pos=[0.0, 0.0, -0.12 * link])
         body.explicitinertial, body.mass, body.inertia = True, 0.05, [STIFF[name][2] / count] * 3
         body.add_joint(name=f"joint{link}", axis=[0.0, 1.0, 0.0])
-        actuator = spec.add_actuator(name=f"a{link}", target=f"joint{link}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator = spec.add_actuator(
+            name=f"a{link}", target=f"joint{link}", trntype=mujoco.mjtTrn.mjTRN_JOINT
+        )
         actuator.set_to_motor()
     return spec
 
@@ -320,7 +373,14 @@ def reversals(name, timestep, loads, allow_unstable=False):
     model = chain(name, timestep, loads, allow_unstable)
     data, speeds = mujoco.MjData(model), []
     for step in range(round(1.0 / timestep)):
-        data.ctrl[:] = (-1) ** int((step + 0.5) * timestep / 0.2) * 0.9 * constant * ratio * voltage / resistance
+        data.ctrl[:] = (
+            (-1) ** int((step + 0.5) * timestep / 0.2)
+            * 0.9
+            * constant
+            * ratio
+            * voltage
+            / resistance
+        )
         mujoco.mj_step(model, data)
         speeds.append(data.qvel.copy())
     return np.array(speeds), voltage / (constant * ratio)
@@ -352,20 +412,28 @@ def test_an_arm_of_two_light_links_stays_bounded_at_20_ms_and_is_right_at_2(name
 
 
 def test_a_speed_that_cannot_be_held_is_refused_and_one_that_is_wrong_warned_of():
-    with pytest.raises(ValueError, match=r"^a0: .*takes 2\.\d+ of the rotor's speed .* leave motor.load_inertia 0"):
+    with pytest.raises(
+        ValueError, match=r"^a0: .*takes 2\.\d+ of the rotor's speed .* leave motor.load_inertia 0"
+    ):
         chain("dcx22l", 0.02, [math.inf])
     with pytest.warns(UserWarning, match=r"above 0\.5 it is wrong"):
         chain("1331t", 0.02, [math.inf])
     with pytest.warns(UserWarning, match=r"takes 22\.4 of the rotor's speed .* shorten the step"):
         chain("dcx22l", 0.2, [0.0])
-    light = dataclasses.replace(Drive(), motor=GearMotor(rotor_inertia=0.0), controller=SampledLoop(500.0))
+    light = dataclasses.replace(
+        Drive(), motor=GearMotor(rotor_inertia=0.0), controller=SampledLoop(500.0)
+    )
     with pytest.raises(ValueError, match=r"raise controller\.sample_rate"):
         light.check_shaft(0.002, 1e-7)
 
 
 def test_a_physics_that_holds_the_speed_over_a_step_judges_it_so():
     """On MuJoCo the drive follows its speed within the step; Gymnasium's equations hold it."""
-    drive = Drive(GearMotor(0.315, 0.4e-3, 0.0203, 0.0203, 0.0, gear_ratio=120.0), SampledLoop(20e3), Supply(24.0))
+    drive = Drive(
+        GearMotor(0.315, 0.4e-3, 0.0203, 0.0203, 0.0, gear_ratio=120.0),
+        SampledLoop(20e3),
+        Supply(24.0),
+    )
     assert 0.05 * 120**2 * 0.0203**2 / (0.315 / 3) > 2  # its rod has an inertia of 1/3 kg*m^2
     codrl_mj.make("pendulum", drive, inner_steps=1).close()
     with pytest.raises(ValueError, match=r"over which that is held, must be < 2; shorten the step"):
@@ -378,7 +446,9 @@ def test_several_drives_on_a_joint_are_judged_together():
     spec.add_actuator(name="b", target="joint0", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
     one = stiff("dcx22l", 0.0)
     codrl_mj.motorise(spec, {"a0": one})
-    with pytest.raises(ValueError, match=r"in 0\.02 s over which that is held, must be < 2; shorten the step"):
+    with pytest.raises(
+        ValueError, match=r"in 0\.02 s over which that is held, must be < 2; shorten the step"
+    ):
         codrl_mj.motorise(spec, {"a0": one, "b": one})
 
 
@@ -402,7 +472,9 @@ def test_a_drive_that_was_switched_off_begins_anew():
 
 def test_a_winding_far_quicker_than_the_samples_has_gains_too():
     """exp(R*T/L) is beyond floating point."""
-    quick = Drive(GearMotor(resistance=20.0, inductance=1e-5), SampledLoop(1e3, delayed=True), Supply(24.0))
+    quick = Drive(
+        GearMotor(resistance=20.0, inductance=1e-5), SampledLoop(1e3, delayed=True), Supply(24.0)
+    )
     assert quick.check(0.002) is None
     state, *_ = responses(quick, 0.002, [0.042 * 0.5] * 200, [0.0] * 200)[-1]
     assert state.current == pytest.approx(0.5)

@@ -20,29 +20,50 @@ from tests.actuators.strategies import between, zero_or
     st.just(0.0) | between(0.01, 1.0),
     between(0.1, 2.0),
 )
-def test_it_is_the_exact_answer_to_the_interpolated_commands(commands, step, time_constant, whole, fraction, gain):
+def test_it_is_the_exact_answer_to_the_interpolated_commands(
+    commands, step, time_constant, whole, fraction, gain
+):
     """Any commands, step, time constant, delay and gain, against scipy's zero-order hold of 1/(1 + T*s).
 
-    A delay between whole steps mixes its neighbours: a held command that arrives within a step is its mean over it.
+    A delay between whole steps mixes its neighbours: a held command that arrives within a step is
+    its mean over it.
     """
-    lag, count, delay = Lag(time_constant, (whole + fraction) * step, gain), len(commands), whole + fraction
-    parameters, state, found = parameters_type(Lag)(*lag.numbers), lag.State(*[0.0] * len(lag.State._fields)), []
+    lag, count, delay = (
+        Lag(time_constant, (whole + fraction) * step, gain),
+        len(commands),
+        whole + fraction,
+    )
+    parameters, state, found = (
+        parameters_type(Lag)(*lag.numbers),
+        lag.State(*[0.0] * len(lag.State._fields)),
+        [],
+    )
     for index, command in enumerate(commands):
-        state, torque, _ = lag.advance(parameters, step, state, Inputs(command, 0.0, 0.0, index * step, 0.0))
+        state, torque, _ = lag.advance(
+            parameters, step, state, Inputs(command, 0.0, 0.0, index * step, 0.0)
+        )
         found.append(torque)
     earlier = np.arange(-HISTORY, count)
-    arrived = gain * np.interp(np.arange(count) - delay, earlier, np.concatenate([np.zeros(HISTORY), commands]))
+    arrived = gain * np.interp(
+        np.arange(count) - delay, earlier, np.concatenate([np.zeros(HISTORY), commands])
+    )
     expected = arrived
     if time_constant:
-        system = tuple(np.array([[value]]) for value in (-1.0 / time_constant, 1.0 / time_constant, 1.0, 0.0))
+        system = tuple(
+            np.array([[value]]) for value in (-1.0 / time_constant, 1.0 / time_constant, 1.0, 0.0)
+        )
         a, b, *_ = signal.cont2discrete(system, step, "zoh")
         expected = signal.lfilter(b[0], [1.0, -a[0, 0]], arrived)
-    np.testing.assert_allclose(found, expected, atol=1e-7 if fraction else 1e-12)  # 1e-9 of a step is none
+    np.testing.assert_allclose(
+        found, expected, atol=1e-7 if fraction else 1e-12
+    )  # 1e-9 of a step is none
 
 
 def test_delays_longer_than_what_is_remembered_are_refused():
     Lag(delay=HISTORY * 0.01).check(0.01)
-    with pytest.raises(ValueError, match=r"Lag\.delay = 0\.0801: must be <= 0\.08 s, 8 steps of 0\.01 s"):
+    with pytest.raises(
+        ValueError, match=r"Lag\.delay = 0\.0801: must be <= 0\.08 s, 8 steps of 0\.01 s"
+    ):
         Lag(delay=0.0801).check(0.01)
 
 

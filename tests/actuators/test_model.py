@@ -100,11 +100,21 @@ def test_an_absent_part_and_one_of_its_numbers_are_one_actuator():
     assert Nested.from_numbers(Nested(maybe=Inner(5.0)).numbers, 0.5) == Nested(maybe=Inner(5.0))
     found = Nested.from_numbers((0.0, 2.0, 7.0, 4.0, 2.0), 0.25)
     assert found == Nested(0.25, False, Inner(2.0, 7))
-    assert (type(found.always.count), found.on) == (int, False)  # whole numbers and flags come back as such
+    assert (type(found.always.count), found.on) == (
+        int,
+        False,
+    )  # whole numbers and flags come back as such
 
 
 def test_paths_are_those_of_all_fields_and_parameters_all_but_the_arm():
-    assert field_paths(Nested) == ("arm_radius", "on", "always.gain", "always.count", "maybe.gain", "maybe.count")
+    assert field_paths(Nested) == (
+        "arm_radius",
+        "on",
+        "always.gain",
+        "always.count",
+        "maybe.gain",
+        "maybe.count",
+    )
     assert dict(parameter_paths(Nested)) == {
         "on": "on",
         "gain": "always.gain",
@@ -128,10 +138,21 @@ class Twice(ActuatorModel):
 
 LOOP = parameters_type(Actuator)(*Actuator().numbers)
 LEAST = {  # field: the least that it may be, or what it must be more than
-    "Motor": {">": ("resistance", "inductance", "torque_constant", "arm_radius"), ">=": ("back_emf_constant",)},
+    "Motor": {
+        ">": ("resistance", "inductance", "torque_constant", "arm_radius"),
+        ">=": ("back_emf_constant",),
+    },
     "CurrentLoop": {
         ">": ("max_voltage",),
-        ">=": ("kp", "ki", "kd", "kff", "integral_leak", "derivative_time_constant", "current_noise"),
+        ">=": (
+            "kp",
+            "ki",
+            "kd",
+            "kff",
+            "integral_leak",
+            "derivative_time_constant",
+            "current_noise",
+        ),
     },
     "Supply": {">": ("voltage",), ">=": ("resistance",)},
 }
@@ -152,7 +173,10 @@ def test_quantities_have_their_bounds(kind, field, sign):
     refused = [-1e-9, -math.inf, math.nan, *[0.0] * (sign == ">"), *[math.inf] * (not infinite)]
     assert not infinite or getattr(kind(**{field: math.inf}), field) == math.inf
     for value in refused:
-        said = f"{kind.__name__}.{field} = {value!r}: must be {'a' if infinite else 'a finite'} number {sign} 0"
+        said = (
+            f"{kind.__name__}.{field} = {value!r}: must be {'a' if infinite else 'a finite'} number"
+            f" {sign} 0"
+        )
         with pytest.raises(ValueError, match=f"^{re.escape(said)}$"):
             kind(**{field: value})
 
@@ -160,26 +184,62 @@ def test_quantities_have_their_bounds(kind, field, sign):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Nested(always=Supply()), r"Nested\.always = .*: must be a Inner; .*Nested\.from_mapping"),
-        (lambda: Nested(maybe=Supply()), r"Nested\.maybe = .*: must be a Inner; .*Nested\.from_mapping"),
+        (
+            lambda: Nested(always=Supply()),
+            r"Nested\.always = .*: must be a Inner; .*Nested\.from_mapping",
+        ),
+        (
+            lambda: Nested(maybe=Supply()),
+            r"Nested\.maybe = .*: must be a Inner; .*Nested\.from_mapping",
+        ),
         (lambda: Nested(always=None), r"Nested\.always = None: must be a Inner"),
         (lambda: Actuator(motor={}), r"Actuator\.motor = .*must be a Motor.*from_mapping"),
-        (lambda: parameter_paths(Twice), r"Twice: another parameter has the same name as gain: rename one"),
-        (lambda: CurrentLoop(current_bias=math.inf), r"CurrentLoop\.current_bias = inf: must be a finite number$"),
+        (
+            lambda: parameter_paths(Twice),
+            r"Twice: another parameter has the same name as gain: rename one",
+        ),
+        (
+            lambda: CurrentLoop(current_bias=math.inf),
+            r"CurrentLoop\.current_bias = inf: must be a finite number$",
+        ),
         (lambda: CurrentLoop(substeps=0), r"CurrentLoop\.substeps = 0: must be an integer >= 1"),
-        (lambda: CurrentLoop(bemf_compensation=1), r"CurrentLoop\.bemf_compensation = 1: must be true or false"),
+        (
+            lambda: CurrentLoop(bemf_compensation=1),
+            r"CurrentLoop\.bemf_compensation = 1: must be true or false",
+        ),
         (lambda: Lag(gain=0.0), r"Lag\.gain = 0\.0: must be a finite number > 0"),
         (lambda: Nested.from_numbers((0.0,) * 3), "zip"),
         (lambda: Nested.from_numbers((0.0,) * 6), "zip"),
-        (lambda: Nested.from_numbers((0.5, 2.0, 7.0, 4.0, 2.0)), r"Nested\.on = 0\.5: must be true or false"),
+        (
+            lambda: Nested.from_numbers((0.5, 2.0, 7.0, 4.0, 2.0)),
+            r"Nested\.on = 0\.5: must be true or false",
+        ),
         (lambda: Actuator.from_numbers(LOOP._replace(substeps=1.5)), r"\.substeps = 1\.5"),
         (lambda: Actuator.from_numbers(LOOP._replace(substeps=math.inf)), r"\.substeps = inf"),
-        (lambda: Actuator.from_numbers(LOOP._replace(bemf_compensation=2.0)), r"\.bemf_compensation = 2"),
-        (lambda: Actuator.from_numbers(LOOP._replace(supply_resistance=-1.0)), r"Supply\.resistance = -1\.0"),
-        (lambda: Actuator.from_numbers(LOOP, 0.0), r"Motor\.arm_radius = 0\.0: must be a finite number > 0"),
-        (lambda: Actuator().replaced({"controller.substeps": 1.5}), r"substeps = 1\.5: must be an integer >= 1"),
-        (lambda: Actuator().replaced({"motor.inductanc": 1.0}), "unknown actuator field motor.inductanc"),
-        (lambda: Actuator().replaced({"motr.inductance": 1.0}), "unknown actuator field motr.inductance"),
+        (
+            lambda: Actuator.from_numbers(LOOP._replace(bemf_compensation=2.0)),
+            r"\.bemf_compensation = 2",
+        ),
+        (
+            lambda: Actuator.from_numbers(LOOP._replace(supply_resistance=-1.0)),
+            r"Supply\.resistance = -1\.0",
+        ),
+        (
+            lambda: Actuator.from_numbers(LOOP, 0.0),
+            r"Motor\.arm_radius = 0\.0: must be a finite number > 0",
+        ),
+        (
+            lambda: Actuator().replaced({"controller.substeps": 1.5}),
+            r"substeps = 1\.5: must be an integer >= 1",
+        ),
+        (
+            lambda: Actuator().replaced({"motor.inductanc": 1.0}),
+            "unknown actuator field motor.inductanc",
+        ),
+        (
+            lambda: Actuator().replaced({"motr.inductance": 1.0}),
+            "unknown actuator field motr.inductance",
+        ),
     ],
 )
 def test_what_is_no_actuator_is_refused_with_field_value_and_bound(make, message):
@@ -190,8 +250,19 @@ def test_what_is_no_actuator_is_refused_with_field_value_and_bound(make, message
 def test_a_current_loop_by_default_is_the_papers_motor_under_a_proportional_gain():
     assert Motor() == Motor(1.0, 0.1, 1.0, 1.0, 1.0)
     loop = CurrentLoop()
-    assert (loop.ki, loop.kd, loop.kff, loop.integral_leak, loop.derivative_time_constant) == (0, 0, 0, 0, 0)
-    assert (loop.current_bias, loop.current_noise, loop.bemf_compensation, loop.substeps) == (0, 0, True, 1)
+    assert (loop.ki, loop.kd, loop.kff, loop.integral_leak, loop.derivative_time_constant) == (
+        0,
+        0,
+        0,
+        0,
+        0,
+    )
+    assert (loop.current_bias, loop.current_noise, loop.bemf_compensation, loop.substeps) == (
+        0,
+        0,
+        True,
+        1,
+    )
     assert Actuator().supply is None
     with pytest.raises(dataclasses.FrozenInstanceError):
         loop.ki = 2.0
@@ -199,12 +270,18 @@ def test_a_current_loop_by_default_is_the_papers_motor_under_a_proportional_gain
 
 def test_fields_are_replaced_by_their_path():
     base = Actuator(Motor(resistance=2.0), CurrentLoop(kp=3.0))
-    changed = base.replaced({"motor.inductance": 0.2, "controller.substeps": 4.0, "controller.bemf_compensation": 0.0})
+    changed = base.replaced(
+        {"motor.inductance": 0.2, "controller.substeps": 4.0, "controller.bemf_compensation": 0.0}
+    )
     loop = CurrentLoop(kp=3.0, substeps=4, bemf_compensation=False)
     assert changed == Actuator(Motor(resistance=2.0, inductance=0.2), loop)
     assert Lag(0.1).replaced({"delay": 0.2}) == Lag(0.1, 0.2)
-    assert Actuator(supply=Supply()).replaced({"supply.voltage": 12.0}).supply == Supply(voltage=12.0)
-    assert base.replaced({"supply.voltage": 12.0}).supply == Supply(voltage=12.0)  # over what no supply stands for
+    assert Actuator(supply=Supply()).replaced({"supply.voltage": 12.0}).supply == Supply(
+        voltage=12.0
+    )
+    assert base.replaced({"supply.voltage": 12.0}).supply == Supply(
+        voltage=12.0
+    )  # over what no supply stands for
     assert base.replaced({}) == base
 
 

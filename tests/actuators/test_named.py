@@ -68,13 +68,17 @@ PAPER_GAINS = {
 @every_rebuilt
 def test_named_actuators_are_the_papers_motor_and_gains_and_variations_of_them(task):
     kp, ki, kd, kff, arm = PAPER_GAINS[task]
-    motor = Motor(resistance=1.0, inductance=0.1, torque_constant=1.0, back_emf_constant=1.0, arm_radius=arm)
+    motor = Motor(
+        resistance=1.0, inductance=0.1, torque_constant=1.0, back_emf_constant=1.0, arm_radius=arm
+    )
     expected = {
         "paper": Actuator(motor, CurrentLoop(kp, ki, kd, kff, max_voltage=24.0)),
         "weak": Actuator(motor, CurrentLoop(kp=1.0, ki=1.0)),
         "weaker": Actuator(motor, CurrentLoop(kp=0.2, ki=0.2)),
         # u = R*i_ref is the voltage at which i_ref is at rest
-        "open_loop": Actuator(dataclasses.replace(motor, inductance=0.5), CurrentLoop(kp=0.0, kff=motor.resistance)),
+        "open_loop": Actuator(
+            dataclasses.replace(motor, inductance=0.5), CurrentLoop(kp=0.0, kff=motor.resistance)
+        ),
     }
     assert {name: named_actuator(name, task) for name in NAMED} == {"ideal": IDEAL, **expected}
     assert len(TASKS[task].paper) == len(TASKS[task].motors)
@@ -89,7 +93,9 @@ def test_named_actuators_are_the_papers_motor_and_gains_and_variations_of_them(t
 FED = Actuator(Motor(resistance=3.0), supply=Supply(12.0, 0.5))
 BY_HAND = "motor: {resistance: 2}\ncontroller:\n  kp: 1.5  # V/A\n  max_voltage: .inf\n"
 FILES = {  # JSON is YAML
-    **{f"lag{kind}": json.dumps(Lag(0.2, 0.01).as_mapping()) for kind in (".yaml", ".yml", ".json")},
+    **{
+        f"lag{kind}": json.dumps(Lag(0.2, 0.01).as_mapping()) for kind in (".yaml", ".yml", ".json")
+    },
     "fed.json": json.dumps(FED.as_mapping()),
     "mine.json": json.dumps(MINE.as_mapping()),
     "by_hand.yaml": BY_HAND,
@@ -103,8 +109,20 @@ FILES = {  # JSON is YAML
     "slipped/unreadable.py": "def :",
     "slipped/other.py": "MINES = 1",
 }
-WRONG_FILES = ("{", "3", "", "[1, 2]", "family: lagg", "motr: {}", "motor: 3", "controller: {kp: -1}", "1: 2")
-WRONG_FILES = {f"wrong{index}.yaml": text for index, text in enumerate((*WRONG_FILES, "controller: {kp: }"))}
+WRONG_FILES = (
+    "{",
+    "3",
+    "",
+    "[1, 2]",
+    "family: lagg",
+    "motr: {}",
+    "motor: 3",
+    "controller: {kp: -1}",
+    "1: 2",
+)
+WRONG_FILES = {
+    f"wrong{index}.yaml": text for index, text in enumerate((*WRONG_FILES, "controller: {kp: }"))
+}
 
 
 @pytest.fixture
@@ -147,7 +165,10 @@ def over(part, **fields):
         *((f"lag{kind}", Lag(0.2, 0.01)) for kind in (".yaml", ".yml", ".json")),
         ("fed.json", FED),
         ("mine.json", MINE),
-        ("by_hand.yaml", Actuator(Motor(resistance=2.0), CurrentLoop(kp=1.5, max_voltage=math.inf))),
+        (
+            "by_hand.yaml",
+            Actuator(Motor(resistance=2.0), CurrentLoop(kp=1.5, max_voltage=math.inf)),
+        ),
         ("over.yaml", over("motor", resistance=2.0)),
         ({"name": "weak", "controller": {"kp": 5.0}}, over("controller", kp=5.0)),
     ],
@@ -163,31 +184,64 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ("papr", r"^unknown actuator 'papr': did you mean 'paper'\? It can be module:NAME of your own$"),
+        (
+            "papr",
+            r"^unknown actuator 'papr': did you mean 'paper'\? It can be module:NAME of your own$",
+        ),
         ("weakest", r"'weakest': did you mean 'weaker'\?"),
         ("open-loop", r"'open-loop': did you mean 'open_loop'\?"),
-        ("maxon-ec45", r"'maxon-ec45': did you mean 'maxon-ec45-flat-339285' or 'maxon-ec45-flat-50w'\?"),
+        (
+            "maxon-ec45",
+            r"'maxon-ec45': did you mean 'maxon-ec45-flat-339285' or 'maxon-ec45-flat-50w'\?",
+        ),
         ("Maxon-EC45-flat-50", r"did you mean 'maxon-ec45-flat-50w'\?"),
         (
             "12345",
-            r"'12345': Known: ideal, paper, weak, weaker(?!.*maxon).*, the motors of `codrl-mj motor list`",
+            (
+                r"'12345': Known: ideal, paper, weak, weaker(?!.*maxon).*, the motors of `codrl-mj"
+                r" motor list`"
+            ),
         ),
-        *((value, r"actuator = .*must be a name \(ideal.*\), an actuator or a mapping") for value in (3, 1.5, Motor())),
+        *(
+            (value, r"actuator = .*must be a name \(ideal.*\), an actuator or a mapping")
+            for value in (3, 1.5, Motor())
+        ),
         ({"motr": {}}, r"unknown actuator field motr; did you mean motor\?$"),
         ({"controllr": {}}, r"unknown actuator field controllr; did you mean controller\?$"),
-        ({"motor": {"inductanse": 0.1}}, r"field motor\.inductanse; did you mean motor\.inductance\?$"),
-        ({"motor": {"arm_radus": 0.1}, "controller": {}}, r"motor\.arm_radus; did you mean motor\.arm_radius\?$"),
+        (
+            {"motor": {"inductanse": 0.1}},
+            r"field motor\.inductanse; did you mean motor\.inductance\?$",
+        ),
+        (
+            {"motor": {"arm_radus": 0.1}, "controller": {}},
+            r"motor\.arm_radus; did you mean motor\.arm_radius\?$",
+        ),
         ({"controller": {"kf": 5.0}}, r"controller\.kf; did you mean controller\.kff\?$"),
-        ({"supply": {"resistence": 5.0}}, r"supply\.resistence; did you mean supply\.resistance\?$"),
-        ({"motor": {"zzz": 1.0}}, r"unknown actuator field motor\.zzz; known: resistance, inductance,"),
+        (
+            {"supply": {"resistence": 5.0}},
+            r"supply\.resistence; did you mean supply\.resistance\?$",
+        ),
+        (
+            {"motor": {"zzz": 1.0}},
+            r"unknown actuator field motor\.zzz; known: resistance, inductance,",
+        ),
         ({"motor": 3.0}, r"'motor' = 3\.0: must be a mapping of Motor's fields"),
         ({"controller": {"ki": -2.0}}, r"CurrentLoop\.ki = -2\.0: must be a finite number >= 0"),
         ({"family": "lagg"}, r"unknown family 'lagg': did you mean 'lag'"),
         ({"family": "torque-speed"}, r"unknown family 'torque-speed': did you mean 'torque_speed'"),
-        ({"family": "lag", "time_constnt": 1.0}, r"unknown actuator field time_constnt; did you mean time_constant\?"),
-        ({"family": "lag", "motor": {}}, "unknown actuator field motor; known: time_constant, delay"),
+        (
+            {"family": "lag", "time_constnt": 1.0},
+            r"unknown actuator field time_constnt; did you mean time_constant\?",
+        ),
+        (
+            {"family": "lag", "motor": {}},
+            "unknown actuator field motor; known: time_constant, delay",
+        ),
         ({"family": "lag", "delay": -1.0}, r"Lag\.delay = -1\.0: must be a finite number >= 0"),
-        ({"family": "torque_speed", "max_torque": 0}, r"TorqueSpeed\.max_torque = 0: must be a number > 0"),
+        (
+            {"family": "torque_speed", "max_torque": 0},
+            r"TorqueSpeed\.max_torque = 0: must be a number > 0",
+        ),
         ({"family": "ideal", "motor": {}}, "unknown actuator field motor"),
         (
             {"family": "nowhere_at_all:Mine"},
@@ -200,21 +254,33 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
             {"family": "slipped.missing:Mine"},
             r"missing failed: ModuleNotFoundError: .*'nowhere_at_all' \(.*missing\.py",
         ),
-        ({"family": "slipped.undefined:Mine"}, r"NameError: name 'z' is not defined \(.*undefined\.py, line 2\)"),
+        (
+            {"family": "slipped.undefined:Mine"},
+            r"NameError: name 'z' is not defined \(.*undefined\.py, line 2\)",
+        ),
         ({"family": "slipped.unreadable:Mine"}, "importing slipped.unreadable failed: SyntaxError"),
-        ({"family": "slipped.other:Mine"}, r"'Mine'; must be module:NAME; did you mean 'MINES'\? .*other\.py"),
+        (
+            {"family": "slipped.other:Mine"},
+            r"'Mine'; must be module:NAME; did you mean 'MINES'\? .*other\.py",
+        ),
         (f"{__name__}:CARTPOLE", "is neither an actuator nor a family of them"),
         (f"{__name__}:MIEN", "has no attribute 'MIEN'; must be module:NAME"),
         ("nowhere_at_all:MINE", "No module named 'nowhere_at_all'"),
         (":", "must be module:NAME"),
         (f"{__name__}:", "must be module:NAME"),
-        ("itself.yaml", r"^itself\.yaml: name = 'itself\.yaml': must be an actuator's name, or a file that"),
+        (
+            "itself.yaml",
+            r"^itself\.yaml: name = 'itself\.yaml': must be an actuator's name, or a file that",
+        ),
         *((name, rf"^{name}: ") for name in WRONG_FILES),
         (
             {"name": "ideal", "motor": {"resistance": 1.0}},
             "the ideal actuator has no motor and no controller to",
         ),
-        ({"name": "paper", "motor": {"resistence": 1.0}}, r"unknown actuator field motor\.resistence"),
+        (
+            {"name": "paper", "motor": {"resistence": 1.0}},
+            r"unknown actuator field motor\.resistence",
+        ),
         ({"name": "lag", "delay": -1}, r"Lag\.delay = -1"),
     ],
 )
@@ -225,7 +291,9 @@ def test_what_describes_no_actuator_is_refused_with_the_reason(files, given, mes
 
 @pytest.mark.parametrize("name", ["paper", "weak", "open_loop", "over.yaml"])
 def test_a_task_without_a_papers_actuator_has_no_variations_of_it(files, name):
-    with pytest.raises(ValueError, match=r"actuator = '\w+': .* of which bare has none; known are current_loop"):
+    with pytest.raises(
+        ValueError, match=r"actuator = '\w+': .* of which bare has none; known are current_loop"
+    ):
         resolve_actuators(name, BARE)
     assert resolve_actuators("ideal", BARE) == (IDEAL,)
     assert resolve_actuators("lag", BARE) == (Lag(),)
@@ -248,7 +316,9 @@ PAIR = dataclasses.replace(
 def test_every_motor_has_its_own_variation_of_its_own_actuator():
     for name, gain in (("weak", 1.0), ("weaker", 0.2)):
         loop = CurrentLoop(kp=gain, ki=gain)
-        assert resolve_actuators(name, PAIR) == tuple(Actuator(paper.motor, loop) for paper in PAIR.paper)
+        assert resolve_actuators(name, PAIR) == tuple(
+            Actuator(paper.motor, loop) for paper in PAIR.paper
+        )
     assert resolve_actuators(["paper", "weak"], PAIR)[0] == PAIR.paper[0]
     assert resolve_actuators(Lag(), PAIR) == (Lag(), Lag())
     assert check_same_family([Lag(0.1), Lag(0.2)]) is Lag
@@ -299,7 +369,10 @@ def test_a_family_is_found_by_its_name_and_by_its_place():
         ("drive", "quanser-qube-servo-2"),  # whose numbers are the defaults
         ("kraken-x60", "kraken-x60"),
         ({"name": "kraken-x60", "motor": {"gear_ratio": 70.3, "arm_radius": 200}}, "kraken-x60"),
-        ({"name": "kraken-x60", "supply": {"voltage": 10}, "controller": {"max_current": 3}}, "kraken-x60"),
+        (
+            {"name": "kraken-x60", "supply": {"voltage": 10}, "controller": {"max_current": 3}},
+            "kraken-x60",
+        ),
         ({"name": "kraken-x60", "motor": {"resistance": 1.0}}, "kraken-x60, changed"),
         ({"name": "kraken-x60", "motor": {"resistance": 1.0}, "label": "rewound"}, "rewound"),
         ("drawer.toml", "drawer"),
@@ -321,7 +394,9 @@ def test_an_actuator_is_called_what_it_was_asked_for_by(files, given, name):
 
 def test_a_motor_of_the_catalogue_is_known_by_its_numbers_and_written_short():
     there = resolve("kraken-x60", None, "nobody")
-    geared = dataclasses.replace(there, motor=dataclasses.replace(there.motor, gear_ratio=70.3, arm_radius=200.0))
+    geared = dataclasses.replace(
+        there, motor=dataclasses.replace(there.motor, gear_ratio=70.3, arm_radius=200.0)
+    )
     assert label_of(geared) == ""
     assert name_of(geared) == "kraken-x60"
     assert named_mapping(labelled(geared, "kraken-x60")) == {
@@ -330,7 +405,10 @@ def test_a_motor_of_the_catalogue_is_known_by_its_numbers_and_written_short():
     }
     other = dataclasses.replace(there, motor=dataclasses.replace(there.motor, resistance=1.0))
     assert name_of(other) == "drive"
-    assert named_mapping(labelled(other, "kraken-x60")) == {"name": "kraken-x60", "motor": {"resistance": 1.0}}
+    assert named_mapping(labelled(other, "kraken-x60")) == {
+        "name": "kraken-x60",
+        "motor": {"resistance": 1.0},
+    }
     assert named_mapping(labelled(Lag(0.2), "slow")) == {"label": "slow", **Lag(0.2).as_mapping()}
 
 
@@ -338,7 +416,9 @@ def test_a_name_is_nothing_of_the_actuator(files):
     asked, plain = resolve("drawer.toml", None, "nobody"), resolve("maxon-re65", None, "nobody")
     assert (name_of(asked), name_of(plain)) == ("drawer", "maxon-re65")
     assert (asked, hash(asked), asked.as_mapping()) == (plain, hash(plain), plain.as_mapping())
-    assert label_of(labelled(IDEAL, "nothing")) == label_of(MINE) == ""  # which may be known by other names
+    assert (
+        label_of(labelled(IDEAL, "nothing")) == label_of(MINE) == ""
+    )  # which may be known by other names
 
 
 # -- places and files ---------------------------------------------------------------------------------------
@@ -370,9 +450,18 @@ def test_a_part_that_is_given_in_part_is_over_what_stands_for_it():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"family": "drive", "motor": {"torque_constant": 0.007}}, "motor.back_emf_constant = 0.042, a default"),
-        ({"family": "drive", "motor": {"back_emf_constant": 0.5}}, "motor.torque_constant = 0.042, a default"),
-        ({"supply": {"voltage": 48.0}}, "controller.max_voltage = 24 V, which limits the supply of 48 V"),
+        (
+            {"family": "drive", "motor": {"torque_constant": 0.007}},
+            "motor.back_emf_constant = 0.042, a default",
+        ),
+        (
+            {"family": "drive", "motor": {"back_emf_constant": 0.5}},
+            "motor.torque_constant = 0.042, a default",
+        ),
+        (
+            {"supply": {"voltage": 48.0}},
+            "controller.max_voltage = 24 V, which limits the supply of 48 V",
+        ),
     ],
 )
 def test_a_default_that_cuts_what_is_given_is_said(given, said):

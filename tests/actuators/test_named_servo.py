@@ -12,7 +12,16 @@ import pytest
 import yaml
 
 import codrl_mj
-from codrl_mj.actuators import Drive, Servo, ServoLoop, actuator_over, label_of, name_of, named_mapping, resolve
+from codrl_mj.actuators import (
+    Drive,
+    Servo,
+    ServoLoop,
+    actuator_over,
+    label_of,
+    name_of,
+    named_mapping,
+    resolve,
+)
 from codrl_mj.cli import main
 from codrl_mj.drives import find_drive, find_loop
 from codrl_mj.training import load_config
@@ -24,7 +33,12 @@ ARM = f"""<mujoco><option timestep="0.001"/><worldbody><body><joint name="knee" 
 <inertial pos="{LENGTH} 0 0" mass="{MASS}" diaginertia="1e-3 1e-3 1e-3"/></body></worldbody>
 <actuator><motor name="knee" joint="knee"/></actuator></mujoco>"""
 GAINS = {"position_gain": 10.0, "velocity_gain": 8.0}
-SERVO = {"name": MOTOR, "family": "servo", "motor": {"gear_ratio": 50.0, "coulomb_friction": 0.0}, "loop": GAINS}
+SERVO = {
+    "name": MOTOR,
+    "family": "servo",
+    "motor": {"gear_ratio": 50.0, "coulomb_friction": 0.0},
+    "loop": GAINS,
+}
 DATASHEET = """[datasheet]
 nominal_voltage = "24 V"
 resistance = "0.9 ohm"
@@ -38,7 +52,10 @@ def files(tmp_path, monkeypatch):
     """A datasheet, an actuator as `codrl-mj identify` writes it, and servos of both by name."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sheet.toml").write_text(DATASHEET)
-    fields = {**resolve(MOTOR, None, "x").as_mapping(), "identified": {"intervals": {"motor.resistance": [0.8, 1.1]}}}
+    fields = {
+        **resolve(MOTOR, None, "x").as_mapping(),
+        "identified": {"intervals": {"motor.resistance": [0.8, 1.1]}},
+    }
     (tmp_path / "identified.yaml").write_text(yaml.safe_dump(fields))
     for name in ("sheet.toml", "identified.yaml"):
         (tmp_path / f"servo_{name[:5]}.yaml").write_text(yaml.safe_dump(SERVO | {"name": name}))
@@ -54,10 +71,14 @@ def settled(actuator, target):
 
 
 @pytest.mark.parametrize("name", [MOTOR, "sheet.toml", "identified.yaml"])
-def test_a_motor_by_name_sags_under_a_load_by_the_closed_form_and_is_the_servo_of_its_parts(files, name):
+def test_a_motor_by_name_sags_under_a_load_by_the_closed_form_and_is_the_servo_of_its_parts(
+    files, name
+):
     drive = resolve(name, None, "x")
     motor = dataclasses.replace(drive.motor, gear_ratio=50.0, coulomb_friction=0.0)
-    parts = Servo(motor, drive.controller, drive.supply, ServoLoop(position_gain=10.0, velocity_gain=8.0))
+    parts = Servo(
+        motor, drive.controller, drive.supply, ServoLoop(position_gain=10.0, velocity_gain=8.0)
+    )
     position, load = settled(SERVO | {"name": name}, 0.3)
     assert 0.3 - position == pytest.approx(load / (10.0 * 8.0), rel=1e-6)
     assert resolve(SERVO | {"name": name}, None, "x") == parts
@@ -66,7 +87,9 @@ def test_a_motor_by_name_sags_under_a_load_by_the_closed_form_and_is_the_servo_o
 
 @pytest.mark.parametrize("name", ["sheet.toml", "identified.yaml"])
 def test_a_file_may_make_a_servo_of_another_file(files, name):
-    assert resolve(f"servo_{name[:5]}.yaml", None, "x") == resolve(SERVO | {"name": name}, None, "x")
+    assert resolve(f"servo_{name[:5]}.yaml", None, "x") == resolve(
+        SERVO | {"name": name}, None, "x"
+    )
 
 
 def test_a_servo_without_a_gain_gets_ten_times_the_slope_of_its_motor_and_says_so():
@@ -87,17 +110,29 @@ def test_a_servo_becomes_its_drive_again_and_keeps_its_name():
     assert plain == Servo(drive.motor, drive.controller, drive.supply, ServoLoop(velocity_gain=2.0))
     assert actuator_over(drive, {"family": Servo, "loop": {"velocity_gain": 2.0}}) == plain
     again = actuator_over(plain, {"family": "drive"})
-    assert (type(again), again, label_of(plain), label_of(again)) == (Drive, drive, f"{MOTOR} servo", MOTOR)
+    assert (type(again), again, label_of(plain), label_of(again)) == (
+        Drive,
+        drive,
+        f"{MOTOR} servo",
+        MOTOR,
+    )
     read = resolve(json.loads(json.dumps(named_mapping(plain))), None, "x")
     assert (read, label_of(read)) == (plain, label_of(plain))
 
 
 @pytest.mark.parametrize("controls", ["position", "velocity"])
 def test_an_agent_asks_a_motor_by_name_for_either(controls):
-    given = {"name": MOTOR, "family": "servo", "motor": {"gear_ratio": 20.0}, "loop": {"controls": controls}}
+    given = {
+        "name": MOTOR,
+        "family": "servo",
+        "motor": {"gear_ratio": 20.0},
+        "loop": {"controls": controls},
+    }
     env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=given, action=controls)
     free = 24.0 / resolve(MOTOR, None, "x").motor.back_emf_constant / 20.0
-    assert env.action_space.high == pytest.approx({"position": math.pi, "velocity": free}[controls], rel=1e-6)
+    assert env.action_space.high == pytest.approx(
+        {"position": math.pi, "velocity": free}[controls], rel=1e-6
+    )
     env.reset(seed=0)
     for _ in range(40):
         *_, info = env.step(np.array([0.5], np.float32))
@@ -108,14 +143,26 @@ def test_an_agent_asks_a_motor_by_name_for_either(controls):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"family": "servo", "controls": "velocity"}, r"field controls; did you mean loop\.controls\?"),
-        ({"name": MOTOR, "loop": {"position_gain": 3}}, "unknown actuator field loop of a drive: add family = 'servo'"),
+        (
+            {"family": "servo", "controls": "velocity"},
+            r"field controls; did you mean loop\.controls\?",
+        ),
+        (
+            {"name": MOTOR, "loop": {"position_gain": 3}},
+            "unknown actuator field loop of a drive: add family = 'servo'",
+        ),
         ({"family": "servo", "motor": MOTOR}, f"write name = '{MOTOR}' beside the family"),
         ({"name": "lag", "family": "servo"}, "cannot be set over an actuator of the family 'lag'"),
         ({"name": MOTOR, "family": "servoo"}, "unknown family 'servoo': did you mean 'servo'"),
         ({"name": "ideal", "family": "servo"}, "the ideal actuator has no motor"),
-        ({**SERVO, "motor": {"back_emf_constant": 0.0}, "loop": {}}, r"loop\.velocity_gain is missing"),
-        ({"name": MOTOR, "friction": 1.0}, r"did you mean motor\.coulomb_friction or motor\.viscous_friction"),
+        (
+            {**SERVO, "motor": {"back_emf_constant": 0.0}, "loop": {}},
+            r"loop\.velocity_gain is missing",
+        ),
+        (
+            {"name": MOTOR, "friction": 1.0},
+            r"did you mean motor\.coulomb_friction or motor\.viscous_friction",
+        ),
     ],
 )
 def test_what_makes_no_servo_is_refused_with_the_way_to_one(given, message):
@@ -127,9 +174,14 @@ def test_the_command_line_makes_a_servo_of_a_name_and_a_run_keeps_it(files, monk
     configs = []
     monkeypatch.setattr("codrl_mj.training.train", lambda config, *_, **__: configs.append(config))
     line = "--actuator sheet.toml --actuator.family servo --actuator.loop.position-gain 10"
-    ran(f"train pendulum {line} --actuator.motor.gear-ratio 50 --env.action position {TINY} --out run")
+    ran(
+        f"train pendulum {line} --actuator.motor.gear-ratio 50 --env.action position {TINY}"
+        " --out run"
+    )
     Path("run").mkdir()
-    Path("run/config.json").write_text(json.dumps(admit(Path("other"), configs[0], resume=False, accept_changes=False)))
+    Path("run/config.json").write_text(
+        json.dumps(admit(Path("other"), configs[0], resume=False, accept_changes=False))
+    )
     made = load_config(Path("run")).actuators[0]
     changes = {"motor": {"gear_ratio": 50.0}, "loop": {"position_gain": 10.0}}
     assert made == resolve({"name": "sheet.toml", "family": "servo", **changes}, None, "x")
@@ -140,7 +192,9 @@ def test_the_way_to_a_servo_is_told_where_it_is_missed(capsys, files):
     train = "train pendulum --actuator sheet.toml"
     assert "(--actuator.family servo)" in refused(capsys, f"{train} --env.action position")
     assert "--actuator.loop.controls velocity)" in refused(capsys, f"{train} --env.action velocity")
-    assert "add --actuator.family servo" in refused(capsys, f"{train} --actuator.loop.position-gain 3")
+    assert "add --actuator.family servo" in refused(
+        capsys, f"{train} --actuator.loop.position-gain 3"
+    )
 
 
 def test_a_servo_in_a_file_is_shown_as_its_motor_and_its_loops(capsys, files):
@@ -148,4 +202,6 @@ def test_a_servo_in_a_file_is_shown_as_its_motor_and_its_loops(capsys, files):
     assert "loop.velocity_gain" in capsys.readouterr().out
     assert find_loop("servo_sheet.yaml") == ServoLoop(**GAINS)
     assert find_loop("sheet.toml") is None
-    assert find_drive("servo_sheet.yaml") == actuator_over(find_drive("sheet.toml"), {"motor": SERVO["motor"]})
+    assert find_drive("servo_sheet.yaml") == actuator_over(
+        find_drive("sheet.toml"), {"motor": SERVO["motor"]}
+    )

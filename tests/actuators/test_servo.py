@@ -60,7 +60,8 @@ def turned(one, targets, timestep=0.001, load=0.0):
 
 
 @pytest.mark.parametrize(
-    ("timestep", "rate"), but([(0.001, 2000.0)], [(0.0005, 2000.0), (0.001, 2000.0), (0.0005, 500.0)])
+    ("timestep", "rate"),
+    but([(0.001, 2000.0)], [(0.0005, 2000.0), (0.001, 2000.0), (0.0005, 500.0)]),
 )
 def test_a_position_loop_is_the_linear_system_that_it_looks_like(timestep, rate):
     """Torque g*(K*(q* - q) - w), held over a sample, on an inertia; the loop's rate may be that of the steps or not."""
@@ -86,15 +87,22 @@ def test_a_position_loop_is_the_linear_system_that_it_looks_like(timestep, rate)
 @pytest.mark.parametrize(("timestep", "rate"), [(0.05, 1000.0), (0.01, 2000.0), (0.004, 250.0)])
 def test_a_servo_is_sampled_at_its_own_rate_within_a_long_step(timestep, rate, integral):
     """The recursion of a PI velocity loop on an inertia, sample by sample, against one or a few long steps."""
-    one = servo(controls="velocity", velocity_gain=1.5, velocity_integral_gain=integral, servo_rate=rate)
+    one = servo(
+        controls="velocity", velocity_gain=1.5, velocity_integral_gain=integral, servo_rate=rate
+    )
     one = dataclasses.replace(one, controller=SampledLoop(100e3))
     _, speeds = turned(one, [2.0] * 4, timestep)
     speed, torque, expected = 0.0, 0.0, []
     for _ in range(round(4 * timestep * rate)):
         error = 2.0 - speed
-        speed, torque = speed + (1.5 * error + torque) / TOTAL / rate, torque + 1.5 * integral * error / rate
+        speed, torque = (
+            speed + (1.5 * error + torque) / TOTAL / rate,
+            torque + 1.5 * integral * error / rate,
+        )
         expected.append(speed)
-    np.testing.assert_allclose(speeds, expected[round(timestep * rate) - 1 :: round(timestep * rate)], rtol=0.01)
+    np.testing.assert_allclose(
+        speeds, expected[round(timestep * rate) - 1 :: round(timestep * rate)], rtol=0.01
+    )
 
 
 @pytest.mark.parametrize("saved", [False, True])
@@ -107,7 +115,11 @@ def test_what_the_model_s_own_servo_was_is_gone(saved):
             spec.actuator("it").set_to_position(kp=3.0, kv=30.0)
         motorised = codrl_mj.motorise(spec, {"shaft": servo(velocity_gain=1.5, servo_rate=500.0)})
         model = motorised.compile()
-        ways.append(run(mujoco.MjModel.from_xml_string(motorised.to_xml()) if saved else model, [0.3] * 250)[0])
+        ways.append(
+            run(
+                mujoco.MjModel.from_xml_string(motorised.to_xml()) if saved else model, [0.3] * 250
+            )[0]
+        )
     np.testing.assert_array_equal(*ways)
     assert ways[0][-1] == pytest.approx(0.3, abs=2e-3)
 
@@ -121,10 +133,18 @@ def test_an_integral_takes_what_a_load_leaves(integral, left):
 
 def test_the_integral_does_not_wind_up():
     """The shaft cannot follow for a second, and then can."""
-    one = servo(supply=4.0, controls="velocity", velocity_gain=1.5, velocity_integral_gain=20.0, max_torque=0.3)
+    one = servo(
+        supply=4.0,
+        controls="velocity",
+        velocity_gain=1.5,
+        velocity_integral_gain=20.0,
+        max_torque=0.3,
+    )
     targets = np.where(np.arange(3000) < 2000, 100.0, 3.0)
     _, speeds = turned(one, targets)
-    reached = -math.expm1(-2.0 * 0.042**2 / (8.4 * TOTAL / RATIO**2))  # of the no-load speed, in 2 s
+    reached = -math.expm1(
+        -2.0 * 0.042**2 / (8.4 * TOTAL / RATIO**2)
+    )  # of the no-load speed, in 2 s
     assert speeds[1999] == pytest.approx(reached * 4.0 / (0.042 * RATIO), rel=1e-3)
     assert (np.abs(speeds[2450:] - 3.0) < 0.05).all()
 
@@ -155,11 +175,20 @@ def test_feed_forward_takes_the_lag_away():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"velocity_gain": 80.0}, r"outer loops are unstable: spectral radius .* It moves 0\.0201 kg\*m\^2"),
+        (
+            {"velocity_gain": 80.0},
+            r"outer loops are unstable: spectral radius .* It moves 0\.0201 kg\*m\^2",
+        ),
         ({"position_gain": 9000.0}, r"position_gain = 9000 well below 2\*pi\*f"),
-        ({"servo_rate": 700.0}, r"servo_rate = 700: must be a multiple of the mechanical step's rate, 1000 Hz"),
+        (
+            {"servo_rate": 700.0},
+            r"servo_rate = 700: must be a multiple of the mechanical step's rate, 1000 Hz",
+        ),
         ({"controls": "force"}, r"controls = 'force': must be one of position, velocity"),
-        ({"inertia_feed_forward": 0.1}, r"inertia_feed_forward = 0\.1: must be 0 where controls = 'position'"),
+        (
+            {"inertia_feed_forward": 0.1},
+            r"inertia_feed_forward = 0\.1: must be 0 where controls = 'position'",
+        ),
     ],
 )
 def test_what_cannot_work_is_refused(change, message):
@@ -174,7 +203,11 @@ def growth(model, steps=1500):
     while len(speeds) < steps and np.abs(data.qvel).max() < 1e-3:
         mujoco.mj_step(model, data)
         speeds.append(np.abs(data.qvel).max())
-    return math.inf if len(speeds) < steps else max(speeds[-steps // 10 :]) / max(speeds[: steps // 10])
+    return (
+        math.inf
+        if len(speeds) < steps
+        else max(speeds[-steps // 10 :]) / max(speeds[: steps // 10])
+    )
 
 
 @pytest.mark.parametrize(
@@ -197,7 +230,9 @@ def test_the_bound_of_stability_is_where_it_is(rate, gains, integrator, links, d
         parent = (parent or spec.worldbody).add_body(pos=[0.3 * (link > 0), 0.0, 0.0])
         parent.add_geom(size=[0.1] * 3, pos=[0.15, 0.0, 0.0], mass=0.5)
         parent.add_joint(name=f"j{link}", axis=[0.0, 0.0, 1.0], damping=[damping, 0.0, 0.0])
-        spec.add_actuator(name=f"a{link}", target=f"j{link}", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
+        spec.add_actuator(
+            name=f"a{link}", target=f"j{link}", trntype=mujoco.mjtTrn.mjTRN_JOINT
+        ).set_to_motor()
 
     def motorised(gain, allow_unstable):
         one = servo(
@@ -215,16 +250,24 @@ def test_the_bound_of_stability_is_where_it_is(rate, gains, integrator, links, d
         middle = math.sqrt(low * high)
         stable = check_shafts(motorised(middle, True).compile(), allow_unstable=True) < 1.0 + 1e-6
         low, high = (middle, high) if stable else (low, middle)
-    assert growth(motorised(low / 1.03, False).compile()) < 1.0 < growth(motorised(high * 1.03, True).compile())
+    assert (
+        growth(motorised(low / 1.03, False).compile())
+        < 1.0
+        < growth(motorised(high * 1.03, True).compile())
+    )
     with pytest.raises(UnstableError, match=r"spectral radius 1\."):
         motorised(high * 1.03, False)
 
 
-ASKED = Servo(GearMotor(gear_ratio=20.0), SampledLoop(20e3), Supply(48.0), ServoLoop(velocity_gain=3.0))
+ASKED = Servo(
+    GearMotor(gear_ratio=20.0), SampledLoop(20e3), Supply(48.0), ServoLoop(velocity_gain=3.0)
+)
 
 
 def test_an_agent_asks_a_servo_for_positions():
-    env = gymnasium.make("codrl_mj/Pendulum-v0", actuator=ASKED, action="position", max_episode_steps=500)
+    env = gymnasium.make(
+        "codrl_mj/Pendulum-v0", actuator=ASKED, action="position", max_episode_steps=500
+    )
     assert env.action_space.high == pytest.approx(math.pi)
     env.reset(seed=0)
     for _ in range(100):
@@ -256,7 +299,10 @@ def test_servos_in_a_vector_are_the_servos_alone():
     draws = {"motor.resistance": Uniform(4.0, 12.0), "loop.velocity_gain": Uniform(1.0, 5.0)}
     one = dataclasses.replace(ASKED, loop=ServoLoop("velocity", velocity_gain=3.0))
     arguments = {"actuator": one, "action": "velocity", "randomize": draws}
-    both = [gymnasium.make_vec("codrl_mj/Pendulum-v0", 3, kind, **arguments) for kind in ("vector_entry_point", "sync")]
+    both = [
+        gymnasium.make_vec("codrl_mj/Pendulum-v0", 3, kind, **arguments)
+        for kind in ("vector_entry_point", "sync")
+    ]
     np.testing.assert_array_equal(*(envs.reset(seed=3)[0] for envs in both))
     for action in np.random.default_rng(0).uniform(-10, 10, size=(40, 3, 1)).astype(np.float32):
         ours, alone = (envs.step(action) for envs in both)
@@ -266,7 +312,12 @@ def test_servos_in_a_vector_are_the_servos_alone():
 
 @pytest.mark.parametrize(
     ("limits", "met"),
-    [({}, ""), ({"max_torque": 0.05}, "current"), ({"max_current": 0.1}, "current"), ({"volts": 2.0}, "voltage")],
+    [
+        ({}, ""),
+        ({"max_torque": 0.05}, "current"),
+        ({"max_current": 0.1}, "current"),
+        ({"volts": 2.0}, "voltage"),
+    ],
 )
 def test_a_servo_says_which_limit_it_met_and_what_it_drew(limits, met):
     """At a held speed, over two samples of the outer loop: what is drawn is heat, work and the field of the winding."""
@@ -277,8 +328,13 @@ def test_a_servo_says_which_limit_it_met_and_what_it_drew(limits, met):
     parameters, state, speed = parameters_type(Servo)(*one.numbers), one.State(*[0.0] * 13), 20.0
     motor, before = one.motor, 0.0
     for target in (80.0, -60.0):
-        state, _, seen = one.advance(parameters, 0.002, state, Inputs(target, 0.0, speed, 0.0, 0.0, math.inf))
-        found = {name: getattr(seen, f"{name}_saturated") for name in ("voltage", "current", "temperature")}
+        state, _, seen = one.advance(
+            parameters, 0.002, state, Inputs(target, 0.0, speed, 0.0, 0.0, math.inf)
+        )
+        found = {
+            name: getattr(seen, f"{name}_saturated")
+            for name in ("voltage", "current", "temperature")
+        }
         assert found == {name: float(name == met) for name in found}
         assert seen.saturated == float(met != "")
         field = 0.5 * motor.inductance * (state.current**2 - before**2) / 0.002

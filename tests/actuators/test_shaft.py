@@ -12,12 +12,17 @@ import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, Inputs, SampledLoop, Supply, parameters_type
 from codrl_mj.actuators.shaft import Shaft, friction
 
-HOT = GearMotor(thermal_resistance_winding=20.0, thermal_time_constant_winding=3.0, ambient_temperature=20.0)
+HOT = GearMotor(
+    thermal_resistance_winding=20.0, thermal_time_constant_winding=3.0, ambient_temperature=20.0
+)
 
 
 def advanced(one, timestep, torques, speed=0.0, inertia=math.inf):
     """Signals of steps, and the last state."""
-    parameters, state = parameters_type(type(one))(*one.numbers), one.State(*[0.0] * len(one.State._fields))
+    parameters, state = (
+        parameters_type(type(one))(*one.numbers),
+        one.State(*[0.0] * len(one.State._fields)),
+    )
     found = []
     for torque in torques:
         state, _, signals = one.advance(
@@ -72,7 +77,10 @@ def test_a_winding_warms_and_its_resistance_with_it():
 def test_winding_and_housing_warm_one_after_the_other():
     """Of a resistance that does not grow: the sum of two first-order responses."""
     motor = dataclasses.replace(
-        HOT, thermal_resistance_housing=30.0, thermal_time_constant_housing=40.0, resistance_coefficient=0.0
+        HOT,
+        thermal_resistance_housing=30.0,
+        thermal_time_constant_housing=40.0,
+        resistance_coefficient=0.0,
     )
     found, _ = advanced(Drive(motor, supply=Supply(48.0)), 0.02, [0.042 * 0.5] * 3000)
     times, watts = 0.02 * np.arange(1, 3001), 0.25 * 8.4
@@ -129,9 +137,15 @@ def test_a_drive_keeps_the_winding_s_limit_and_then_gives_the_continuous_current
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"max_temperature": 20.0, "thermal_resistance_winding": 1.0}, r"= 20: must be above ambient_temperature = 25"),
+        (
+            {"max_temperature": 20.0, "thermal_resistance_winding": 1.0},
+            r"= 20: must be above ambient_temperature = 25",
+        ),
         ({"max_temperature": 80.0}, r"max_temperature = 80: needs thermal_resistance_winding or"),
-        ({"ambient_temperature": -260.0}, r"= -260: .* no resistance; must be above -229\.453 degC"),
+        (
+            {"ambient_temperature": -260.0},
+            r"= -260: .* no resistance; must be above -229\.453 degC",
+        ),
     ],
 )
 def test_temperatures_that_cannot_be_are_refused(fields, message):
@@ -159,13 +173,19 @@ def test_friction_in_motion_is_the_sum_of_its_laws(speed, torque):
     parameters = parameters_of(stribeck_friction=0.01, stribeck_speed=4.0, gear_efficiency=0.7)
     taken = friction(parameters, 1e-6, torque, Shaft(1e-3, 0.0, speed))
     share = 0.3 if torque * speed > 0.0 else 3.0 / 7.0
-    assert taken == pytest.approx(math.copysign(0.01 * math.exp(-((speed / 4.0) ** 2)) + share * abs(torque), speed))
+    assert taken == pytest.approx(
+        math.copysign(0.01 * math.exp(-((speed / 4.0) ** 2)) + share * abs(torque), speed)
+    )
 
 
 @pytest.mark.parametrize("step", [0.0005, 0.002])
 @pytest.mark.parametrize("ratio", [1.0, 20.0])
 def test_a_rotor_sticks_until_coulomb_and_stribeck_friction_are_overcome(step, ratio):
-    friction = {"coulomb_friction": 0.01 / ratio, "stribeck_friction": 0.02 / ratio, "stribeck_speed": ratio}
+    friction = {
+        "coulomb_friction": 0.01 / ratio,
+        "stribeck_friction": 0.02 / ratio,
+        "stribeck_speed": ratio,
+    }
     one, alone = (
         Drive(GearMotor(gear_ratio=ratio, **fields), supply=Supply(48.0))
         for fields in (friction, friction | {"stribeck_friction": 0.0})
@@ -192,7 +212,10 @@ def test_a_gear_that_loses_holds_what_its_motor_does_not(efficiency, holds):
 
 def test_friction_only_takes_energy():
     """A rotor in motion without a command comes to rest, and stays there."""
-    one = Drive(GearMotor(gear_efficiency=0.6, stribeck_friction=0.002, stribeck_speed=5.0), supply=Supply(48.0))
+    one = Drive(
+        GearMotor(gear_efficiency=0.6, stribeck_friction=0.002, stribeck_speed=5.0),
+        supply=Supply(48.0),
+    )
     model = on_a_shaft(one, 0.002)
     data = mujoco.MjData(model)
     data.qvel[:] = 4.0
@@ -204,7 +227,11 @@ def test_friction_only_takes_energy():
     assert abs(speeds[-1]) < 1e-6
 
 
-MASS, LENGTH, ABOUT = 0.5, 0.15, 0.035  # a pendulum: [kg], [m] to its centre, [kg*m^2] about its hinge
+MASS, LENGTH, ABOUT = (
+    0.5,
+    0.15,
+    0.035,
+)  # a pendulum: [kg], [m] to its centre, [kg*m^2] about its hinge
 
 
 def servo_model(timestep, duration, start, friction_of, motor):
@@ -213,7 +240,11 @@ def servo_model(timestep, duration, start, friction_of, motor):
     for step in range(round(duration / timestep)):
         pull = motor(step * timestep) - MASS * 9.81 * LENGTH * math.sin(angle)
         stops = ABOUT * speed / timestep + pull
-        speed += timestep / ABOUT * (pull - math.copysign(min(abs(stops), friction_of(abs(speed))), stops))
+        speed += (
+            timestep
+            / ABOUT
+            * (pull - math.copysign(min(abs(stops), friction_of(abs(speed))), stops))
+        )
         angle += timestep * speed
         found.append(angle)
     return np.array(found)
@@ -229,7 +260,11 @@ def test_coulomb_viscous_and_stribeck_friction_are_those_of_a_servo_model(ratio,
     """Numbers near those that were fitted to a Dynamixel MX-64; MuJoCo has the first two."""
     coulomb, stribeck, at, exponent, viscous = 0.06, 0.05, 1.5, 1.3, 0.015
     expected = servo_model(
-        0.001, 3.0, start, lambda w: coulomb + stribeck * math.exp(-((w / at) ** exponent)) + viscous * w, motor
+        0.001,
+        3.0,
+        start,
+        lambda w: coulomb + stribeck * math.exp(-((w / at) ** exponent)) + viscous * w,
+        motor,
     )
     one = GearMotor(
         rotor_inertia=0.0,
@@ -241,7 +276,10 @@ def test_coulomb_viscous_and_stribeck_friction_are_those_of_a_servo_model(ratio,
         stribeck_exponent=exponent,
     )
     found = {}
-    for name, changed in (("with", one), ("without", dataclasses.replace(one, stribeck_friction=0.0))):
+    for name, changed in (
+        ("with", one),
+        ("without", dataclasses.replace(one, stribeck_friction=0.0)),
+    ):
         load = {"inertia": ABOUT - MASS * LENGTH**2, "mass": MASS, "down": LENGTH}
         model = on_a_shaft(Drive(changed, supply=Supply(1e4)), 0.001, **load)
         data, rows = mujoco.MjData(model), []

@@ -34,16 +34,20 @@ plain_loops = st.builds(
 
 
 def with_gains(actuator, **gains):
-    return dataclasses.replace(actuator, controller=dataclasses.replace(actuator.controller, **gains))
+    return dataclasses.replace(
+        actuator, controller=dataclasses.replace(actuator.controller, **gains)
+    )
 
 
 def electrical_matrix(actuator, timestep):
     """Transition matrix of the unsaturated loop over one electrical step, read off `advance` itself.
 
-    Only the states that some gain reads are part of the loop: the current always, the integral if ki > 0 and the
-    previous error if kd > 0.
+    Only the states that some gain reads are part of the loop: the current always, the integral if
+    ki > 0 and the previous error if kd > 0.
     """
-    parameters = parameters_type(Actuator)(*actuator.numbers)._replace(max_voltage=np.inf, substeps=1)
+    parameters = parameters_type(Actuator)(*actuator.numbers)._replace(
+        max_voltage=np.inf, substeps=1
+    )
     states = [0, *[1] * (actuator.controller.ki > 0), *[2] * (actuator.controller.kd > 0)]
     rest, units = Inputs(0.0, 0.0, 0.0, 0.0, 0.0), np.eye(3)[states]
     dt = timestep / actuator.controller.substeps
@@ -54,8 +58,9 @@ def electrical_matrix(actuator, timestep):
 def polynomial_of(actuator, dt):
     """Characteristic polynomial of the PID loop, expanded by hand from its 3 x 3 matrix.
 
-    With a = dt/L: i' = A i + a kI I - (kD/L) e_old, I' = I - dt i, e_old' = -i, A = 1 - a (R + kP + kI dt + kD/dt).
-    Where kI or kD is zero the root of the state that nothing reads (1 and 0) is divided out.
+    With a = dt/L: i' = A i + a kI I - (kD/L) e_old, I' = I - dt i, e_old' = -i, A = 1 - a (R + kP +
+    kI dt + kD/dt). Where kI or kD is zero the root of the state that nothing reads (1 and 0) is
+    divided out.
     """
     motor, loop = actuator.motor, actuator.controller
     a = dt / motor.inductance
@@ -86,7 +91,10 @@ def test_the_spectral_radius_is_that_of_the_hand_derived_polynomial(motor, loop,
 
 @given(actuators, timesteps)
 def test_the_radius_is_that_of_the_matrix_once_for_each_substep(actuator, dt):
-    radius, count = np.abs(np.linalg.eigvals(electrical_matrix(actuator, dt))).max(), actuator.controller.substeps
+    radius, count = (
+        np.abs(np.linalg.eigvals(electrical_matrix(actuator, dt))).max(),
+        actuator.controller.substeps,
+    )
     assert spectral_radius(actuator, dt) == pytest.approx(radius**count, rel=1e-6 * count, abs=1e-6)
 
 
@@ -94,11 +102,27 @@ def test_the_radius_is_that_of_the_matrix_once_for_each_substep(actuator, dt):
 
 PENDULUM = Actuator(controller=CurrentLoop(kp=1.0, ki=20.0, kd=1e-6))
 CARTPOLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6))
-PAPER_LOOPS = {  # name: actuator, step [s], spectral radius, the kd at which the loop turns unstable
+# name: actuator, step [s], spectral radius, the kd at which the loop turns unstable
+PAPER_LOOPS = {
     "pendulum": (PENDULUM, 0.05, 0.500, 0.038),
-    "mountain car": (Actuator(controller=CurrentLoop(kp=1.0, ki=1.0, kd=1e-2)), 0.05, 0.975, 0.049),
-    "mountain car, tight": (Actuator(controller=CurrentLoop(kp=2.0, ki=10.0, kd=1e-6)), 0.05, 0.843, 0.019),
-    "mountain car, continuous": (Actuator(controller=CurrentLoop(kp=0.1, ki=10.0, kd=1e-3)), 0.05, 0.676, 0.066),
+    "mountain car": (
+        Actuator(controller=CurrentLoop(kp=1.0, ki=1.0, kd=1e-2)),
+        0.05,
+        0.975,
+        0.049,
+    ),
+    "mountain car, tight": (
+        Actuator(controller=CurrentLoop(kp=2.0, ki=10.0, kd=1e-6)),
+        0.05,
+        0.843,
+        0.019,
+    ),
+    "mountain car, continuous": (
+        Actuator(controller=CurrentLoop(kp=0.1, ki=10.0, kd=1e-3)),
+        0.05,
+        0.676,
+        0.066,
+    ),
     "acrobot": (Actuator(controller=CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)), 0.02, 0.872, 0.079),
     "cart-pole": (CARTPOLE, 0.02, 0.996, 0.047),
 }
@@ -110,15 +134,27 @@ def test_the_papers_loops_have_their_published_radius_and_derivative_gain(name):
     assert round(spectral_radius(actuator, dt), 3) == radius
     check_stable(actuator, dt)
     low, high = limit - 0.001, limit + 0.001
-    assert spectral_radius(with_gains(actuator, kd=low), dt) < 1.0 < spectral_radius(with_gains(actuator, kd=high), dt)
+    assert (
+        spectral_radius(with_gains(actuator, kd=low), dt)
+        < 1.0
+        < spectral_radius(with_gains(actuator, kd=high), dt)
+    )
     while high - low > 1e-9:
         middle = (low + high) / 2
-        low, high = (middle, high) if spectral_radius(with_gains(actuator, kd=middle), dt) < 1.0 else (low, middle)
+        low, high = (
+            (middle, high)
+            if spectral_radius(with_gains(actuator, kd=middle), dt) < 1.0
+            else (low, middle)
+        )
     assert low == pytest.approx(limit, abs=0.0005 + 1e-8)  # published to three decimals
 
 
-@pytest.mark.parametrize(("actuator", "dt", "radius"), [(PENDULUM, 0.1, 2.4), (CARTPOLE, 0.05, 1.67)])
-def test_at_a_longer_step_the_papers_gains_are_unstable_and_the_remedy_is_two_substeps(actuator, dt, radius):
+@pytest.mark.parametrize(
+    ("actuator", "dt", "radius"), [(PENDULUM, 0.1, 2.4), (CARTPOLE, 0.05, 1.67)]
+)
+def test_at_a_longer_step_the_papers_gains_are_unstable_and_the_remedy_is_two_substeps(
+    actuator, dt, radius
+):
     assert spectral_radius(actuator, dt) == pytest.approx(radius, abs=0.02)
     with pytest.raises(ValueError, match=r"unstable.*Set controller\.substeps = 2"):
         check_stable(actuator, dt)
@@ -150,10 +186,16 @@ def test_an_unstable_loop_is_refused_with_its_radius_and_a_remedy_that_works(act
         if substeps > 2 * loop.substeps:  # and it is no larger than it needs to be
             assert spectral_radius(with_gains(actuator, substeps=substeps // 2), dt) >= 1.0
     else:
-        remedy = f"Lower the gains (kp = {loop.kp:g}, ki = {loop.ki:g}, kd = {loop.kd:g}): more substeps do not help"
+        remedy = (
+            f"Lower the gains (kp = {loop.kp:g}, ki = {loop.ki:g}, kd = {loop.kd:g}): more substeps"
+            " do not help"
+        )
         assert remedy in str(refused.value)
         for doubling in range(1, 11):
-            assert spectral_radius(with_gains(actuator, substeps=loop.substeps * 2**doubling), dt) >= 1.0
+            assert (
+                spectral_radius(with_gains(actuator, substeps=loop.substeps * 2**doubling), dt)
+                >= 1.0
+            )
 
 
 # -- many at once -------------------------------------------------------------------------------------------
@@ -161,7 +203,9 @@ def test_an_unstable_loop_is_refused_with_its_radius_and_a_remedy_that_works(act
 
 @settings(max_examples=40)
 @given(st.lists(actuators, min_size=1, max_size=8), timesteps)
-def test_many_are_each_the_one_to_the_last_bit_and_the_quick_test_is_below_one_where_they_are(several, dt):
+def test_many_are_each_the_one_to_the_last_bit_and_the_quick_test_is_below_one_where_they_are(
+    several, dt
+):
     numbers = np.array([one.numbers for one in several])
     radii = spectral_radii(Actuator, numbers, dt)
     np.testing.assert_array_equal(radii, [spectral_radius(one, dt) for one in several])
@@ -173,8 +217,12 @@ def test_the_quick_test_asks_the_eigenvalues_on_the_edge(motor, pole, nudge, dt)
     """A proportional loop whose pole is +-1, give or take some rounding errors."""
     kp = (1.0 - pole) * motor.inductance / dt - motor.resistance
     assume(kp >= 0.0)
-    numbers = np.array([Actuator(motor, CurrentLoop(kp=kp + nudge * np.spacing(max(kp, 1.0)))).numbers])
-    np.testing.assert_array_equal(stability_radii(Actuator, numbers, dt), spectral_radii(Actuator, numbers, dt))
+    numbers = np.array(
+        [Actuator(motor, CurrentLoop(kp=kp + nudge * np.spacing(max(kp, 1.0)))).numbers]
+    )
+    np.testing.assert_array_equal(
+        stability_radii(Actuator, numbers, dt), spectral_radii(Actuator, numbers, dt)
+    )
 
 
 def test_the_quick_test_asks_nobody_where_the_case_is_clear(monkeypatch):
@@ -185,6 +233,8 @@ def test_the_quick_test_asks_nobody_where_the_case_is_clear(monkeypatch):
 
 @pytest.mark.parametrize("field", ["kp", "ki", "kd"])
 def test_gains_that_overflow_are_unstable_at_any_number_of_substeps(field):
-    numbers = np.array([with_gains(Actuator(), **{field: 1e308}, substeps=count).numbers for count in (1, 4)])
+    numbers = np.array(
+        [with_gains(Actuator(), **{field: 1e308}, substeps=count).numbers for count in (1, 4)]
+    )
     for radii in (stability_radii, spectral_radii):
         assert not (radii(Actuator, numbers, 0.01) < 1.0).any()

@@ -8,8 +8,9 @@ import pytest
 import codrl_mj
 from codrl_mj.actuators import Inputs, TorqueSpeed, actuator_over, parameters_type
 
-# Isaac Lab, source/isaaclab/test/actuators/test_dc_motor.py, test_dc_motor_clip, at saturation_effort 100,
-# velocity_limit 50, effort_limit 60; mjlab, tests/test_dc_actuator.py, at saturation_effort 20, velocity_limit 30
+# Isaac Lab, source/isaaclab/test/actuators/test_dc_motor.py, test_dc_motor_clip, at
+# saturation_effort 100, velocity_limit 50, effort_limit 60; mjlab, tests/test_dc_actuator.py, at
+# saturation_effort 20, velocity_limit 30
 ISAAC, MJLAB = TorqueSpeed(100.0, 50.0, 60.0), TorqueSpeed(20.0, 30.0, 20.0)
 CASES = [  # motor, desired, speed, delivered, in the first and fourth quadrant
     (ISAAC, 30.0, 10.0, 30.0),
@@ -35,7 +36,9 @@ CASES = [  # motor, desired, speed, delivered, in the first and fourth quadrant
 @pytest.mark.parametrize(("motor", "desired", "speed", "expected"), CASES)
 def test_points_in_four_quadrants_are_those_of_others(motor, desired, speed, expected, sign):
     inputs = Inputs(sign * desired, 0.0, sign * speed, 0.0, 0.0)
-    _, torque, signals = motor.advance(parameters_type(TorqueSpeed)(*motor.numbers), 0.01, (), inputs)
+    _, torque, signals = motor.advance(
+        parameters_type(TorqueSpeed)(*motor.numbers), 0.01, (), inputs
+    )
     assert torque == pytest.approx(sign * expected, rel=1e-12, abs=1e-12)
     assert signals.lower_limit <= torque <= signals.upper_limit
     assert signals.saturated == (torque != sign * desired)

@@ -13,16 +13,23 @@ _BUFFERED = {"learning_starts": 50, "batch_size": 16, "buffer_size": 1000}
 SMALL = {
     "ppo": (PPOConfig(rollout_steps=64, batch_size=32, epochs=2, hidden=(8,)), "cartpole"),
     "ppo, apart": (
-        PPOConfig(rollout_steps=64, batch_size=None, epochs=3, critic_learning_rate=1e-3, hidden=(8,)),
+        PPOConfig(
+            rollout_steps=64, batch_size=None, epochs=3, critic_learning_rate=1e-3, hidden=(8,)
+        ),
         "pendulum",
     ),
     "ddpg": (
-        DDPGConfig(actor_units=(8,), state_units=(4,), action_units=(4,), joint_units=(8,), **_BUFFERED),
+        DDPGConfig(
+            actor_units=(8,), state_units=(4,), action_units=(4,), joint_units=(8,), **_BUFFERED
+        ),
         "pendulum",
     ),
     "dqn": (DQNConfig(hidden=(8,), **_BUFFERED), "cartpole"),
     "td3": (TD3Config(hidden=(8,), **_BUFFERED), "mountain_car_continuous"),
-    "sac": (SACConfig(hidden=(8,), state_dependent_noise=True, **_BUFFERED), "mountain_car_continuous"),
+    "sac": (
+        SACConfig(hidden=(8,), state_dependent_noise=True, **_BUFFERED),
+        "mountain_car_continuous",
+    ),
 }
 """Name -> (settings, task)."""
 
@@ -62,4 +69,10 @@ class Sampled(gymnasium.Env):
 
     def step(self, action):
         assert self.action_space.contains(action)
-        return self.observation_space.sample(), float(np.sum(action)), False, self.np_random.random() < 0.1, {}
+        return (
+            self.observation_space.sample(),
+            float(np.sum(action)),
+            False,
+            self.np_random.random() < 0.1,
+            {},
+        )

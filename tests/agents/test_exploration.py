@@ -10,11 +10,18 @@ from tests.agents.small import make_model
 
 @pytest.mark.parametrize(
     ("agent", "sigma", "theta", "dt"),
-    [(DDPGConfig, 0.5, 0.15, 1.0), (TD3Config, 0.3, 1.0, 1.0), (SACConfig, 0.2, 3.0, 0.1), (DDPGConfig, 0.4, 1.5, 1.0)],
+    [
+        (DDPGConfig, 0.5, 0.15, 1.0),
+        (TD3Config, 0.3, 1.0, 1.0),
+        (SACConfig, 0.2, 3.0, 0.1),
+        (DDPGConfig, 0.4, 1.5, 1.0),
+    ],
 )
 def test_the_noise_is_its_recursion(agent, sigma, theta, dt):
     """X' = (1 - theta dt) x + sigma sqrt(dt) N(0, 1), from 0, with the numbers that it draws."""
-    noise = make_model(agent(noise_sigma=sigma, noise_theta=theta, noise_dt=dt), "pendulum").action_noise
+    noise = make_model(
+        agent(noise_sigma=sigma, noise_theta=theta, noise_dt=dt), "pendulum"
+    ).action_noise
     np.random.seed(1)  # the generator that the noise draws from
     drawn = np.array([noise()[0] for _ in range(200)], dtype=float)
     np.random.seed(1)
@@ -24,7 +31,9 @@ def test_the_noise_is_its_recursion(agent, sigma, theta, dt):
 
 
 def test_the_noise_starts_at_zero_in_every_episode_and_can_be_left_out():
-    model = make_model(DDPGConfig(noise_sigma=0.5, learning_starts=10**6), "pendulum", max_episode_steps=10)
+    model = make_model(
+        DDPGConfig(noise_sigma=0.5, learning_starts=10**6), "pendulum", max_episode_steps=10
+    )
     model.learn(15)
     assert model.action_noise.noise_prev != 0
     model.learn(5, reset_num_timesteps=False)
@@ -45,9 +54,9 @@ class Epsilons(BaseCallback):
 
 def epsilons(steps, max_episode_steps=None, **settings):
     watched = Epsilons()
-    make_model(DQNConfig(hidden=(4,), **settings), "mountain_car", max_episode_steps=max_episode_steps).learn(
-        steps, watched
-    )
+    make_model(
+        DQNConfig(hidden=(4,), **settings), "mountain_car", max_episode_steps=max_episode_steps
+    ).learn(steps, watched)
     return watched.seen
 
 

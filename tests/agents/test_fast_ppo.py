@@ -21,14 +21,34 @@ from tests.agents.small import Sampled
 CASES = {
     "discrete": ("CartPole", {"entropy_coefficient": 0.01, "target_kl": None}),
     "stopped": ("CartPole", {"target_kl": 0.003, "learning_rate": 0.01}),
-    "continuous": ("Pendulum", {"entropy_coefficient": 0.01, "hidden": (16, 24), "activation": "relu"}),
-    "in units": ("Pendulum", {"unit_actions": True, "log_std_init": -0.5, "input_scale": (1.0, 1.0, 0.2)}),
+    "continuous": (
+        "Pendulum",
+        {"entropy_coefficient": 0.01, "hidden": (16, 24), "activation": "relu"},
+    ),
+    "in units": (
+        "Pendulum",
+        {"unit_actions": True, "log_std_init": -0.5, "input_scale": (1.0, 1.0, 0.2)},
+    ),
     "state-dependent": (
         "Pendulum",
-        {"state_dependent_noise": True, "noise_steps": 4, "entropy_coefficient": 0.01, "hidden": (8, 8)},
+        {
+            "state_dependent_noise": True,
+            "noise_steps": 4,
+            "entropy_coefficient": 0.01,
+            "hidden": (8, 8),
+        },
     ),
 }
-FILLED = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs", "advantages", "returns")
+FILLED = (
+    "observations",
+    "actions",
+    "rewards",
+    "episode_starts",
+    "values",
+    "log_probs",
+    "advantages",
+    "returns",
+)
 
 
 def pair(case):
@@ -102,13 +122,17 @@ class Replayed:
 
 @pytest.mark.parametrize("case", ["discrete", "in units", "state-dependent"])
 def test_fills_the_buffer_as_stable_baselines3_does_for_the_same_actions(case):
-    ours, theirs, _ = pair(case)  # their environments are the same object, and begin anew with the model's seed
+    ours, theirs, _ = pair(
+        case
+    )  # their environments are the same object, and begin anew with the model's seed
     collect(ours)
     mine = ours.rollout_buffer
     theirs.policy.forward = Replayed(theirs.policy, mine.actions)
     collect(theirs)
     for name in FILLED:
-        np.testing.assert_allclose(getattr(mine, name), getattr(theirs.rollout_buffer, name), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(
+            getattr(mine, name), getattr(theirs.rollout_buffer, name), rtol=1e-5, atol=1e-5
+        )
     assert mine.episode_starts[1:].any()
 
 
@@ -152,7 +176,9 @@ def test_a_saved_model_goes_on_in_stable_baselines3_and_theirs_here(case, tmp_pa
 def test_moments_of_other_networks_are_refused():
     ours, _, _ = pair("discrete")
     other, _, _ = pair("state-dependent")
-    with pytest.raises(ValueError, match=r"12 parameters are optimised: must be 13|13 .* must be 12"):
+    with pytest.raises(
+        ValueError, match=r"12 parameters are optimised: must be 13|13 .* must be 12"
+    ):
         ours.policy.optimizer.load_state_dict(other.policy.optimizer.state_dict())
 
 
@@ -201,9 +227,20 @@ def test_a_copy_that_would_not_learn_says_so():
         ("clip_range_vf", box(3), {"clip_range_vf": 0.2}),
         ("hidden layers", box(3), {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [4]}}}),
         ("hidden layers", box(3), {"policy_kwargs": {"activation_fn": torch.nn.ELU}}),
-        ("extractor must not learn", PICTURES, {"policy_kwargs": {"features_extractor_class": NatureCNN}}),
+        (
+            "extractor must not learn",
+            PICTURES,
+            {"policy_kwargs": {"features_extractor_class": NatureCNN}},
+        ),
     ],
 )
 def test_what_it_would_learn_wrongly_is_refused(name, observations, settings):
     with pytest.raises(ValueError, match=name):
-        FastPPO(ActorCriticPolicy, spaced(observations, box(1)), n_steps=16, batch_size=16, device="cpu", **settings)
+        FastPPO(
+            ActorCriticPolicy,
+            spaced(observations, box(1)),
+            n_steps=16,
+            batch_size=16,
+            device="cpu",
+            **settings,
+        )

@@ -1,8 +1,8 @@
 """Every agent learns: a few seconds of training beat a return that no untrained policy reaches.
 
-Untrained and random policies balance the cart-pole for 9 to 60 steps, get about -1200 on the pendulum, where -150 is
-as good as it gets, and leave the car in its valley for all of its 200 steps. The settings are made for speed; each
-clears its bar with room on seeds 0 to 2.
+Untrained and random policies balance the cart-pole for 9 to 60 steps, get about -1200 on the
+pendulum, where -150 is as good as it gets, and leave the car in its valley for all of its 200
+steps. The settings are made for speed; each clears its bar with room on seeds 0 to 2.
 """
 
 import numpy as np
@@ -17,17 +17,36 @@ _REPLAY = {"batch_size": 64, "learning_starts": 200}
 _NOISE = {"noise_sigma": 0.3, "noise_theta": 1.0, "noise_dt": 1.0}
 
 _DDPG_NET = {"state_units": (), "action_units": (), "joint_units": (64, 64)}
-_DQN = {"hidden": (64, 64), "gamma": 0.95, "tau": 0.05, "target_every": 8, "train_every": 8, "gradient_steps": 4}
+_DQN = {
+    "hidden": (64, 64),
+    "gamma": 0.95,
+    "tau": 0.05,
+    "target_every": 8,
+    "train_every": 8,
+    "gradient_steps": 4,
+}
 _EPSILON = {"exploration_decay": None, "exploration_fraction": 0.4, "exploration_end": 0.04}
 
 # agent -> (settings, task, environments, steps, least return)
 LEARNERS = {
     "ppo": (PPOConfig(rollout_steps=1024, batch_size=128, epochs=8), "cartpole", 8, 10_240, 130),
     "ppo, actor and critic apart": (
-        PPOConfig(rollout_steps=1024, batch_size=None, epochs=20, learning_rate=3e-3, critic_learning_rate=3e-3),
+        PPOConfig(
+            rollout_steps=1024,
+            batch_size=None,
+            epochs=20,
+            learning_rate=3e-3,
+            critic_learning_rate=3e-3,
+        ),
         *("cartpole", 8, 10_240, 130),
     ),
-    "dqn": (DQNConfig(batch_size=128, learning_starts=500, **_DQN, **_EPSILON), "cartpole", 1, 6000, 90),
+    "dqn": (
+        DQNConfig(batch_size=128, learning_starts=500, **_DQN, **_EPSILON),
+        "cartpole",
+        1,
+        6000,
+        90,
+    ),
     "ddpg": (DDPGConfig(**_DDPG_NET, **_REPLAY, **_FAST, **_NOISE), "pendulum", 1, 2400, -500),
     "td3": (TD3Config(policy_delay=1, **_REPLAY, **_FAST, **_NOISE), "pendulum", 1, 2000, -500),
     "sac": (SACConfig(**_REPLAY, **_FAST), "pendulum", 1, 2000, -500),
@@ -41,7 +60,9 @@ def mean_return(policy, task, episodes=20):
     envs.seed(1000)
     observations, returns = envs.reset(), {}
     while len(returns) < episodes:
-        observations, _, ended, infos = envs.step(policy.predict(observations, deterministic=True)[0])
+        observations, _, ended, infos = envs.step(
+            policy.predict(observations, deterministic=True)[0]
+        )
         for row in np.flatnonzero(ended).tolist():
             returns.setdefault(row, infos[row]["episode"]["r"])
     return np.mean(list(returns.values()))

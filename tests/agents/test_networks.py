@@ -12,7 +12,9 @@ from codrl_mj.agents import AGENTS, DDPGConfig, PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, PRESETS, find_preset
 from tests.agents.small import make_envs, make_model
 
-EVERY = [(agent, task, name) for (agent, task), of in PRESETS.items() for name in of if task != ELSEWHERE]
+EVERY = [
+    (agent, task, name) for (agent, task), of in PRESETS.items() for name in of if task != ELSEWHERE
+]
 
 
 def policy_of(config, task, **arguments):
@@ -27,7 +29,11 @@ def paper(agent, task):
 def layers(module):
     """In their order: (inputs, outputs) of the linear ones, names of the others."""
     return [
-        (layer.in_features, layer.out_features) if isinstance(layer, nn.Linear) else type(layer).__name__
+        (
+            (layer.in_features, layer.out_features)
+            if isinstance(layer, nn.Linear)
+            else type(layer).__name__
+        )
         for layer in module.modules()
         if isinstance(layer, (nn.Linear, nn.ReLU, nn.Tanh))
     ]
@@ -52,12 +58,32 @@ ACTOR = [(64, 64), "ReLU", (64, 1), "Tanh"]
         (paper("ddpg", "pendulum"), "pendulum", "critic_target", TWO_STREAMS),
         (paper("ddpg", CAR), CAR, "actor", [(2, 64), "ReLU", *ACTOR]),
         (paper("ddpg", CAR), CAR, "critic", [(2, 64), "ReLU", (65, 64), "ReLU", (64, 1)]),
-        (paper("dqn", "acrobot"), "acrobot", "q_net", [(6, 64), "ReLU", (64, 128), "ReLU", (128, 3)]),
-        (paper("ppo", "cartpole"), "cartpole", "mlp_extractor.policy_net", [(4, 64), "Tanh", (64, 64), "Tanh"]),
-        (paper("ppo", "cartpole"), "cartpole", "mlp_extractor.value_net", [(4, 64), "Tanh", (64, 64), "Tanh"]),
+        (
+            paper("dqn", "acrobot"),
+            "acrobot",
+            "q_net",
+            [(6, 64), "ReLU", (64, 128), "ReLU", (128, 3)],
+        ),
+        (
+            paper("ppo", "cartpole"),
+            "cartpole",
+            "mlp_extractor.policy_net",
+            [(4, 64), "Tanh", (64, 64), "Tanh"],
+        ),
+        (
+            paper("ppo", "cartpole"),
+            "cartpole",
+            "mlp_extractor.value_net",
+            [(4, 64), "Tanh", (64, 64), "Tanh"],
+        ),
         (paper("ppo", "cartpole"), "cartpole", "action_net", [(64, 2)]),
         (paper("ppo", "cartpole"), "cartpole", "value_net", [(64, 1)]),
-        (PPOConfig(hidden=(5,), activation="relu"), "cartpole", "mlp_extractor.policy_net", [(4, 5), "ReLU"]),
+        (
+            PPOConfig(hidden=(5,), activation="relu"),
+            "cartpole",
+            "mlp_extractor.policy_net",
+            [(4, 5), "ReLU"],
+        ),
     ],
 )
 def test_layers_are_those_printed_or_asked_for(config, task, part, expected):
@@ -88,7 +114,9 @@ def test_the_critic_of_two_streams_is_the_function_that_the_paper_describes():
 def test_ddpg_acts_within_the_range_that_tanh_spans(task, limit):
     policy = policy_of(paper("ddpg", task), task)
     policy.actor.mu[-2].bias.data.fill_(100.0)
-    np.testing.assert_allclose(policy.predict(observations(task), deterministic=True)[0], limit, rtol=1e-6)
+    np.testing.assert_allclose(
+        policy.predict(observations(task), deterministic=True)[0], limit, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("agent", ["ppo", "ddpg", "td3", "sac"])
@@ -99,11 +127,16 @@ def test_factors_on_the_input_are_those_on_the_observation(agent):
     scaled.load_state_dict(plain.state_dict())
     seen = observations(task)
     times = seen * np.array(factors, np.float32)
-    ours, theirs = (one.predict(seen, deterministic=True)[0] for one, seen in ((scaled, seen), (plain, times)))
+    ours, theirs = (
+        one.predict(seen, deterministic=True)[0] for one, seen in ((scaled, seen), (plain, times))
+    )
     np.testing.assert_array_equal(ours, theirs)
     if agent != "ppo":  # critics too
         actions = torch.zeros(len(seen), 1)
-        ours, theirs = scaled.critic(torch.tensor(seen), actions), plain.critic(torch.tensor(times), actions)
+        ours, theirs = (
+            scaled.critic(torch.tensor(seen), actions),
+            plain.critic(torch.tensor(times), actions),
+        )
         assert all(map(torch.equal, ours, theirs))
 
 
@@ -120,14 +153,19 @@ def test_unit_actions_are_those_of_a_plain_actor_times_the_largest(command, larg
     plain, units = (policy_of(config, "furuta", action=command) for config in configs)
     units.load_state_dict(plain.state_dict())
     seen = torch.as_tensor(observations("furuta"))
-    ours, theirs = units.get_distribution(seen).distribution, plain.get_distribution(seen).distribution
+    ours, theirs = (
+        units.get_distribution(seen).distribution,
+        plain.get_distribution(seen).distribution,
+    )
     torch.testing.assert_close(ours.mean, largest * theirs.mean)
     torch.testing.assert_close(ours.stddev, torch.full_like(ours.stddev, largest * np.exp(-0.5)))
 
 
 def test_the_largest_action_may_be_a_negative_one():
     envs, space = make_envs("furuta"), gymnasium.spaces.Box(-2.0, 0.0, (1,), np.float32)
-    policy = PPOConfig(log_std_init=0.0, unit_actions=True).make_policy(envs.observation_space, space)
+    policy = PPOConfig(log_std_init=0.0, unit_actions=True).make_policy(
+        envs.observation_space, space
+    )
     spread = policy.get_distribution(torch.as_tensor(observations("furuta"))).distribution.stddev
     torch.testing.assert_close(spread, torch.full_like(spread, 2.0))
 
@@ -138,5 +176,7 @@ def test_weights_make_the_same_policy_again(agent, task, settings):
     model = make_model(preset.agent, task, seed=3, num_envs=preset.num_envs)
     policy = preset.agent.make_policy(model.observation_space, model.action_space)
     policy.load_state_dict(model.policy.state_dict())  # all have the same names and shapes
-    ours, theirs = (one.predict(observations(task), deterministic=True)[0] for one in (policy, model.policy))
+    ours, theirs = (
+        one.predict(observations(task), deterministic=True)[0] for one in (policy, model.policy)
+    )
     np.testing.assert_array_equal(ours, theirs)

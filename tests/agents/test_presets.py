@@ -23,12 +23,43 @@ PPO = (
     "rollout_steps",
     "batch_size",
 )
-SARSA = ("tilings", "intervals", "step_size", "gamma", "epsilon", "epsilon_decay", "trace_decay", "initial_value")
-PRINTED = [  # what the paper prints (Experimental Results): episodes or steps, and values of the names above
-    ("ddpg", "pendulum", 500, None, DDPG, (1e-3, 2e-3, 0.99, 0.005, (64, 64), (1,), (32,), (256, 256))),
-    ("ddpg", "mountain_car_continuous", 200, None, DDPG, (1e-3, 4e-5, 0.85, 0.45, (64, 64), (64,), (), (64,))),
+SARSA = (
+    "tilings",
+    "intervals",
+    "step_size",
+    "gamma",
+    "epsilon",
+    "epsilon_decay",
+    "trace_decay",
+    "initial_value",
+)
+# what the paper prints (Experimental Results): episodes or steps, and values of the names above
+PRINTED = [
+    (
+        "ddpg",
+        "pendulum",
+        500,
+        None,
+        DDPG,
+        (1e-3, 2e-3, 0.99, 0.005, (64, 64), (1,), (32,), (256, 256)),
+    ),
+    (
+        "ddpg",
+        "mountain_car_continuous",
+        200,
+        None,
+        DDPG,
+        (1e-3, 4e-5, 0.85, 0.45, (64, 64), (64,), (), (64,)),
+    ),
     ("dqn", "acrobot", 500, None, DQN, (1e-3, 0.99, (64, 128))),
-    ("ppo", "cartpole", None, 60 * 4000, PPO, (3e-4, 0.99, (64, 64), 1e-3, 0.97, 0.2, 0.01, "tanh", 4000, None)),
+    (
+        "ppo",
+        "cartpole",
+        None,
+        60 * 4000,
+        PPO,
+        (3e-4, 0.99, (64, 64), 1e-3, 0.97, 0.2, 0.01, "tanh", 4000, None),
+    ),
     ("sarsa", "mountain_car", 600, None, SARSA, (8, (8, 8), 0.0375, 1.0, 0.001, 1.0, 0.0, 0.0)),
 ]
 
@@ -73,11 +104,17 @@ def test_settings_have_the_names_that_are_known_and_one_budget():
     ("names", "message"),
     [
         (("sac", "furuta"), "sac on furuta has no such settings; those on furuta are ppo: default"),
-        (("dqn", "acrobot", "repaired"), "settings = 'repaired': dqn on acrobot has no such settings"),
+        (
+            ("dqn", "acrobot", "repaired"),
+            "settings = 'repaired': dqn on acrobot has no such settings",
+        ),
         (("dqn", "acrobot", "repaired"), "dqn: default, paper"),
         (("dqn", "pendulum"), "dqn on pendulum has no such settings; "),
         (("dqn", "pendulum"), "ddpg: default, paper, repaired"),
-        (("ppo", "juggling", "paper"), "ppo on juggling has no such settings; those on juggling are none"),
+        (
+            ("ppo", "juggling", "paper"),
+            "ppo on juggling has no such settings; those on juggling are none",
+        ),
     ],
 )
 def test_unknown_settings_are_answered_with_those_that_exist(names, message):

@@ -57,7 +57,9 @@ def _table(model):
 def test_it_does_what_the_box_says(trace_decay):
     """The weights are those that the box (10.1; 12.7 with replacing traces) computes from what was done."""
     step_size, gamma, env = 0.3, 0.9, Chain()
-    config = SARSAConfig(step_size=step_size, gamma=gamma, epsilon=0.5, trace_decay=trace_decay, **TABLE)
+    config = SARSAConfig(
+        step_size=step_size, gamma=gamma, epsilon=0.5, trace_decay=trace_decay, **TABLE
+    )
     model = config.make_model(env, 3).learn(60)
     values = np.zeros((3, 2))
     for episode in env.history[:-1]:  # the last one was only begun
@@ -90,7 +92,10 @@ def test_every_weight_starts_at_its_share_of_the_initial_value():
 
 def test_equally_good_actions_are_chosen_alike_and_a_greedy_policy_takes_the_first():
     env = Chain(actions=4)
-    env.step = lambda action: (env.history[-1].append(action), (np.zeros(1, np.float32), 0.0, True, False, {}))[1]
+    env.step = lambda action: (
+        env.history[-1].append(action),
+        (np.zeros(1, np.float32), 0.0, True, False, {}),
+    )[1]
     model = SARSAConfig(epsilon=0.0, **TABLE).make_model(env, 0).learn(1000)
     counts = np.bincount([int(episode[0]) for episode in env.history if episode], minlength=4)
     assert counts.sum() == 1000
@@ -99,7 +104,9 @@ def test_equally_good_actions_are_chosen_alike_and_a_greedy_policy_takes_the_fir
 
 
 def test_epsilon_is_the_share_of_random_actions():
-    policy = SARSAConfig(epsilon=0.3, **TABLE).make_policy(Chain.observation_space, spaces.Discrete(2))
+    policy = SARSAConfig(epsilon=0.3, **TABLE).make_policy(
+        Chain.observation_space, spaces.Discrete(2)
+    )
     policy.table[:, 1] = 1.0
     actions, _ = policy.predict(np.zeros((20_000, 1), np.float32), deterministic=False)
     assert abs((actions == 0).mean() - 0.15) < 5 * np.sqrt(0.15 * 0.85 / 20_000)
@@ -109,7 +116,9 @@ def test_epsilon_is_the_share_of_random_actions():
 
 
 def _car(seed_of_env=None, **arguments):
-    env = codrl_mj.make_sb3_vec_env("codrl_mj/MountainCar-v0", num_envs=1, **({"actuator": "ideal"} | arguments))
+    env = codrl_mj.make_sb3_vec_env(
+        "codrl_mj/MountainCar-v0", num_envs=1, **({"actuator": "ideal"} | arguments)
+    )
     if seed_of_env is not None:
         env.seed(seed_of_env)
     return env
@@ -157,7 +166,9 @@ def test_a_loaded_model_acts_and_learns_on_like_the_one_saved(tmp_path):
 def test_many_predictions_are_each_the_one():
     model = SARSAConfig().make_model(_car(), 0).learn(2000)
     space = model.observation_space
-    observations = np.random.default_rng(0).uniform(space.low, space.high, (200, 2)).astype(np.float32)
+    observations = (
+        np.random.default_rng(0).uniform(space.low, space.high, (200, 2)).astype(np.float32)
+    )
     actions = model.predict(observations, deterministic=True)[0].tolist()
     assert set(actions) == {0, 1, 2}
     assert [model.predict(one, deterministic=True)[0].item() for one in observations] == actions
@@ -177,7 +188,9 @@ def test_callbacks_see_every_episode_and_its_epsilon_and_loggers_work(tmp_path):
     often = EveryNTimesteps(400, ConvertCallback(lambda locals_, _: every.append(locals_) or True))
     save = CheckpointCallback(2, str(tmp_path / "checkpoints"))
     model.learn(10**9, [watched, often, save, StopTrainingOnMaxEpisodes(5)], log_interval=1)
-    assert watched.begun == [(200 * episode, pytest.approx(0.5 * 0.9**episode)) for episode in range(5)]
+    assert watched.begun == [
+        (200 * episode, pytest.approx(0.5 * 0.9**episode)) for episode in range(5)
+    ]
     assert len(every) == 2
     assert model.num_timesteps == sum(episode["l"] for episode in model.ep_info_buffer) == 1000
     assert list((tmp_path / "checkpoints").iterdir())
@@ -193,8 +206,18 @@ def test_learning_ends_with_an_episode_and_goes_on_with_the_next():
 # -- whole episodes in compiled code ----------------------------------------------------------------------------
 
 NOISY = {"controller": {"ki": 1.0, "kd": 0.01, "current_noise": 0.05}}
-DISTURBED = {"command_delay": 0.12, "pulse_force": 0.1, "pulse_duration": 1.0, "pulse_interval": 9.0}
-LEVELS = {"actuator": "paper", "observe_actuator": True, "action": "current", "levels": (-1, -0.5, 0.5, 1)}
+DISTURBED = {
+    "command_delay": 0.12,
+    "pulse_force": 0.1,
+    "pulse_duration": 1.0,
+    "pulse_interval": 9.0,
+}
+LEVELS = {
+    "actuator": "paper",
+    "observe_actuator": True,
+    "action": "current",
+    "levels": (-1, -0.5, 0.5, 1),
+}
 
 
 @pytest.mark.parametrize(
@@ -210,7 +233,10 @@ LEVELS = {"actuator": "paper", "observe_actuator": True, "action": "current", "l
 def test_compiled_episodes_are_those_taken_step_by_step(settings, arguments):
     states, seen = [], []
     for compiled in (False, True):
-        model, watched = _model(SARSAConfig(epsilon=0.2, **settings), compiled, **arguments), Watched()
+        model, watched = (
+            _model(SARSAConfig(epsilon=0.2, **settings), compiled, **arguments),
+            Watched(),
+        )
         model.learn(10**9, [StopTrainingOnMaxEpisodes(5), watched])
         signals = {f"signals.{name}": values for name, values in model.env.signals.items()}
         own = {"table": _table(model), "observation": model._last_obs, "steps": model.num_timesteps}
@@ -229,8 +255,17 @@ def test_compiled_episodes_are_those_taken_step_by_step(settings, arguments):
         np.testing.assert_array_equal(one["terminal_observation"], other["terminal_observation"])
         assert one["TimeLimit.truncated"] == other["TimeLimit.truncated"]
         assert one["episode"] | {"t": 0} == other["episode"] | {"t": 0}
-    for signal in ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated"):
-        np.testing.assert_array_equal(*(np.concatenate([s["signals"][signal] for s in each]) for each in seen))
+    for signal in (
+        "desired_force",
+        "actual_force",
+        "current",
+        "reference_current",
+        "voltage",
+        "saturated",
+    ):
+        np.testing.assert_array_equal(
+            *(np.concatenate([s["signals"][signal] for s in each]) for each in seen)
+        )
 
 
 def test_episodes_on_a_hill_that_was_rewritten_are_not_those_of_a_simulation_of_its_own():
@@ -268,7 +303,11 @@ def test_a_diverging_simulation_is_an_error(compiled):
     ("task", "config", "message"),
     [
         ("Pendulum", SARSAConfig(intervals=(8, 8, 8)), "must be Discrete"),
-        ("MountainCar", SARSAConfig(intervals=(8, 8, 8)), "of 3 observation entries, but there are 2"),
+        (
+            "MountainCar",
+            SARSAConfig(intervals=(8, 8, 8)),
+            "of 3 observation entries, but there are 2",
+        ),
         ("Acrobot", SARSAConfig(intervals=(8, 8), angles=3), "angles = 3: must be from 0"),
         ("CartPole", SARSAConfig(intervals=(4, 4, 4, 4)), "axis 1 from -inf to inf"),
         ("MountainCar", SARSAConfig(tilings=6), "tilings = 6: must be a power of 2"),
@@ -296,5 +335,11 @@ def test_the_actuators_currents_are_ignored_or_tiled_as_the_intervals_say():
     env = _car(actuator="paper", observe_actuator=True)
     space = env.observation_space
     assert SARSAConfig().make_model(env, 0).policy.table.shape == (648, 3)
-    ends = {"low": (*space.low[:2].tolist(), -1.0, -1.0), "high": (*space.high[:2].tolist(), 1.0, 1.0)}
-    assert SARSAConfig(intervals=(8, 8, 2, 2), **ends).make_model(env, 0).policy.table.shape == (648 * 9, 3)
+    ends = {
+        "low": (*space.low[:2].tolist(), -1.0, -1.0),
+        "high": (*space.high[:2].tolist(), 1.0, 1.0),
+    }
+    assert SARSAConfig(intervals=(8, 8, 2, 2), **ends).make_model(env, 0).policy.table.shape == (
+        648 * 9,
+        3,
+    )

@@ -36,9 +36,15 @@ SHARE = (beyond(0, 1), 0.5, 1), (0, beyond(1, 2), *NO), "a finite number > 0 and
 PART = (0, 0.5, 1), (beyond(0, -1), beyond(1, 2), *NO), "a finite number >= 0 and <= 1"
 ABOVE_0 = (beyond(0, 1), 3), (0, *NO), "a finite number > 0"
 FROM_0 = (0, 3), (beyond(0, -1), *NO), "a finite number >= 0"
-COUNTS = [((least,), (least - 1, float(least), True, "2"), f"an integer >= {least}") for least in range(3)]
+COUNTS = [
+    ((least,), (least - 1, float(least), True, "2"), f"an integer >= {least}") for least in range(3)
+]
 UNITS = ((3, 5),), ((0,), (2.0,), 64, (True,)), "a tuple of integers >= 1"
-FACTORS = ((0.5, 3.0),), ((0.0,), (-1.0,), (math.nan,), (math.inf,), 1.0, ("2",)), "a tuple of finite numbers > 0"
+FACTORS = (
+    ((0.5, 3.0),),
+    ((0.0,), (-1.0,), (math.nan,), (math.inf,), 1.0, ("2",)),
+    "a tuple of finite numbers > 0",
+)
 
 FIELDS = {  # field -> (agents, values, those of the agents that take None as well)
     "learning_rate": (DEEP, SHARE, ()),
@@ -89,7 +95,10 @@ def test_a_setting_is_taken_exactly_within_its_bounds(field):
             given = list(value) if isinstance(value, tuple) else value  # as JSON has it
             assert getattr(agent(**{field: given}), field) == value
         for value in (*refused, *(() if agent in optional else nothing)):
-            message = rf"^{agent.__name__}\.{field} = {re.escape(repr(value))}: must be {re.escape(words)}"
+            message = (
+                rf"^{agent.__name__}\.{field} = {re.escape(repr(value))}: must be"
+                rf" {re.escape(words)}"
+            )
             with pytest.raises(ValueError, match=message):
                 agent(**{field: value})
 
@@ -103,8 +112,14 @@ UNSTABLE = "noise_theta = 4.0: noise_theta * noise_dt must be < 2, and noise_dt 
     ("make", "message"),
     [
         # x' = (1 - theta * dt) * x + ... is stable for |1 - theta * dt| < 1
-        *((lambda agent=agent: agent(**NOISE), f"{agent.__name__}.{UNSTABLE}") for agent in CONTINUOUS),
-        (lambda: PPOConfig(**APART), "unit_actions = True: must be False with state_dependent_noise"),
+        *(
+            (lambda agent=agent: agent(**NOISE), f"{agent.__name__}.{UNSTABLE}")
+            for agent in CONTINUOUS
+        ),
+        (
+            lambda: PPOConfig(**APART),
+            "unit_actions = True: must be False with state_dependent_noise",
+        ),
         # with the environments
         (
             lambda: make_model(PPOConfig(rollout_steps=100, batch_size=10), "cartpole", num_envs=3),
@@ -114,11 +129,23 @@ UNSTABLE = "noise_theta = 4.0: noise_theta * noise_dt must be < 2, and noise_dt 
             lambda: make_model(PPOConfig(rollout_steps=100, batch_size=30), "cartpole"),
             "PPOConfig.rollout_steps = 100: must be a multiple of batch_size = 30",
         ),
-        (lambda: make_model(DQNConfig(train_every=None), "cartpole", num_envs=2), "needs num_envs = 1, not 2"),
-        (lambda: make_model(PPOConfig(unit_actions=True), "cartpole"), "must be False for discrete actions"),
-        (lambda: make_model(DQNConfig(input_scale=(1, 1, 1)), "mountain_car"), "must have at most 2 factors"),
+        (
+            lambda: make_model(DQNConfig(train_every=None), "cartpole", num_envs=2),
+            "needs num_envs = 1, not 2",
+        ),
+        (
+            lambda: make_model(PPOConfig(unit_actions=True), "cartpole"),
+            "must be False for discrete actions",
+        ),
+        (
+            lambda: make_model(DQNConfig(input_scale=(1, 1, 1)), "mountain_car"),
+            "must have at most 2 factors",
+        ),
         # names
-        (lambda: agent_from_mapping({"name": "dqn", "momentum": 1}), "unknown key agent.momentum; known: "),
+        (
+            lambda: agent_from_mapping({"name": "dqn", "momentum": 1}),
+            "unknown key agent.momentum; known: ",
+        ),
         (lambda: agent_from_mapping({"gamma": 0.9}), "unknown agent 'None'"),
         (lambda: find_agent("reinforce"), "unknown agent 'reinforce': Known: ppo, ddpg, dqn"),
         (lambda: find_agent(f"{__name__}:re"), "is no subclass of codrl_mj's AgentConfig"),
@@ -144,7 +171,9 @@ def test_noise_that_dies_out_is_taken(agent):
     ],
 )
 def test_an_agent_that_cannot_act_in_a_task_is_refused_with_those_that_can(agent, task, kind):
-    with pytest.raises(ValueError, match=rf"agent = '{agent}': cannot act in the {kind} actions of {task}") as refusal:
+    with pytest.raises(
+        ValueError, match=rf"agent = '{agent}': cannot act in the {kind} actions of {task}"
+    ) as refusal:
         check_fits(agent, EnvConfig(task))
     named = set(str(refusal.value).rpartition(": ")[2].split(", ")) & set(AGENTS)
     assert "ppo" in named

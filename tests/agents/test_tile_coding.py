@@ -31,7 +31,9 @@ def test_a_point_lies_in_one_tile_of_each_displaced_grid(point):
     expected = []
     for tiling in range(16):
         displacements = (Fraction((2 * axis + 1) * tiling % 16, 16) for axis in range(3))
-        cells = [math.floor(Fraction(x) + shift) for x, shift in zip(point, displacements, strict=True)]
+        cells = [
+            math.floor(Fraction(x) + shift) for x, shift in zip(point, displacements, strict=True)
+        ]
         expected.append(np.ravel_multi_index((tiling, *cells), (16, *COUNTS)))
     assert _tiles(EXACT, point) == expected
 
@@ -52,24 +54,32 @@ def test_two_states_share_a_tile_exactly_if_they_do_in_suttons_tiles3():
     ours, theirs = {}, {}
     for point in generator.uniform(0, 1, (2000, 2)):
         quanta = np.floor(point * 64).astype(int)
-        for tiling, tile in enumerate(_tiles(PAPER, SPACE.low + (SPACE.high - SPACE.low).astype(float) * point)):
+        for tiling, tile in enumerate(
+            _tiles(PAPER, SPACE.low + (SPACE.high - SPACE.low).astype(float) * point)
+        ):
             coordinates = tiling, *((quanta + tiling * np.array([1, 3])) // 8).tolist()
             assert ours.setdefault(tile, coordinates) == coordinates
             assert theirs.setdefault(coordinates, tile) == tile
     assert len(ours) > 8 * 64
 
 
-@given(st.floats(allow_nan=True, allow_infinity=True), st.floats(allow_nan=True, allow_infinity=True))
+@given(
+    st.floats(allow_nan=True, allow_infinity=True), st.floats(allow_nan=True, allow_infinity=True)
+)
 def test_points_outside_lie_in_the_outer_tiles_and_nan_at_the_lower_end(position, velocity):
     inside = [
         low if math.isnan(entry) else min(max(entry, low), high)
-        for entry, low, high in zip((position, velocity), SPACE.low.tolist(), SPACE.high.tolist(), strict=True)
+        for entry, low, high in zip(
+            (position, velocity), SPACE.low.tolist(), SPACE.high.tolist(), strict=True
+        )
     ]
     assert _tiles(PAPER, (position, velocity)) == _tiles(PAPER, inside)
 
 
 def test_float32_observations_have_the_tiles_of_their_float64_values():
-    for point in np.random.default_rng(1).uniform(SPACE.low, SPACE.high, (100, 2)).astype(np.float32):
+    for point in (
+        np.random.default_rng(1).uniform(SPACE.low, SPACE.high, (100, 2)).astype(np.float32)
+    ):
         assert _tiles(PAPER, point, np.float32) == _tiles(PAPER, point.astype(np.float64))
 
 
@@ -82,7 +92,9 @@ def test_an_angle_is_tiled_as_the_number_that_it_is(angle):
     wrapping = make_coder((), (), 8, (4,), angles=1)
     plain = make_coder((-math.pi,), (math.pi,), 8, (4,))
     angle = math.atan2(math.sin(angle), math.cos(angle))  # as it comes back
-    expected = [tile % 5 % 4 + tile // 5 * 4 for tile in _tiles(plain, [angle])]  # the fifth tile is the first again
+    expected = [
+        tile % 5 % 4 + tile // 5 * 4 for tile in _tiles(plain, [angle])
+    ]  # the fifth tile is the first again
     assert _tiles(wrapping, _seen(angle)) == expected
 
 

@@ -23,21 +23,35 @@ def with_rates(config, actor, critic):
 
 def apart(**settings):
     """PPO with separate passes, one rollout long."""
-    defaults = {"rollout_steps": 128, "batch_size": None, "hidden": (8,), "critic_learning_rate": 1e-3}
+    defaults = {
+        "rollout_steps": 128,
+        "batch_size": None,
+        "hidden": (8,),
+        "critic_learning_rate": 1e-3,
+    }
     return PPOConfig(**defaults | settings)
 
 
 @pytest.mark.parametrize(
     ("config", "task"),
-    [*((config, "pendulum") for config in (*ACTOR_CRITIC.values(), apart())), (apart(), "cartpole")],
+    [
+        *((config, "pendulum") for config in (*ACTOR_CRITIC.values(), apart())),
+        (apart(), "cartpole"),
+    ],
     ids=lambda value: getattr(value, "name", value),
 )
 @pytest.mark.parametrize(("actor", "critic"), [(TINY, LARGE), (LARGE, TINY)])
 def test_each_learning_rate_moves_its_own_network(config, task, actor, critic):
     model = make_model(with_rates(config, actor, critic), task)
-    before = {name: tensor for name, tensor in weights(model.policy).items() if "target" not in name}
+    before = {
+        name: tensor for name, tensor in weights(model.policy).items() if "target" not in name
+    }
     model.learn(60)
-    of_critic = {name for name in before if name.startswith(("critic", "mlp_extractor.value_net", "value_net"))}
+    of_critic = {
+        name
+        for name in before
+        if name.startswith(("critic", "mlp_extractor.value_net", "value_net"))
+    }
     moved = of_critic if critic == LARGE else set(before) - of_critic
     assert differing(before, weights(model.policy), by=1e-20) == moved
 
@@ -65,11 +79,14 @@ def steps_taken(model):
     [
         ({"epochs": 3, "critic_epochs": 5, "target_kl": None}, 256, [2 * 3, 2 * 5]),  # two rollouts
         ({"epochs": 3, "batch_size": 32, "target_kl": None}, 128, [3 * 4, 3 * 4]),  # in minibatches
-        # before its first step the policy has not moved at all; after one, by more than any tiny bound
+        # before its first step the policy has not moved at all; after one, by more than any tiny
+        # bound
         ({"epochs": 7, "target_kl": 1e-12, "learning_rate": LARGE}, 128, [1, 7]),
     ],
 )
-def test_ppo_takes_its_passes_but_after_too_large_a_move_of_the_actor_the_critics_alone(settings, steps, taken):
+def test_ppo_takes_its_passes_but_after_too_large_a_move_of_the_actor_the_critics_alone(
+    settings, steps, taken
+):
     model = make_model(apart(**settings), "cartpole")
     model.learn(steps)
     assert steps_taken(model) == taken
@@ -100,17 +117,24 @@ def test_the_actor_stops_at_one_and_a_half_times_the_bound(target_kl):
 
 
 def test_separate_passes_are_the_clipped_loss_and_the_squared_error_stepped_by_two_optimisers():
-    model = make_model(apart(learning_rate=3e-4, critic_learning_rate=1e-3, epochs=4, target_kl=None), "cartpole")
+    model = make_model(
+        apart(learning_rate=3e-4, critic_learning_rate=1e-3, epochs=4, target_kl=None), "cartpole"
+    )
     reference = make_model(apart(learning_rate=3e-4), "cartpole").policy
     reference.load_state_dict(model.policy.state_dict())
     model.learn(128)
     critic = [*reference.mlp_extractor.value_net.parameters(), *reference.value_net.parameters()]
     actor = [*reference.mlp_extractor.policy_net.parameters(), *reference.action_net.parameters()]
-    optimizers = torch.optim.Adam(actor, lr=3e-4, eps=1e-5), torch.optim.Adam(critic, lr=1e-3, eps=1e-5)
+    optimizers = (
+        torch.optim.Adam(actor, lr=3e-4, eps=1e-5),
+        torch.optim.Adam(critic, lr=1e-3, eps=1e-5),
+    )
     rollout = next(model.rollout_buffer.get())
     advantage = (rollout.advantages - rollout.advantages.mean()) / rollout.advantages.std()
     for _ in range(4):
-        value, log_probability, _ = reference.evaluate_actions(rollout.observations, rollout.actions.flatten())
+        value, log_probability, _ = reference.evaluate_actions(
+            rollout.observations, rollout.actions.flatten()
+        )
         ratio = torch.exp(log_probability - rollout.old_log_prob)
         losses = (
             -torch.minimum(ratio * advantage, ratio.clip(0.8, 1.2) * advantage).mean(),
@@ -142,14 +166,20 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not(agent):
 @pytest.mark.parametrize(
     ("agent", "settings", "steps_of_gradient"),
     [
-        ("ddpg", {"train_every": None}, lambda steps: steps),  # after every episode as many as it was long
+        (
+            "ddpg",
+            {"train_every": None},
+            lambda steps: steps,
+        ),  # after every episode as many as it was long
         ("dqn", {"train_every": None}, lambda steps: steps),
         ("dqn", {"train_every": 8, "gradient_steps": 3}, lambda steps: steps / 8 * 3),
     ],
 )
 def test_gradient_steps_and_their_frequency_are_as_asked(agent, settings, steps_of_gradient):
     config, task = SMALL[agent]
-    model = make_model(dataclasses.replace(config, learning_starts=0, **settings), task, max_episode_steps=20)
+    model = make_model(
+        dataclasses.replace(config, learning_starts=0, **settings), task, max_episode_steps=20
+    )
     model.learn(96)
     assert model.num_timesteps >= 96
     assert model._n_updates == steps_of_gradient(model.num_timesteps)

@@ -7,7 +7,13 @@ import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 QUIET = (
-    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"),
+    *(
+        "--no-sandbox",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-sync",
+    ),
     *("--disable-component-update", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 )
 
@@ -20,8 +26,8 @@ def chromium():
     path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if path is None:
         pytest.fail(
-            f"there is no browser: none of {', '.join(NAMES)} is on the path; install one (Debian, Ubuntu: apt-get "
-            "install chromium) or name it in CHROMIUM"
+            f"there is no browser: none of {', '.join(NAMES)} is on the path; install one (Debian,"
+            " Ubuntu: apt-get install chromium) or name it in CHROMIUM"
         )
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=list(QUIET))
@@ -35,13 +41,17 @@ def opened(chromium):
     pages, wrong = [], []
 
     def open_page(address, width=1280, height=800, scheme="light", **options):
-        page = chromium.new_page(viewport={"width": width, "height": height}, color_scheme=scheme, **options)
+        page = chromium.new_page(
+            viewport={"width": width, "height": height}, color_scheme=scheme, **options
+        )
         page.emulate_media(reduced_motion="reduce")
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on("console", lambda message: message.type == "error" and wrong.append(message.text))
 
         def asked(request):
-            if not request.url.startswith(("data:", "blob:", "file:", "http://127.0.0.1:", "ws://127.0.0.1:")):
+            if not request.url.startswith(
+                ("data:", "blob:", "file:", "http://127.0.0.1:", "ws://127.0.0.1:")
+            ):
                 wrong.append(f"asked for {request.url}")
 
         page.on("request", asked)

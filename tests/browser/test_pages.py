@@ -30,10 +30,17 @@ def pages(tmp_path_factory):
     )
     report([RUN], folder / "report.html", joined=lambda shown: (*replays(shown), joined))
     report([RUN, RUN.parent / "cartpole"], folder / "two.html")
-    motor_page("qube", find_drive("quanser-qube-servo-2"), find_entry("quanser-qube-servo-2"), folder / "motor.html")
+    motor_page(
+        "qube",
+        find_drive("quanser-qube-servo-2"),
+        find_entry("quanser-qube-servo-2"),
+        folder / "motor.html",
+    )
     evil = "<img src=http://there/x onerror=alert(1)>" + "x" * 90
     plot = Plot(evil, f"{evil} [s]", evil, (Curve(evil, np.arange(9.0), np.arange(9.0)),))
-    section = builder.Section("s", evil, builder.plot(plot) + builder.table(evil, (evil,), [(evil,)]))
+    section = builder.Section(
+        "s", evil, builder.plot(plot) + builder.table(evil, (evil,), [(evil,)])
+    )
     builder.write(folder / "evil.html", builder.page(evil, evil, Markup(), [section]))
     return folder
 
@@ -48,7 +55,9 @@ def drawn(page, title):
 
 def span(figure):
     """What a plot shows of its horizontal axis."""
-    return figure.locator(".plot").evaluate("box => [box.plot.u.scales.x.min, box.plot.u.scales.x.max]")
+    return figure.locator(".plot").evaluate(
+        "box => [box.plot.u.scales.x.min, box.plot.u.scales.x.max]"
+    )
 
 
 def now(page):
@@ -58,7 +67,8 @@ def now(page):
 def line(figure):
     """The time at which a plot draws the present."""
     return figure.locator(".plot").evaluate(
-        "box => box.plot.u.posToVal(new DOMMatrix(getComputedStyle(box.plot.line).transform).e, 'x')"
+        "box => box.plot.u.posToVal(new DOMMatrix(getComputedStyle(box.plot.line).transform).e,"
+        " 'x')"
     )
 
 
@@ -73,13 +83,17 @@ def test_pages_fit_laptop_and_phone_in_light_and_dark(opened, pages, name, width
     light = page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
     assert light is (scheme == "light")
     page.click("#theme")
-    assert (page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)") is not light
+    assert (
+        page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    ) is not light
 
 
 def test_the_plots_follow_the_film(opened, pages):
     page = opened((pages / "report.html").as_uri())
     torque = drawn(page, "Torque at the shaft")
-    until(page, "document.querySelector('video').currentTime > 0")  # a frame of its own: the poster is a later one
+    until(
+        page, "document.querySelector('video').currentTime > 0"
+    )  # a frame of its own: the poster is a later one
     assert page.evaluate("codrl.clock.time") == 0.0
     page.get_by_role("button", name="Play").click()
     until(page, "codrl.clock.time > 0.6")
@@ -137,7 +151,9 @@ def test_plots_zoom_pan_and_show_all_again(opened, pages):
     page.mouse.down()
     page.mouse.move(box["x"] + 0.75 * box["width"], box["y"] + 60, steps=4)
     page.mouse.up()
-    assert span(figure) == pytest.approx([0.75 * low + 0.25 * high, 0.25 * low + 0.75 * high], rel=0.05)
+    assert span(figure) == pytest.approx(
+        [0.75 * low + 0.25 * high, 0.25 * low + 0.75 * high], rel=0.05
+    )
     page.mouse.dblclick(box["x"] + 0.5 * box["width"], box["y"] + 50)
     assert span(figure) == whole
     page.mouse.move(box["x"] + box["width"] - 2, box["y"] + 50)
@@ -165,13 +181,19 @@ def test_runs_can_be_hidden(opened, pages):
     assert figure.locator(".legend button:visible").count() == 4
     page.get_by_label("cartpole", exact=True).uncheck()
     assert figure.locator(".legend button:visible").count() == 2
-    series = figure.locator(".plot").evaluate("box => box.plot.u.series.slice(1).map((one) => one.show)")
+    series = figure.locator(".plot").evaluate(
+        "box => box.plot.u.series.slice(1).map((one) => one.show)"
+    )
     assert series == [True, True, False, False]
 
 
 def test_without_scripts_there_are_pictures_and_the_films_own_controls(opened, pages):
     page = opened((pages / "report.html").as_uri(), java_script_enabled=False)
-    assert page.locator("figure.uplotted noscript img").count() == page.locator("figure.uplotted").count() > 5
+    assert (
+        page.locator("figure.uplotted noscript img").count()
+        == page.locator("figure.uplotted").count()
+        > 5
+    )
     assert page.locator("video").get_attribute("controls") is not None
 
 

@@ -40,7 +40,9 @@ const setAll = (time) => clocks.forEach((clock) => clock(time));
 
 def picture(page):
     page.wait_for_timeout(300)
-    return np.asarray(Image.open(io.BytesIO(page.locator(".replay").screenshot())).convert("RGB")).astype(int)
+    return np.asarray(
+        Image.open(io.BytesIO(page.locator(".replay").screenshot())).convert("RGB")
+    ).astype(int)
 
 
 def poses(page):
@@ -69,7 +71,9 @@ def test_it_plays_at_a_speed_and_stops_at_the_end(page_file, opened):
     page.clock.pause_at(3_600_000)  # ms; from here on time passes as it is told to
     page.click("#play")
     page.clock.run_for(250)  # ms
-    assert page.evaluate("replay.now()") == pytest.approx(4 * 0.25, abs=4 * 2 / 60)  # its first frame begins to count
+    assert page.evaluate("replay.now()") == pytest.approx(
+        4 * 0.25, abs=4 * 2 / 60
+    )  # its first frame begins to count
     page.clock.run_for(500)
     assert page.evaluate("replay.now()") == pytest.approx(59 / 30, abs=1e-3)
     assert page.inner_text("#play") == "Play"

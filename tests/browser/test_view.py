@@ -17,7 +17,9 @@ pytestmark = pytest.mark.browser
 @pytest.fixture(scope="module")
 def browser():
     """A pole on a motor, simulated in a thread of its own as in a terminal."""
-    config = EnvConfig.from_mapping({"task": "InvertedPendulum-v5", "actuator": {".*": "maxon-re65"}})
+    config = EnvConfig.from_mapping(
+        {"task": "InvertedPendulum-v5", "actuator": {".*": "maxon-re65"}}
+    )
     made = Browser(Session(config, {}), 0, "pole")
     ended = threading.Event()
     thread = threading.Thread(target=lambda: made.run(ended.is_set))
@@ -44,10 +46,17 @@ def test_it_simulates_in_real_time_and_is_paused_stepped_and_reset(browser, open
     until(page, lambda: browser._real == pytest.approx(1.0, abs=0.2) and browser.session.time > 0)
     page.get_by_role("button", name="Play or pause").click()
     page.wait_for_selector("text=paused")
-    browser.session.again = False  # an episode that has just ended would begin anew with the next step
+    browser.session.again = (
+        False  # an episode that has just ended would begin anew with the next step
+    )
     time = browser.session.time
     page.get_by_role("button", name="Step").click()
-    until(page, lambda: browser.session.time == pytest.approx(time + browser.session.recorder.step_duration))
+    until(
+        page,
+        lambda: (
+            browser.session.time == pytest.approx(time + browser.session.recorder.step_duration)
+        ),
+    )
     browser.session.again = True
     page.get_by_role("button", name="Reset").click()
     page.wait_for_selector("text=0.00 s")
@@ -97,7 +106,8 @@ def test_signals_that_differ_by_rounding_alone_are_drawn(browser, opened):
     kept, browser.playing = browser.session.signals, False
     count = len(browser.session.recorder.trace_names)
     browser.session.signals = collections.deque(
-        (0.01 * index, np.full((1, count), -24.0) * (1 + 1e-10 * (index % 2))) for index in range(50)
+        (0.01 * index, np.full((1, count), -24.0) * (1 + 1e-10 * (index % 2)))
+        for index in range(50)
     )
     until(page, lambda: page.evaluate("document.querySelectorAll('.u-wrap').length") > 0)
     page.wait_for_timeout(1500)
@@ -114,7 +124,9 @@ def test_another_policy_acts(browser, opened):
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
-def test_it_is_dark_where_that_is_preferred_and_leaves_a_phone_the_scene(browser, opened, width, scheme):
+def test_it_is_dark_where_that_is_preferred_and_leaves_a_phone_the_scene(
+    browser, opened, width, scheme
+):
     page = opened(browser.url, width, scheme=scheme)
     shown(browser, page)
     assert page.evaluate("document.documentElement.dataset.mantineColorScheme") == scheme

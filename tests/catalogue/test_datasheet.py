@@ -60,11 +60,17 @@ POLOLU = {
 }
 
 
-@pytest.mark.parametrize(("kind", "unit"), [(kind, unit) for kind, sizes in units._USUAL.items() for unit in sizes])
+@pytest.mark.parametrize(
+    ("kind", "unit"), [(kind, unit) for kind, sizes in units._USUAL.items() for unit in sizes]
+)
 def test_usual_units_have_pint_s_sizes_to_the_bit(kind, unit, monkeypatch):
-    numbers = [units.in_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)]
+    numbers = [
+        units.in_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
+    ]
     monkeypatch.setattr(units, "_USUAL", {})
-    assert numbers == [units.in_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)]
+    assert numbers == [
+        units.in_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
+    ]
 
 
 @st.composite
@@ -73,7 +79,12 @@ def _motors(draw):
     voltage, resistance, constant, inertia = draw(SIZES), draw(SIZES), draw(SIZES), draw(SIZES)
     stall = voltage / resistance
     free = stall * draw(st.floats(0.0, 0.3))
-    motor = {"resistance": resistance, "torque_constant": constant, "rotor_inertia": inertia, "voltage": voltage}
+    motor = {
+        "resistance": resistance,
+        "torque_constant": constant,
+        "rotor_inertia": inertia,
+        "voltage": voltage,
+    }
     printed = {
         "nominal_voltage": voltage,
         "stall_torque": constant * (stall - free),
@@ -103,8 +114,12 @@ def test_a_motor_comes_back_from_its_stall_and_free_points(data):
     for name, value in motor.items():
         assert getattr(numbers, name) == pytest.approx(value, rel=1e-12), name
     assert numbers.back_emf_constant == pytest.approx(motor["torque_constant"], rel=1e-12)
-    assert numbers.inductance == pytest.approx(printed["electrical_time_constant"] * motor["resistance"], rel=1e-12)
-    assert numbers.coulomb_friction == pytest.approx(motor["torque_constant"] * printed["no_load_current"], rel=1e-12)
+    assert numbers.inductance == pytest.approx(
+        printed["electrical_time_constant"] * motor["resistance"], rel=1e-12
+    )
+    assert numbers.coulomb_friction == pytest.approx(
+        motor["torque_constant"] * printed["no_load_current"], rel=1e-12
+    )
     assert numbers.viscous_friction == 0.0
     assert numbers.disagreements == ()
 
@@ -119,13 +134,20 @@ def test_a_geared_motor_comes_back_from_its_output(data, ratio, efficiency):
     text["rotor_inertia"] += " at output"
     numbers = from_datasheet(shaft="output", gear_ratio=ratio, **text)
     assert numbers.gear_efficiency == pytest.approx(efficiency, rel=1e-11)
-    free = efficiency * motor["torque_constant"] * printed["no_load_current"]  # what the gear leaves of the torque
+    free = (
+        efficiency * motor["torque_constant"] * printed["no_load_current"]
+    )  # what the gear leaves of the torque
     assert numbers.coulomb_friction == pytest.approx(free, rel=1e-11)
     for name, value in motor.items():
         assert getattr(numbers, name) == pytest.approx(value, rel=1e-12), name
-    del text["no_load_speed"]  # then the constant follows from the torque, if the efficiency is printed
+    del text[
+        "no_load_speed"
+    ]  # then the constant follows from the torque, if the efficiency is printed
     told = from_datasheet(
-        shaft="output", gear_ratio=f"{ratio!r}:1", gear_efficiency=f"{efficiency * 100.0!r} %", **text
+        shaft="output",
+        gear_ratio=f"{ratio!r}:1",
+        gear_efficiency=f"{efficiency * 100.0!r} %",
+        **text,
     )
     assert told.torque_constant == pytest.approx(motor["torque_constant"], rel=1e-12)
 
@@ -137,14 +159,25 @@ def test_a_motor_comes_back_from_its_constants(data):
     inertia, henries = motor["rotor_inertia"], printed["electrical_time_constant"] * ohms
     one = data.draw(
         st.sampled_from(
-            [{"torque_constant": constant}, {"back_emf_constant": constant}, {"speed_constant": 1 / constant}]
+            [
+                {"torque_constant": constant},
+                {"back_emf_constant": constant},
+                {"speed_constant": 1 / constant},
+            ]
         )
     )
     numbers = from_datasheet(
-        **data.draw(_print({"resistance": ohms, "inductance": henries, "rotor_inertia": inertia, **one}))
+        **data.draw(
+            _print({"resistance": ohms, "inductance": henries, "rotor_inertia": inertia, **one})
+        )
     )
     expected = (ohms, henries, constant, constant, inertia)
-    found = (numbers.resistance, numbers.inductance, numbers.torque_constant, numbers.back_emf_constant)
+    found = (
+        numbers.resistance,
+        numbers.inductance,
+        numbers.torque_constant,
+        numbers.back_emf_constant,
+    )
     assert (*found, numbers.rotor_inertia) == pytest.approx(expected, rel=1e-12)
     assert numbers.voltage is numbers.coulomb_friction is numbers.continuous_current is None
 
@@ -155,7 +188,9 @@ def test_a_motor_comes_back_from_two_points_of_its_line(data, load):
     current = load * printed["stall_current"]
     point = {
         "continuous_current": current,
-        "continuous_speed": (motor["voltage"] - motor["resistance"] * current) / motor["torque_constant"],
+        "continuous_speed": (
+            (motor["voltage"] - motor["resistance"] * current) / motor["torque_constant"]
+        ),
         "continuous_torque": motor["torque_constant"] * (current - printed["no_load_current"]),
     }
     free = {name: printed[name] for name in ("nominal_voltage", "no_load_speed", "no_load_current")}
@@ -166,27 +201,50 @@ def test_a_motor_comes_back_from_two_points_of_its_line(data, load):
 
 @given(st.floats(0.01, 0.9))
 def test_printed_friction_takes_its_part_of_the_no_load_current(share):
-    free = {"resistance": "1 ohm", "inductance": "1 mH", "torque_constant": "0.1 N*m/A", "no_load_current": "1 A"}
-    coulomb = from_datasheet(**free, no_load_speed="100 rad/s", coulomb_friction=f"{0.1 * share!r} N*m")
+    free = {
+        "resistance": "1 ohm",
+        "inductance": "1 mH",
+        "torque_constant": "0.1 N*m/A",
+        "no_load_current": "1 A",
+    }
+    coulomb = from_datasheet(
+        **free, no_load_speed="100 rad/s", coulomb_friction=f"{0.1 * share!r} N*m"
+    )
     assert coulomb.viscous_friction == pytest.approx(0.1 * (1.0 - share) / 100.0)
-    more = from_datasheet(**free, no_load_speed="100 rad/s", coulomb_friction=f"{0.1 + 0.01 * share!r} N*m")
+    more = from_datasheet(
+        **free, no_load_speed="100 rad/s", coulomb_friction=f"{0.1 + 0.01 * share!r} N*m"
+    )
     assert more.viscous_friction == 0.0
-    more = from_datasheet(**free, no_load_speed="100 rad/s", viscous_friction=f"{1e-3 + 1e-4 * share!r} N*m*s/rad")
+    more = from_datasheet(
+        **free, no_load_speed="100 rad/s", viscous_friction=f"{1e-3 + 1e-4 * share!r} N*m*s/rad"
+    )
     assert more.coulomb_friction == 0.0
-    viscous = from_datasheet(**free, no_load_speed="100 rad/s", viscous_friction=f"{1e-3 * share!r} N*m*s/rad")
+    viscous = from_datasheet(
+        **free, no_load_speed="100 rad/s", viscous_friction=f"{1e-3 * share!r} N*m*s/rad"
+    )
     assert viscous.coulomb_friction == pytest.approx(0.1 * (1.0 - share))
 
 
 @pytest.mark.parametrize("known", ["torque_constant", "back_emf_constant", "speed_constant"])
 def test_constants_at_the_output_are_reflected_by_the_ratio(known):
-    value = {"torque_constant": "3 N*m/A", "back_emf_constant": "3 V*s/rad", "speed_constant": "1 rad/s/V"}[known]
+    value = {
+        "torque_constant": "3 N*m/A",
+        "back_emf_constant": "3 V*s/rad",
+        "speed_constant": "1 rad/s/V",
+    }[known]
     seen = 1.0 if known == "speed_constant" else 3.0
-    numbers = from_datasheet(resistance="1 ohm", inductance="1 mH", gear_ratio=30, shaft="output", **{known: value})
-    assert (numbers.torque_constant, numbers.back_emf_constant) == pytest.approx((seen / 30.0, seen / 30.0))
+    numbers = from_datasheet(
+        resistance="1 ohm", inductance="1 mH", gear_ratio=30, shaft="output", **{known: value}
+    )
+    assert (numbers.torque_constant, numbers.back_emf_constant) == pytest.approx(
+        (seen / 30.0, seen / 30.0)
+    )
 
 
 def test_without_a_no_load_current_none_is_taken_off():
-    numbers = from_datasheet(**{name: value for name, value in CIM.items() if name != "no_load_current"})
+    numbers = from_datasheet(
+        **{name: value for name, value in CIM.items() if name != "no_load_current"}
+    )
     assert numbers.torque_constant == pytest.approx(2.42 / 133.0)
     assert numbers.back_emf_constant == pytest.approx(12.0 / (5310.0 * math.tau / 60.0))
     assert numbers.coulomb_friction is numbers.viscous_friction is None
@@ -195,7 +253,9 @@ def test_without_a_no_load_current_none_is_taken_off():
 def test_a_gear_gains_nothing():
     """Rounding may make a gear of 1.05, which is 1 and a disagreement; more than the tolerance is refused."""
     geared = {**GEARED, "torque_constant": "0.1 N*m/A at motor"}
-    numbers = from_datasheet(**geared, continuous_current="2 A", continuous_torque="2.1 N*m at output")
+    numbers = from_datasheet(
+        **geared, continuous_current="2 A", continuous_torque="2.1 N*m at output"
+    )
     assert numbers.gear_efficiency == 1.0
     assert numbers.disagreements[0].difference == pytest.approx(2.0 / 2.1 - 1.0)
     with pytest.raises(ValueError, match=r"gear_efficiency = 1\.5"):
@@ -204,7 +264,9 @@ def test_a_gear_gains_nothing():
 
 def test_the_torque_that_a_gear_bears_for_ever_gives_the_current():
     geared = {**GEARED, "torque_constant": "0.1 N*m/A at motor"}
-    numbers = from_datasheet(**geared, gear_efficiency=0.5, continuous_torque="2 N*m at output", no_load_current="1 A")
+    numbers = from_datasheet(
+        **geared, gear_efficiency=0.5, continuous_torque="2 N*m at output", no_load_current="1 A"
+    )
     assert numbers.continuous_current == pytest.approx(2.0 / (10.0 * 0.5 * 0.1) + 1.0)
     assert numbers.disagreements == ()
 
@@ -216,9 +278,14 @@ def test_every_number_says_how_it_came_about():
         thermal_resistance_winding="3 °C/W",
         thermal_resistance_housing="2 degC/W",
     )
-    assert numbers.derived["resistance"] == "resistance = nominal_voltage / stall_current = 12 V / 133 A = 0.09023 ohm"
+    assert (
+        numbers.derived["resistance"]
+        == "resistance = nominal_voltage / stall_current = 12 V / 133 A = 0.09023 ohm"
+    )
     assert numbers.derived["voltage"] == "voltage = 12 V, printed as nominal_voltage"
-    assert (numbers.max_temperature, numbers.thermal_resistance_winding) == pytest.approx((125.0, 3.0))
+    assert (numbers.max_temperature, numbers.thermal_resistance_winding) == pytest.approx(
+        (125.0, 3.0)
+    )
     assert numbers.thermal_resistance_housing == pytest.approx(2.0)
     assert numbers.derived["thermal_resistance"].endswith("= 3 K/W + 2 K/W = 5 K/W")
     for name in vars(numbers):
@@ -229,14 +296,23 @@ def test_every_number_says_how_it_came_about():
 def test_thermal_numbers_are_read_with_their_offsets_and_of_either_print():
     """A temperature has an offset, a difference in K/W or degC/W has none."""
     kelvin = from_datasheet(
-        **CIM, max_winding_temperature="398.15 K", thermal_resistance="5 K/W", thermal_time_constant_winding="0.5 min"
+        **CIM,
+        max_winding_temperature="398.15 K",
+        thermal_resistance="5 K/W",
+        thermal_time_constant_winding="0.5 min",
     )
     assert kelvin.max_temperature == pytest.approx(125.0)
-    assert from_datasheet(**CIM, max_winding_temperature="257 degF").max_temperature == pytest.approx(125.0)
-    assert (kelvin.thermal_resistance, kelvin.thermal_time_constant_winding) == pytest.approx((5.0, 30.0))
+    assert from_datasheet(
+        **CIM, max_winding_temperature="257 degF"
+    ).max_temperature == pytest.approx(125.0)
+    assert (kelvin.thermal_resistance, kelvin.thermal_time_constant_winding) == pytest.approx(
+        (5.0, 30.0)
+    )
     assert kelvin.thermal_resistance_winding is from_datasheet(**CIM).thermal_resistance is None
     parts = {"thermal_resistance_winding": "3 K/W", "thermal_resistance_housing": "2 K/W"}
-    with pytest.raises(ValueError, match=r"thermal_resistance = 9 K/W, but .* = 3 K/W \+ 2 K/W = 5 K/W"):
+    with pytest.raises(
+        ValueError, match=r"thermal_resistance = 9 K/W, but .* = 3 K/W \+ 2 K/W = 5 K/W"
+    ):
         from_datasheet(**CIM, **parts, thermal_resistance="9 K/W")
 
 
@@ -256,14 +332,26 @@ def test_a_phase_of_a_star_may_be_written_as_a_product():
 @pytest.mark.parametrize(
     ("name", "printed", "value"),
     [
-        *(("stall_torque", f"14 {unit}", 1.372931) for unit in ("kg*cm", "kg.cm", "kg-cm", "kgf.cm", "Kg cm", "kgcm")),
-        *(("stall_torque", f"60 {unit}", 0.42369310) for unit in ("oz-in", "oz*in", "ozf*in", "ozin", "OZ-IN")),
+        *(
+            ("stall_torque", f"14 {unit}", 1.372931)
+            for unit in ("kg*cm", "kg.cm", "kg-cm", "kgf.cm", "Kg cm", "kgcm")
+        ),
+        *(
+            ("stall_torque", f"60 {unit}", 0.42369310)
+            for unit in ("oz-in", "oz*in", "ozf*in", "ozin", "OZ-IN")
+        ),
         ("stall_torque", "2 lb-ft", 2.7116359),
         ("kt", "3 oz-in/A", 0.021184655),
         ("rotor_inertia", "1e-3 oz-in-s^2", 7.0615518e-6),
         ("rotor_inertia", "1 oz-in^2", 1.8289978e-5),
-        *(("no_load_speed", f"330 {unit}", 34.557519) for unit in ("RPM", "Rpm", "rev/min", "r/min", "1/min", "min-1")),
-        *((name, "340 RPM/V", 35.604717) for name in ("Kv", "kv", "speed_constant", "Speed_Constant")),
+        *(
+            ("no_load_speed", f"330 {unit}", 34.557519)
+            for unit in ("RPM", "Rpm", "rev/min", "r/min", "1/min", "min-1")
+        ),
+        *(
+            (name, "340 RPM/V", 35.604717)
+            for name in ("Kv", "kv", "speed_constant", "Speed_Constant")
+        ),
         ("Voltage", "12 Volts", 12.0),
         ("resistance", "64 mOhm", 0.064),
         ("rated_current", "2 Amps", 2.0),
@@ -282,15 +370,50 @@ REFUSED = {
     "a number": ({"resistance": 25.1}, "resistance", "25.1", 'resistance = "0.464 ohm"'),
     "wrong dimension": ({"stall_torque": "25.1 mN"}, "stall_torque", "25.1 mN", "N*m"),
     "mass for force": ({"peak_current": "140 kg*mm"}, "peak_current", "140 kg*mm", "which is in A"),
-    "electrical rpm": ({"no_load_speed": "9000 eRPM"}, "no_load_speed", "9000 eRPM", "divide by the pole pairs"),
+    "electrical rpm": (
+        {"no_load_speed": "9000 eRPM"},
+        "no_load_speed",
+        "9000 eRPM",
+        "divide by the pole pairs",
+    ),
     "pole pairs": ({"pole_pairs": 14}, "pole_pairs", "leave it out", "electrical rpm"),
-    "a phase": ({"phase_resistance": "0.3 ohm"}, "phase_resistance", "of a delta two thirds", '"2 * 0.3 ohm"'),
-    "two names": ({"kv": "1 rpm/V", "speed_constant": "1 rpm/V"}, "speed_constant", "given already", "leave one"),
+    "a phase": (
+        {"phase_resistance": "0.3 ohm"},
+        "phase_resistance",
+        "of a delta two thirds",
+        '"2 * 0.3 ohm"',
+    ),
+    "two names": (
+        {"kv": "1 rpm/V", "speed_constant": "1 rpm/V"},
+        "speed_constant",
+        "given already",
+        "leave one",
+    ),
     "which shaft": (POLOLU, "shaft is missing", "stall_torque, no_load_speed", 'shaft = "output"'),
-    "the other shaft": ({**POLOLU, "shaft": "motor"}, "back_emf", "+29.2%", "and at which shaft they are (shaft"),
-    "one value's shaft": ({**GEARED, "kt": "1 Nm/A"}, "shaft is missing", "torque_constant", '"... at motor"'),
-    "unknown unit": ({"inductance": "3 henrys of iron"}, "inductance", "henrys", 'inductance = "0.322 mH"'),
-    "code": ({"inductance": "3 __import__('os')"}, "inductance", "__import__", 'inductance = "0.322 mH"'),
+    "the other shaft": (
+        {**POLOLU, "shaft": "motor"},
+        "back_emf",
+        "+29.2%",
+        "and at which shaft they are (shaft",
+    ),
+    "one value's shaft": (
+        {**GEARED, "kt": "1 Nm/A"},
+        "shaft is missing",
+        "torque_constant",
+        '"... at motor"',
+    ),
+    "unknown unit": (
+        {"inductance": "3 henrys of iron"},
+        "inductance",
+        "henrys",
+        'inductance = "0.322 mH"',
+    ),
+    "code": (
+        {"inductance": "3 __import__('os')"},
+        "inductance",
+        "__import__",
+        'inductance = "0.322 mH"',
+    ),
     "a thousand's space": (
         {"no_load_speed": "10 600 rpm"},
         "no_load_speed",
@@ -304,21 +427,67 @@ REFUSED = {
     "negative": ({"resistance": "-1 ohm"}, "resistance", "-1 ohm", "> 0"),
     "not finite": ({"resistance": "1e999 ohm"}, "resistance", "1e999", "finite"),
     "efficiency": ({"gear_efficiency": "140 %"}, "gear_efficiency", "140 %", "<= 1"),
-    "misspelt": ({"resistence": "1 ohm"}, "resistence", "datasheet field", "did you mean resistance?"),
+    "misspelt": (
+        {"resistence": "1 ohm"},
+        "resistence",
+        "datasheet field",
+        "did you mean resistance?",
+    ),
     "shaft": ({"shaft": "wheel"}, "shaft", "wheel", "motor or output"),
-    "no gear": ({"torque_constant": "1 N*m/A at output"}, "torque_constant", "1 N*m/A", "gear_ratio = 30"),
-    "no inductance": ({**CIM, "inductance": None}, "inductance", "not printed", 'inductance = "0.3 mH"'),
-    "nothing": ({"inductance": "1 mH"}, "resistance", "not printed", "nominal_voltage and stall_current"),
-    "milli": ({**CIM, "stall_torque": "2.42 mN*m"}, "torque_constant", "1.857e-05", "units of stall_torque"),
-    "stall current": ({**CIM, "resistance": "0.9 ohm"}, "stall_current", "133 A", "units of stall_current"),
+    "no gear": (
+        {"torque_constant": "1 N*m/A at output"},
+        "torque_constant",
+        "1 N*m/A",
+        "gear_ratio = 30",
+    ),
+    "no inductance": (
+        {**CIM, "inductance": None},
+        "inductance",
+        "not printed",
+        'inductance = "0.3 mH"',
+    ),
+    "nothing": (
+        {"inductance": "1 mH"},
+        "resistance",
+        "not printed",
+        "nominal_voltage and stall_current",
+    ),
+    "milli": (
+        {**CIM, "stall_torque": "2.42 mN*m"},
+        "torque_constant",
+        "1.857e-05",
+        "units of stall_torque",
+    ),
+    "stall current": (
+        {**CIM, "resistance": "0.9 ohm"},
+        "stall_current",
+        "133 A",
+        "units of stall_current",
+    ),
     "speed constant": (
         {**CIM, "torque_constant": "0.0211 N*m/A", "speed_constant": "45.2 rpm/V"},
         *("torque_constant", "0.0211 N*m/A", "units of torque_constant, speed_constant"),
     ),
-    "free above stall": ({**CIM, "no_load_current": "140 A"}, "torque_constant", "140 A", "must be > 0"),
-    "free at stall": ({**CIM, "no_load_current": "133 A"}, "torque_constant", "133 A", "divides by 0"),
+    "free above stall": (
+        {**CIM, "no_load_current": "140 A"},
+        "torque_constant",
+        "140 A",
+        "must be > 0",
+    ),
+    "free at stall": (
+        {**CIM, "no_load_current": "133 A"},
+        "torque_constant",
+        "133 A",
+        "divides by 0",
+    ),
     "gear of milli": (
-        {**CIM, "shaft": "output", "gear_ratio": 30, "stall_torque": "2.42 mN*m", "no_load_speed": "177 rpm"},
+        {
+            **CIM,
+            "shaft": "output",
+            "gear_ratio": 30,
+            "stall_torque": "2.42 mN*m",
+            "no_load_speed": "177 rpm",
+        },
         *("gear_efficiency", "0.00242 N*m", "check the units"),
     ),
     "tolerance": ({**CIM, "tolerance": 0}, "tolerance", "0", "> 0"),
@@ -342,7 +511,10 @@ def test_without_strictness_a_contradiction_is_only_listed():
 
 def test_the_rules_speak_of_fields():
     for quantity, formula in (*derivation.RULES, *(check[:2] for check in derivation.CHECKS)):
-        assert {quantity, *derivation.compiled(formula).co_names} <= {*KINDS, *derivation.AT_OUTPUT}, formula
+        assert {quantity, *derivation.compiled(formula).co_names} <= {
+            *KINDS,
+            *derivation.AT_OUTPUT,
+        }, formula
     first = derivation.compiled(derivation.RULES[0][1])
     assert first.co_names == ("nominal_voltage", "stall_current")
     assert eval(first, {}, {"nominal_voltage": 12.0, "stall_current": 133.0}) == 12.0 / 133.0
@@ -369,7 +541,13 @@ SERVO = {
 @pytest.mark.parametrize(
     "printed",
     [
-        *("0.222 s/60deg", "0.222sec/60°", "0.222 Sec / 60 degrees", "222 ms/60º", "0.222 seconds per 60 deg"),
+        *(
+            "0.222 s/60deg",
+            "0.222sec/60°",
+            "0.222 Sec / 60 degrees",
+            "222 ms/60º",
+            "0.222 seconds per 60 deg",
+        ),
         *("60°/0.222s", "0.222 s/60deg at output", "0.222s/60Deg"),
     ],
 )
@@ -379,7 +557,9 @@ def test_the_time_of_an_angle_is_a_speed(printed):
     assert reading.shaft == "output"
 
 
-@pytest.mark.parametrize("printed", ["0 s/60deg", "0.2 s/60", "0.2 s", "0.2 s/60deg at 6 V", "0,2 s/60deg"])
+@pytest.mark.parametrize(
+    "printed", ["0 s/60deg", "0.2 s/60", "0.2 s", "0.2 s/60deg at 6 V", "0,2 s/60deg"]
+)
 def test_what_is_no_time_of_an_angle_is_refused(printed):
     with pytest.raises(ValueError, match=r"^datasheet\.no_load_speed = "):
         from_datasheet(**SERVO | {"no_load_speed": printed})
@@ -388,13 +568,19 @@ def test_what_is_no_time_of_an_angle_is_refused(printed):
 def test_a_rotors_inertia_behind_a_gear_says_its_shaft():
     """Printed values are nearly always the rotor's own; reflected they are ratio^2 times as large."""
     for unit in ("g*cm2", "g.cm2", "g cm²", "gcm2", "g*cm^2"):
-        assert from_datasheet(**SERVO, rotor_inertia=f"60 {unit} at motor").rotor_inertia == pytest.approx(6e-6)
+        assert from_datasheet(
+            **SERVO, rotor_inertia=f"60 {unit} at motor"
+        ).rotor_inertia == pytest.approx(6e-6)
     reflected = from_datasheet(**SERVO, rotor_inertia="60 gcm2 at output").rotor_inertia
     assert reflected == pytest.approx(6e-6 / 345.0**2)
-    with pytest.raises(ValueError, match=r'rotor_inertia = \'60 gcm2\'.*"60 gcm2 at motor".*"60 gcm2 at output"'):
+    with pytest.raises(
+        ValueError, match=r'rotor_inertia = \'60 gcm2\'.*"60 gcm2 at motor".*"60 gcm2 at output"'
+    ):
         from_datasheet(**SERVO, rotor_inertia="60 gcm2")
     unsaid = {**SERVO, "gear_ratio": 1, "stall_torque": "0.04 Nm"} | {"no_load_speed": "1600 rad/s"}
-    assert from_datasheet(strict=False, **unsaid, rotor_inertia="60 gcm2").rotor_inertia == pytest.approx(6e-6)
+    assert from_datasheet(
+        strict=False, **unsaid, rotor_inertia="60 gcm2"
+    ).rotor_inertia == pytest.approx(6e-6)
 
 
 def test_a_torque_constant_at_the_output_has_the_gears_loss_in_it():
@@ -403,12 +589,21 @@ def test_a_torque_constant_at_the_output_has_the_gears_loss_in_it():
     constant = (12.0 - resistance * 0.18) / speed
     with_it = from_datasheet(**SERVO, torque_constant="11 kg.cm/A")
     assert with_it.torque_constant == pytest.approx(constant, rel=1e-12)
-    assert with_it == dataclasses.replace(from_datasheet(**SERVO), disagreements=with_it.disagreements)
-    alone = from_datasheet(**{k: v for k, v in SERVO.items() if k != "stall_torque"}, torque_constant="11 kg.cm/A")
+    assert with_it == dataclasses.replace(
+        from_datasheet(**SERVO), disagreements=with_it.disagreements
+    )
+    alone = from_datasheet(
+        **{k: v for k, v in SERVO.items() if k != "stall_torque"}, torque_constant="11 kg.cm/A"
+    )
     assert alone.gear_efficiency == pytest.approx(11.0 * 0.0980665 / (345.0 * constant), rel=1e-12)
-    with pytest.raises(ValueError, match="contradicts the rest"):  # the motor's own, said to be the output's
+    with pytest.raises(
+        ValueError, match="contradicts the rest"
+    ):  # the motor's own, said to be the output's
         from_datasheet(**SERVO, torque_constant="6.88 mNm/A")
-    for said in ({"torque_constant": "2.5 Nm/A"}, {"torque_constant": "11 kg.cm/A", "gear_efficiency": "45 %"}):
+    for said in (
+        {"torque_constant": "2.5 Nm/A"},
+        {"torque_constant": "11 kg.cm/A", "gear_efficiency": "45 %"},
+    ):
         told = from_datasheet(strict=False, **SERVO, **said)  # of a gear without losses, as ever
         value = {"2": 2.5, "1": 11.0 * 0.0980665}[said["torque_constant"][0]]
         assert told.torque_constant == pytest.approx(value / 345.0, rel=1e-12)
@@ -423,5 +618,7 @@ def test_a_file_is_read_whatever_editor_saved_it(tmp_path):
             file.write_bytes(end.join(lines).encode(encoding))
             assert motor_entry(str(file)).numbers == expected
     file.write_bytes("\n".join([*lines, 'rotor_inertia = "60 µg*m^2 at motor"']).encode("cp1252"))
-    with pytest.raises(ValueError, match=r"line 10 has the byte 0xb5 \(µ in Windows-1252\).*save the file as UTF-8"):
+    with pytest.raises(
+        ValueError, match=r"line 10 has the byte 0xb5 \(µ in Windows-1252\).*save the file as UTF-8"
+    ):
         motor_entry(str(file))

@@ -40,7 +40,13 @@ inductance = "measured on another"
 def test_there_are_motors_of_many_kinds():
     assert len(NAMES) >= 12
     kinds = {motor_entry(name).kind for name in NAMES}
-    assert {"brushed", "brushless", "brushless, geared", "brushed, geared", "brushed, coreless"} <= kinds
+    assert {
+        "brushed",
+        "brushless",
+        "brushless, geared",
+        "brushed, geared",
+        "brushed, coreless",
+    } <= kinds
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -56,7 +62,9 @@ def test_every_value_has_a_source_or_a_reason(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_motor_agrees_with_itself_or_its_notes_say_why_not(name):
     entry = motor_entry(name)
-    large = {one.quantity for one in entry.numbers.disagreements if abs(one.difference) > 0.05 - 1e-4}
+    large = {
+        one.quantity for one in entry.numbers.disagreements if abs(one.difference) > 0.05 - 1e-4
+    }
     assert large == {quantity for motor, quantity in EXPLAINED if motor == name}
     for quantity in large:
         assert EXPLAINED[name, quantity] in " ".join(entry.notes.split())
@@ -69,7 +77,10 @@ def test_the_model_stands_at_the_printed_points(name):
     numbers, printed = entry.numbers, entry.datasheet.readings()
     friction = (numbers.coulomb_friction or 0.0), (numbers.viscous_friction or 0.0)
     if {"no_load_speed", "nominal_voltage"} <= printed.keys():
-        matrix = [[numbers.resistance, numbers.back_emf_constant], [numbers.torque_constant, -friction[1]]]
+        matrix = [
+            [numbers.resistance, numbers.back_emf_constant],
+            [numbers.torque_constant, -friction[1]],
+        ]
         _, speed = np.linalg.solve(matrix, [numbers.voltage, friction[0]])
         ratio = numbers.gear_ratio if printed["no_load_speed"].shaft == "output" else 1.0
         assert speed / ratio == pytest.approx(printed["no_load_speed"].value, rel=0.05)
@@ -82,7 +93,11 @@ def test_the_model_stands_at_the_printed_points(name):
         torque *= numbers.gear_ratio * numbers.gear_efficiency if past_gear else 1.0
         assert torque == pytest.approx(printed["stall_torque"].value, rel=0.05)
     if "mechanical_time_constant" in printed:
-        constant = numbers.resistance * numbers.rotor_inertia / (numbers.torque_constant * numbers.back_emf_constant)
+        constant = (
+            numbers.resistance
+            * numbers.rotor_inertia
+            / (numbers.torque_constant * numbers.back_emf_constant)
+        )
         assert constant == pytest.approx(printed["mechanical_time_constant"].value, rel=0.05)
 
 
@@ -97,9 +112,14 @@ def test_what_a_motor_bears_for_ever_is_what_its_thermal_numbers_bear(name):
 
 
 def test_the_pmg_132_is_gym_electric_motors():
-    theirs, ours = DcPermanentlyExcitedMotor._default_motor_parameter, motor_entry("heinzmann-pmg-132").numbers
+    theirs, ours = (
+        DcPermanentlyExcitedMotor._default_motor_parameter,
+        motor_entry("heinzmann-pmg-132").numbers,
+    )
     assert (ours.resistance, ours.inductance) == pytest.approx((theirs["r_a"], theirs["l_a"]))
-    assert (ours.torque_constant, ours.rotor_inertia) == pytest.approx((theirs["psi_e"], theirs["j_rotor"]))
+    assert (ours.torque_constant, ours.rotor_inertia) == pytest.approx(
+        (theirs["psi_e"], theirs["j_rotor"])
+    )
 
 
 def test_a_file_of_ones_own_is_an_entry(tmp_path):
@@ -113,7 +133,8 @@ def test_a_file_of_ones_own_is_an_entry(tmp_path):
 def test_a_file_of_ones_own_need_not_say_who_makes_it_and_its_numbers_are_looked_at_first(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(
-        'kind = ""\n[datasheet]\nshaft = ""\nR = ""\nkv = "340 RPM/V"\nresistance = "64 mΩ"\ninductance = "30 µH"'
+        'kind = ""\n[datasheet]\nshaft = ""\nR = ""\nkv = "340 RPM/V"\nresistance = "64'
+        ' mΩ"\ninductance = "30 µH"'
     )
     with pytest.raises(ValueError, match="unknown datasheet field R"):
         motor_entry(str(path))
@@ -131,7 +152,10 @@ def test_a_file_of_ones_own_need_not_say_who_makes_it_and_its_numbers_are_looked
         (
             '"1 ohm"',
             '"1"',
-            "datasheet.resistance = '1': has no unit; write a number and its unit, such as resistance = \"0.464 ohm\"",
+            (
+                "datasheet.resistance = '1': has no unit; write a number and its unit, such as"
+                ' resistance = "0.464 ohm"'
+            ),
         ),
         ("resistance =", "resistanse =", "did you mean resistance?"),
         ('= "the rest"', '= ["resistance"]', "not one for torque_constant"),
@@ -141,7 +165,11 @@ def test_a_file_of_ones_own_need_not_say_who_makes_it_and_its_numbers_are_looked
         ('kind = "brushed"', "notes = []", "notes = []: must be text"),
         ('kind = "brushed"', "tolerance = []", "tolerance = []: must be a number > 0"),
         ('= "the rest"', '= ["inductance"]', "unknown entry sources"),
-        ("[estimated]\ninductance", "[estimated]\nrotor_inertia", "unknown entry estimated.rotor_inertia"),
+        (
+            "[estimated]\ninductance",
+            "[estimated]\nrotor_inertia",
+            "unknown entry estimated.rotor_inertia",
+        ),
         ("[estimated]\ninductance =", "estimated =", "unknown datasheet field estimated"),
         ("[datasheet]", "[datasheet", "is no TOML file"),
     ],
@@ -178,5 +206,9 @@ def test_the_pages_have_every_motor_and_their_examples_run(tmp_path, capsys):
 
 def test_the_page_names_every_value_of_a_datasheet():
     page = (Path(__file__).parents[2] / "docs" / "motors.md").read_text()
-    named = set(re.findall(r"`(\w+)`", page.partition("## What you can write")[2].partition("Mind three")[0]))
+    named = set(
+        re.findall(
+            r"`(\w+)`", page.partition("## What you can write")[2].partition("Mind three")[0]
+        )
+    )
     assert {field.name for field in dataclasses.fields(Datasheet)} <= named

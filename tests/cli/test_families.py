@@ -53,7 +53,11 @@ def own_family(tmp_path, monkeypatch):
 def test_the_family_that_is_named_decides_on_the_flags(capsys, first, trained, own_family):
     for actuator, flags in {
         "lag": ("--actuator.time-constant", "--actuator.delay"),
-        "torque_speed": ("--actuator.stall-torque", "--actuator.no-load-speed", "--actuator.max-torque"),
+        "torque_speed": (
+            "--actuator.stall-torque",
+            "--actuator.no-load-speed",
+            "--actuator.max-torque",
+        ),
         "weaker": ("--actuator.motor.inductance", "--actuator.supply.resistance"),
         "own_family:Slow": ("--actuator.time-constant", "Half a second"),
     }.items():
@@ -63,7 +67,10 @@ def test_the_family_that_is_named_decides_on_the_flags(capsys, first, trained, o
 
 
 def test_fields_of_a_family_are_set_by_its_flags():
-    ran(f"train cartpole --actuator lag --actuator.time-constant 0.1 --actuator.delay 0.02 {TINY} --out run")
+    ran(
+        f"train cartpole --actuator lag --actuator.time-constant 0.1 --actuator.delay 0.02 {TINY}"
+        " --out run"
+    )
     assert load_config(Path("run")).actuator == Lag(0.1, 0.02)
     ran("evaluate run --episodes 1 --out e.json --actuator.delay 0.04")
     described = {"family": "lag", "time_constant": 0.1, "delay": 0.04, "gain": 1.0}
@@ -76,7 +83,12 @@ def test_fields_of_a_family_are_set_by_its_flags():
 def test_a_module_that_a_run_names_is_imported_only_on_trust(capsys, own_family):
     ran(f"train pendulum --actuator own_family:Slow {TINY} --out run")
     own_family()
-    for line in ("evaluate run --episodes 1", "render run", "train --resume run", "train --config run/config.json"):
+    for line in (
+        "evaluate run --episodes 1",
+        "render run",
+        "train --resume run",
+        "train --config run/config.json",
+    ):
         assert "own_family:Slow': needs the module own_family" in refused(capsys, line)
     ran("runs . --out runs.json")
     assert [run["actuator"] for run in read("runs.json")["runs"]] == ["own_family:Slow"]
@@ -106,8 +118,13 @@ def test_the_source_of_a_family_is_part_of_what_a_run_was_made_with(own_family, 
 def test_so_is_the_file_of_a_model_of_somebody_s_own(tmp_path):
     arm, path = find_task("tests.own_project.arm:TASK"), tmp_path / "arm.xml"
     path.touch()
-    register(dataclasses.replace(arm, name="copied_arm", env_id="tests/CopiedArm-v0", asset=str(path)))
-    own, foreign = EnvConfig("copied_arm", "lag"), EnvConfig("HalfCheetah-v5", options={"xml_file": str(path)})
+    register(
+        dataclasses.replace(arm, name="copied_arm", env_id="tests/CopiedArm-v0", asset=str(path))
+    )
+    own, foreign = (
+        EnvConfig("copied_arm", "lag"),
+        EnvConfig("HalfCheetah-v5", options={"xml_file": str(path)}),
+    )
     digests = set()
     model = (Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml").read_text()
     for text in (model, f"{model}<!-- changed -->"):
@@ -116,7 +133,9 @@ def test_so_is_the_file_of_a_model_of_somebody_s_own(tmp_path):
     assert len(digests) == 4
 
 
-def test_an_environment_that_a_file_registers_goes_by_the_file_and_its_id(tmp_path, monkeypatch, capsys):
+def test_an_environment_that_a_file_registers_goes_by_the_file_and_its_id(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     entry = "gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv"
     registers = f"gymnasium.register('my/Arm-v0', entry_point='{entry}', max_episode_steps=60)"

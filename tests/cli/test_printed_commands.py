@@ -26,7 +26,9 @@ def printed(text):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_shell_reads_the_words_of_a_command_as_they_were(name):
     line = command("board", "check", Path(name), f"{name}.csv", trust=True)
-    said = subprocess.run(["sh", "-c", line.replace("codrl-mj", "printf '%s\\n'", 1)], capture_output=True, text=True)
+    said = subprocess.run(
+        ["sh", "-c", line.replace("codrl-mj", "printf '%s\\n'", 1)], capture_output=True, text=True
+    )
     assert said.stdout.splitlines() == ["board", "check", name, f"{name}.csv", "--trust"]
 
 
@@ -54,7 +56,9 @@ def test_a_motor_that_is_written_is_shown_by_what_is_printed(capsys):
     assert following == ["motor", "show", "my motor.toml"]
 
 
-def test_a_run_is_continued_by_what_is_printed_and_evaluated_with_trust_where_it_needs_it(trained, capsys):
+def test_a_run_is_continued_by_what_is_printed_and_evaluated_with_trust_where_it_needs_it(
+    trained, capsys
+):
     half = Path(shutil.copytree(trained, "half a run"))
     (half / "result.json").unlink()
     assert main(["evaluate", str(half)]) == 2
@@ -79,4 +83,6 @@ def test_commands_with_paths_in_them_are_made_in_one_place():
                     begun = begun or re.search(r"codrl-mj [a-z]", part.value) is not None
                     continue
                 call = part.value.func if isinstance(part.value, ast.Call) else part.value
-                assert not begun or ast.unparse(call) in quoted, f"{file}:{node.lineno}: use codrl_mj.fields.command"
+                assert not begun or ast.unparse(call) in quoted, (
+                    f"{file}:{node.lineno}: use codrl_mj.fields.command"
+                )

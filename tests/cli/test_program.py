@@ -15,13 +15,20 @@ PROGRAM = Path(sys.executable).with_name("codrl-mj")
 
 
 def program(*words, **options):
-    return subprocess.run(words, capture_output=True, text=True, timeout=120, check=False, **options)
+    return subprocess.run(
+        words, capture_output=True, text=True, timeout=120, check=False, **options
+    )
 
 
-@pytest.mark.parametrize("missing", but(["torch"], ["torch", "stable_baselines3", "safetensors", "matplotlib"]))
+@pytest.mark.parametrize(
+    "missing", but(["torch"], ["torch", "stable_baselines3", "safetensors", "matplotlib"])
+)
 def test_a_missing_extra_is_named_before_anything_is_written(tmp_path, missing):
     """In a process of its own, where nothing has been imported yet."""
-    code = f"import sys; sys.modules[{missing!r}] = None; from codrl_mj.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = (
+        f"import sys; sys.modules[{missing!r}] = None; from codrl_mj.cli import main;"
+        " sys.exit(main(sys.argv[1:]))"
+    )
     done = program(sys.executable, "-c", code, *f"train cartpole {TINY} --out run".split())
     assert done.returncode == 2
     assert done.stderr.startswith("codrl-mj: error: ")

@@ -10,7 +10,13 @@ from tests.cli.lines import TINY, contents, policy_alone, refused
 from tests.matrix import but
 
 REFUSED = [
-    ("", "codrl-mj needs a verb: try codrl-mj motor list, or codrl-mj train cartpole first; there are train,"),
+    (
+        "",
+        (
+            "codrl-mj needs a verb: try codrl-mj motor list, or codrl-mj train cartpole first;"
+            " there are train,"
+        ),
+    ),
     ("", "board, validate; codrl-mj --help says more"),
     ("trian cartpole", "unknown verb 'trian': did you mean 'train'? verbs are train, evaluate,"),
     ("motor", "codrl-mj motor needs a verb: there are list, new, show,"),
@@ -20,10 +26,16 @@ REFUSED = [
     ("motor list --sort stal", "--sort stal: did you mean 'stall_torque'? must be one of"),
     ("identify check", "codrl-mj identify check needs --columns;"),
     ("train", "codrl-mj train needs TASK; codrl-mj train --help says more"),
-    ("train pendulm --agent sac", "'pendulm': did you mean 'pendulum'? It can be module:NAME of your own"),
+    (
+        "train pendulm --agent sac",
+        "'pendulm': did you mean 'pendulum'? It can be module:NAME of your own",
+    ),
     ("train pendulm", "Gymnasium's goes by its id, such as HalfCheetah-v5"),
     ("render pendulm", "no run configuration at pendulm/config.json: did you mean 'pendulum'?"),
-    ("train CartPole-v1", "has no MuJoCo model built from XML, and so no motors: take 'cartpole', our task"),
+    (
+        "train CartPole-v1",
+        "has no MuJoCo model built from XML, and so no motors: take 'cartpole', our task",
+    ),
     ("train cartpole more", "unexpected 'more': codrl-mj train --help"),
     ("train cartpole --seed", "--seed needs a value: a whole number"),
     ("train cartpole --seed two", "--seed two: must be a whole number"),
@@ -31,12 +43,27 @@ REFUSED = [
     ("train cartpole --sed 3", "unknown flag --sed: did you mean '--seed'?"),
     ("train cartpole --kp 3", "unknown flag --kp: did you mean '--actuator.controller.kp'?"),
     ("train cartpole --agent pp", "--agent pp: did you mean 'ppo'? must be one of ppo, ddpg"),
-    ("train cartpole --gear-ratio 20", "--gear-ratio: the actuator has no gear ratio; motors of codrl-mj motor list"),
-    ("train cartpole --actuator nope:X --actuator.efficiency 1", "'nope:X': No module named 'nope'; must be module:"),
+    (
+        "train cartpole --gear-ratio 20",
+        "--gear-ratio: the actuator has no gear ratio; motors of codrl-mj motor list",
+    ),
+    (
+        "train cartpole --actuator nope:X --actuator.efficiency 1",
+        "'nope:X': No module named 'nope'; must be module:",
+    ),
     ("train cartpole --actuator nope.py:X", "nope.py: there is no such file; must be FILE.py:NAME"),
-    ("train cartpole --actuator ../up/nope.py:X", "nope.py: there is no such file; must be FILE.py:NAME"),
-    ("train cartpole --num-envs 1e12 --agent dqn --out run", "num_envs = 1000000000000: takes about 3e+06 GB of"),
-    ("train InvertedPendulum-v5 --num-envs 1e9", "num_envs = 1000000000: takes about 2e+05 GB of memory, of which"),
+    (
+        "train cartpole --actuator ../up/nope.py:X",
+        "nope.py: there is no such file; must be FILE.py:NAME",
+    ),
+    (
+        "train cartpole --num-envs 1e12 --agent dqn --out run",
+        "num_envs = 1000000000000: takes about 3e+06 GB of",
+    ),
+    (
+        "train InvertedPendulum-v5 --num-envs 1e9",
+        "num_envs = 1000000000: takes about 2e+05 GB of memory, of which",
+    ),
     ("view cartpole --port 99999", "--port 99999: must be from 1 to 65535"),
     ("train cartpole --total-steps 0", "total_steps = 0"),
     ("train cartpole --num-envs 0", "num_envs = 0"),
@@ -49,7 +76,10 @@ REFUSED = [
     ("evaluate", "POLICY: none was given"),
     ("evaluate RUN --episodes 0 --out result.json", "episodes = 0"),
     ("evaluate run --out .", "cannot write .: it is a folder"),
-    ("evaluate nowhere --actuator weaker --episodes 100", "no run configuration at nowhere/config.json"),
+    (
+        "evaluate nowhere --actuator weaker --episodes 100",
+        "no run configuration at nowhere/config.json",
+    ),
     ("render nowhere --out balance.mp4", "nowhere/config.json"),
     ("render cartpole --camera drone", "cameras are fixed, close"),
     ("render cartpole --width 641", "width = 641: must be even"),
@@ -62,7 +92,11 @@ REFUSED = [
     *(
         (f"{verb} RUN {flag}{value}", f"{text}{flag}{end}")
         for verb in ("evaluate", "render")
-        for flag, value in (("--env.action", " current"), ("--env.levels", " -1 1"), ("--env.observe-actuator", ""))
+        for flag, value in (
+            ("--env.action", " current"),
+            ("--env.levels", " -1 1"),
+            ("--env.observe-actuator", ""),
+        )
         for text, end in (("", " = "), ("leave ", " out"))
     ),
 ]
@@ -80,7 +114,11 @@ EVERYWHERE = {
     "--env.center-radius nan": "center_radius = nan",
 }
 OF_TRAINING = [(f"train cartpole {flags}", says) for flags, says in EVERYWHERE.items()]
-OF_A_RUN = [(f"{verb} RUN {flags}", says) for flags, says in EVERYWHERE.items() for verb in ("evaluate", "render")]
+OF_A_RUN = [
+    (f"{verb} RUN {flags}", says)
+    for flags, says in EVERYWHERE.items()
+    for verb in ("evaluate", "render")
+]
 
 
 @pytest.mark.parametrize(("line", "says"), [*REFUSED, *OF_TRAINING, *but(OF_A_RUN[:6], OF_A_RUN)])
@@ -133,13 +171,19 @@ def test_what_cannot_be_written_is_refused_before_anything_is_computed(capsys, l
 )
 def test_a_foreign_file_in_the_run_folder_is_named(capsys, trained, verb, file, content):
     shutil.copytree(trained, "foreign")
-    Path("foreign", file).unlink() if content is None else Path("foreign", file).write_bytes(content)
+    (
+        Path("foreign", file).unlink()
+        if content is None
+        else Path("foreign", file).write_bytes(content)
+    )
     assert file in refused(capsys, f"{verb} foreign")
 
 
 def test_a_policy_for_another_task_is_refused(capsys, trained):
     policy_alone(trained)
-    assert "observation_space: the policy was trained with" in refused(capsys, "evaluate alone --task pendulum")
+    assert "observation_space: the policy was trained with" in refused(
+        capsys, "evaluate alone --task pendulum"
+    )
 
 
 def stopped(*_, **__):
@@ -160,7 +204,9 @@ def stopped_in_a_library(*_):
         ("runs", "runs.summaries.find_runs", stopped_in_a_library),
     ],
 )
-def test_what_is_stopped_exits_with_130_and_leaves_nothing(monkeypatch, tmp_path, capsys, line, function, how):
+def test_what_is_stopped_exits_with_130_and_leaves_nothing(
+    monkeypatch, tmp_path, capsys, line, function, how
+):
     monkeypatch.setattr(f"codrl_mj.{function}", how)
     assert main(line.split()) == 130
     assert capsys.readouterr().err == "codrl-mj: stopped: the same command begins anew\n"
@@ -169,7 +215,9 @@ def test_what_is_stopped_exits_with_130_and_leaves_nothing(monkeypatch, tmp_path
 
 def test_what_is_no_fault_of_the_input_is_one_line_and_whole_on_request(capsys, monkeypatch):
     monkeypatch.setattr("codrl_mj.runs.summaries.find_runs", lambda _: {}["absent"])
-    assert refused(capsys, "runs") == "codrl-mj: error: KeyError: 'absent' (--traceback shows where)\n"
+    assert (
+        refused(capsys, "runs") == "codrl-mj: error: KeyError: 'absent' (--traceback shows where)\n"
+    )
     assert main(["runs", "--traceback"]) == 2
     traced = capsys.readouterr().err
     assert traced.startswith("Traceback (most recent call last):")

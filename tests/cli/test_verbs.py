@@ -26,12 +26,21 @@ from tests.cli.lines import SMALL_FILM, TINY, helped, policy_alone, ran, read
 
 TAUGHT = {
     "": [
-        f"{what}{verb}" for verb in ("train", "evaluate", "render", "validate") for what in ("• ", "Example: codrl-mj ")
+        f"{what}{verb}"
+        for verb in ("train", "evaluate", "render", "validate")
+        for what in ("• ", "Example: codrl-mj ")
     ],
-    "train": [f"{{{','.join(TASKS)}}}", "cartpole --actuator weaker --env.center-radius 0.1 --out runs/through-weaker"],
+    "train": [
+        f"{{{','.join(TASKS)}}}",
+        "cartpole --actuator weaker --env.center-radius 0.1 --out runs/through-weaker",
+    ],
     "evaluate": ["codrl-mj evaluate runs/cartpole-ppo-ideal-0 --actuator weaker --episodes 100"],
     "render": ["codrl-mj render runs/cartpole-ppo-weaker-0 --out balance.mp4"],
-    "validate": [f"{{{','.join(TASKS)}}}", "validate cartpole --out certificate", "validate --model robot.xml"],
+    "validate": [
+        f"{{{','.join(TASKS)}}}",
+        "validate cartpole --out certificate",
+        "validate --model robot.xml",
+    ],
 }
 
 
@@ -49,10 +58,26 @@ def test_the_help_explains_every_named_actuator_and_every_field_with_its_unit(ca
     for part, kind in (("motor", Motor), ("controller", CurrentLoop), ("supply", Supply)):
         for field in dataclasses.fields(kind):
             assert f"--actuator.{part}.{field.name.replace('_', '-')}" in text
-    for unit in ("[ohm]", "[H]", "[N*m/A]", "[V*s/rad]", "[m]", "[V/A]", "[V/(A*s)]", "[V*s/A]", "[1/s]", "[s]"):
+    for unit in (
+        "[ohm]",
+        "[H]",
+        "[N*m/A]",
+        "[V*s/rad]",
+        "[m]",
+        "[V/A]",
+        "[V/(A*s)]",
+        "[V*s/A]",
+        "[1/s]",
+        "[s]",
+    ):
         assert unit in text
     names = {*find_world("cartpole").fields} - {"task", "actuator", "options"}
-    for flag in (*(f"env.{name.replace('_', '-')}" for name in names), "env.center-radius", "seed", "out"):
+    for flag in (
+        *(f"env.{name.replace('_', '-')}" for name in names),
+        "env.center-radius",
+        "seed",
+        "out",
+    ):
         assert f"--{flag}" in text
 
 
@@ -67,13 +92,21 @@ def test_the_help_explains_every_named_actuator_and_every_field_with_its_unit(ca
 def test_the_help_shows_every_default_of_the_agent_on_the_task(capsys, agent, task, settings):
     text = helped(capsys, "train", task, "--agent", agent, "--settings", settings)
     config = TrainConfig.preset(task, agent, settings)
-    values = {f"--agent.{field.name}": getattr(config.agent, field.name) for field in dataclasses.fields(config.agent)}
-    values |= {f"--{name}": getattr(config, name) for name in ("seed", "total_steps", "total_episodes", "num_envs")}
+    values = {
+        f"--agent.{field.name}": getattr(config.agent, field.name)
+        for field in dataclasses.fields(config.agent)
+    }
+    values |= {
+        f"--{name}": getattr(config, name)
+        for name in ("seed", "total_steps", "total_episodes", "num_envs")
+    }
     values["--env.max_episode_steps"] = config.env.max_episode_steps
     if isinstance(config.env, EnvConfig):
         values["--env.center_radius"] = config.env.as_mapping()["options"].get("center_radius")
     for name, value in values.items():
-        *_, flag = re.split(rf" {name.replace('_', '-')}(?![\w-])", text)  # the last one: before may be examples
+        *_, flag = re.split(
+            rf" {name.replace('_', '-')}(?![\w-])", text
+        )  # the last one: before may be examples
         default = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
         assert flag.partition("(default: ")[2].startswith(f"{default})"), name
 
@@ -83,7 +116,9 @@ def test_the_short_help_has_every_flag_and_half_the_lines(capsys):
     with pytest.raises(SystemExit):
         main(["train", "pendulum", "-h"])
     short = capsys.readouterr().out
-    assert set(re.findall(r" --[a-z][\w.-]+", long)) <= set(re.findall(r" --[a-z][\w.-]+", f" {short} --actuators "))
+    assert set(re.findall(r" --[a-z][\w.-]+", long)) <= set(
+        re.findall(r" --[a-z][\w.-]+", f" {short} --actuators ")
+    )
     assert "--help-verbose" in short
     assert short.count("\n") < 130
 
@@ -103,11 +138,18 @@ def test_training_leaves_a_run_folder_whose_fields_are_set_over_the_named_actuat
     ran(f"train cartpole --actuator weaker --seed 3 {loop} {more} {env} {TINY}")
     assert "next: codrl-mj evaluate runs/cartpole-ppo-weaker-3" in capsys.readouterr().out
     config = load_config(Path("runs/cartpole-ppo-weaker-3"))
-    assert (config.seed, config.total_steps, config.num_envs, config.agent.hidden) == (3, 500, 2, (8,))
+    assert (config.seed, config.total_steps, config.num_envs, config.agent.hidden) == (
+        3,
+        500,
+        2,
+        (8,),
+    )
     assert (config.env.options.center_radius, config.env.options.sutton_barto_reward) == (0.1, True)
     assert config.env.inner_steps == 2
     changed = {"kp": 0.3, "max_voltage": math.inf, "bemf_compensation": False}
-    changed = {f"controller.{name}": value for name, value in changed.items()} | {"motor.inductance": 0.07}
+    changed = {f"controller.{name}": value for name, value in changed.items()} | {
+        "motor.inductance": 0.07
+    }
     assert config.actuator == named_actuator("weaker", "cartpole").replaced(changed)
 
 
@@ -137,7 +179,9 @@ def test_several_policies_have_a_row_each_in_the_environment_of_their_own_traini
     both = {str(trained): "weaker", str(config.parent): "paper"}
     ran(f"evaluate {' '.join(both)} --episodes 3 --out both.json")
     found = read("both.json")
-    assert list(found) == [f"{Path(one).parent.name}/{trained.name} on {motor}" for one, motor in both.items()]
+    assert list(found) == [
+        f"{Path(one).parent.name}/{trained.name} on {motor}" for one, motor in both.items()
+    ]
     for path, result in zip(both, found.values(), strict=True):
         ran(f"evaluate {path} --episodes 3 --out one.json")
         assert read("one.json") == result
@@ -156,7 +200,9 @@ def test_a_policy_is_evaluated_on_any_actuator_with_any_field_and_sampled_action
     assert 0 < results["paper"]["tracking_rms"] < results["weaker"]["tracking_rms"]
     assert results["starved"]["peak_voltage"] == 0.2
     assert results["starved"]["saturated_percent"] > 50
-    assert results["sampled"]["returns"] != results["weaker"]["returns"]  # the others are of the most likely actions
+    assert (
+        results["sampled"]["returns"] != results["weaker"]["returns"]
+    )  # the others are of the most likely actions
 
 
 def test_a_run_is_evaluated_and_filmed_in_the_environment_of_its_training():
@@ -220,7 +266,9 @@ def test_with_json_nothing_else_is_printed(capsys, trained, line, place):
 
 
 LOG = "log.csv --columns time=time:s,voltage=voltage:V,current=current:A,position=position:rad"
-LOGGED = "identify simulate maxon-ec45-flat-50w --out log.csv --amplitude 12 --inertia 1e-4 --duration 1"
+LOGGED = (
+    "identify simulate maxon-ec45-flat-50w --out log.csv --amplitude 12 --inertia 1e-4 --duration 1"
+)
 BEHIND = [
     # lines, separated by ;, the last of which is looked at
     *(line for line, _ in WITH_NUMBERS),
@@ -263,14 +311,21 @@ def test_numbers_are_understood_as_people_write_them(monkeypatch):
     monkeypatch.setattr("codrl_mj.cli.train.Train.run", lambda self: given.append(self) or 0)
     motor = "--actuator maxon-re65 --gear-ratio 20:1 --voltage=12"
     ran(f"train pendulum --agent ppo {motor} --total-steps 1e5 --num-envs 64 --agent.hidden 1e1 8")
-    assert (given[0].total_steps, given[0].num_envs, given[0].agent.hidden) == (100_000, 64, (10, 8))
+    assert (given[0].total_steps, given[0].num_envs, given[0].agent.hidden) == (
+        100_000,
+        64,
+        (10, 8),
+    )
     assert given[0].actuator_fields.motor.gear_ratio == 20.0
     assert given[0].actuator_fields.supply.voltage == 12.0
 
 
 @pytest.mark.filterwarnings("always::UserWarning")
 def test_draws_of_the_training_over_another_actuator_are_said(capsys):
-    flags = "--agent.rollout-steps 64 --agent.batch-size 64 --total-steps 64 --num-envs 1 --evaluation-episodes 1"
+    flags = (
+        "--agent.rollout-steps 64 --agent.batch-size 64 --total-steps 64 --num-envs 1"
+        " --evaluation-episodes 1"
+    )
     ran(f"train cartpole --env.randomize motor.inductance=uniform(0.09,0.11) {flags} --out drawn")
     capsys.readouterr()
     ran("evaluate drawn --episodes 1 --actuator weak")

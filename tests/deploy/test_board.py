@@ -16,7 +16,16 @@ import pytest
 from codrl_mj.actuators import Actuator, CurrentLoop, Motor, Servo, ServoLoop
 from codrl_mj.agents import DQNConfig, SACConfig
 from codrl_mj.cli import main
-from codrl_mj.deploy import Board, Contract, Link, OnnxPolicy, board_test, check_log, export, instructions
+from codrl_mj.deploy import (
+    Board,
+    Contract,
+    Link,
+    OnnxPolicy,
+    board_test,
+    check_log,
+    export,
+    instructions,
+)
 from codrl_mj.deploy import board as boards
 from codrl_mj.deploy.board import TARGETS, missing_tools
 from codrl_mj.deploy.wire import Wire
@@ -26,14 +35,23 @@ from tests.deploy.test_export import trained
 from tests.deploy.test_run import with_sensors
 from tests.matrix import but
 
-pytestmark = pytest.mark.skipif(bool(missing_tools("host")), reason="NOT RUN: no C compiler: apt-get install gcc")
+pytestmark = pytest.mark.skipif(
+    bool(missing_tools("host")), reason="NOT RUN: no C compiler: apt-get install gcc"
+)
 ON = [
-    pytest.param(name, marks=pytest.mark.skipif(bool(missing_tools(name)), reason=f"NOT RUN: {missing_tools(name)}"))
+    pytest.param(
+        name,
+        marks=pytest.mark.skipif(
+            bool(missing_tools(name)), reason=f"NOT RUN: {missing_tools(name)}"
+        ),
+    )
     for name in TARGETS
 ]
 OK, DAMAGED, OLD, NOT_FINITE, LATE, BEYOND, NO_SENSORS = 0, 1, 2, 4, 8, 16, 32
 AGENTS = {"furuta": "ppo", "cartpole": "dqn"}
-of_furuta, of_cartpole = (pytest.mark.parametrize("folder", [task], indirect=True) for task in AGENTS)
+of_furuta, of_cartpole = (
+    pytest.mark.parametrize("folder", [task], indirect=True) for task in AGENTS
+)
 
 
 @pytest.fixture(scope="module", params=AGENTS)
@@ -41,7 +59,14 @@ def folder(request, tmp_path_factory):
     """A policy with random weights, exported in float and in double."""
     task = request.param
     out = tmp_path_factory.mktemp("exported") / task
-    export(trained(task, AGENTS[task])[0], EnvConfig(task), AGENTS[task], out, 1, double=task == "cartpole")
+    export(
+        trained(task, AGENTS[task])[0],
+        EnvConfig(task),
+        AGENTS[task],
+        out,
+        1,
+        double=task == "cartpole",
+    )
     return out
 
 
@@ -101,31 +126,52 @@ def test_a_gain_changed_in_the_c_changes_what_the_motor_does(folder, tmp_path):
 FURUTA = EnvConfig("furuta")
 (DRIVE,) = FURUTA.driven.values()
 CLAMPING = DRIVE.replaced({"controller.anti_windup": "clamping"})
-LATE_AND_SAGGING = {"controller.delayed": True, "controller.deadband": 0.3, "supply.resistance": 1.5}
+LATE_AND_SAGGING = {
+    "controller.delayed": True,
+    "controller.deadband": 0.3,
+    "supply.resistance": 1.5,
+}
 OWN_GAINS = {"controller.kp": 6.0, "controller.ki": 900.0}
-GEARED = {"motor.thermal_resistance_winding": 5.0, "motor.gear_efficiency": 0.8, "motor.stribeck_friction": 1e-3}
+GEARED = {
+    "motor.thermal_resistance_winding": 5.0,
+    "motor.gear_efficiency": 0.8,
+    "motor.stribeck_friction": 1e-3,
+}
 LOOPS = {
     "late, with a dead band, sagging, clamping": CLAMPING.replaced(LATE_AND_SAGGING),
     "own gains, warming, geared": DRIVE.replaced(OWN_GAINS | GEARED),
-    "servo": Servo(DRIVE.motor, DRIVE.controller, DRIVE.supply, ServoLoop(servo_rate=500.0, velocity_gain=0.004)),
-    "the paper's": Actuator(Motor(), CurrentLoop(kp=2.0, ki=5.0, kd=1e-4, substeps=3, current_bias=0.02, kff=0.1)),
+    "servo": Servo(
+        DRIVE.motor,
+        DRIVE.controller,
+        DRIVE.supply,
+        ServoLoop(servo_rate=500.0, velocity_gain=0.004),
+    ),
+    "the paper's": Actuator(
+        Motor(), CurrentLoop(kp=2.0, ki=5.0, kd=1e-4, substeps=3, current_bias=0.02, kff=0.1)
+    ),
 }
 
 
 @pytest.mark.parametrize("name", LOOPS)
 def test_a_motor_whose_loop_is_on_the_board_moves_as_it_does_in_the_simulation(name, tmp_path):
-    env = EnvConfig("furuta", actuator=LOOPS[name], action="position" if name == "servo" else "force")
+    env = EnvConfig(
+        "furuta", actuator=LOOPS[name], action="position" if name == "servo" else "force"
+    )
     policy, made = trained("furuta", "ppo")[0], env.make()
     policy.action_space = made.action_space
     export(policy, env, "ppo", tmp_path / "out", 1, double=True)
     random = np.random.default_rng(0)
-    actions = random.uniform(made.action_space.low, made.action_space.high, (60, 1)).astype(np.float32)
+    actions = random.uniform(made.action_space.low, made.action_space.high, (60, 1)).astype(
+        np.float32
+    )
 
     def signals():
         made.reset(seed=0)
         told = [made.step(action) for action in actions]
         keys = ("current", "voltage", "actual_force")
-        return np.array([one for one, *_ in told]), np.array([[info[key] for key in keys] for *_, info in told])
+        return np.array([one for one, *_ in told]), np.array(
+            [[info[key] for key in keys] for *_, info in told]
+        )
 
     with Board(tmp_path / "out") as board:
         observed, felt = signals()
@@ -146,7 +192,10 @@ def test_converters_come_between(folder):
 LIMITED = {"name": "paper", "controller": {"max_voltage": 12.0}}
 VOLTS = {
     "pendulum": (EnvConfig("pendulum", LIMITED, action="voltage"), SACConfig(hidden=(8,))),
-    "cartpole": (EnvConfig("cartpole", LIMITED, action="voltage", levels=(-5, -1.3, 0.7, 5)), DQNConfig(hidden=(8,))),
+    "cartpole": (
+        EnvConfig("cartpole", LIMITED, action="voltage", levels=(-5, -1.3, 0.7, 5)),
+        DQNConfig(hidden=(8,)),
+    ),
 }
 
 
@@ -165,13 +214,19 @@ def test_a_bridge_comes_behind_a_policy_that_commands_voltages(tmp_path, task):
     contract = Contract.read(tmp_path / "out")
     commanded = contract.commands(done.on_board[0].action).ravel() / step
     np.testing.assert_allclose(coarse, np.round(commanded), atol=1e-6)
-    with pytest.raises(ValueError, match="the policy commands voltages, and the C measures no current"):
+    with pytest.raises(
+        ValueError, match="the policy commands voltages, and the C measures no current"
+    ):
         board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=8, current_bits=8))
 
 
 def test_without_a_loop_and_a_voltage_there_is_no_bridge(tmp_path):
-    export(trained("pendulum", "ddpg")[0], EnvConfig("pendulum", "lag"), "ddpg", tmp_path / "out", 1)
-    with pytest.raises(ValueError, match="must be 0: the C neither closes a current loop nor commands a voltage"):
+    export(
+        trained("pendulum", "ddpg")[0], EnvConfig("pendulum", "lag"), "ddpg", tmp_path / "out", 1
+    )
+    with pytest.raises(
+        ValueError, match="must be 0: the C neither closes a current loop nor commands a voltage"
+    ):
         board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=8))
 
 
@@ -193,7 +248,10 @@ def test_a_contract_that_names_a_module_takes_trust(tmp_path, monkeypatch, capsy
         patched.syspath_prepend(tmp_path)
         env = EnvConfig("ball_and_beam:TASK", max_episode_steps=20)
         export(trained("ball_and_beam:TASK", "ppo")[0], env, "ppo", tmp_path / "out", 1)
-    for line in (["board", "test", "out", "--log", "a.csv"], ["identify", "compare", "out", "a.csv"]):
+    for line in (
+        ["board", "test", "out", "--log", "a.csv"],
+        ["identify", "compare", "out", "a.csv"],
+    ):
         forget()
         monkeypatch.setattr(sys, "path", [one for one in sys.path if one != str(tmp_path)])
         options = ["--episodes", "1"] if line[0] == "board" else []
@@ -215,7 +273,9 @@ def test_encoders_and_late_answers_come_between(folder):
         angle = np.arctan2(seen[place + 1], seen[place])
         assert angle / step == pytest.approx(round(angle / step), abs=1e-9)
         assert abs(angle - np.arctan2(row[place + 1], row[place])) <= 0.51 * step
-    np.testing.assert_allclose(seen[4:] / (step * 50.0), np.round(row[4:] / (step * 50.0)), atol=1e-9)
+    np.testing.assert_allclose(
+        seen[4:] / (step * 50.0), np.round(row[4:] / (step * 50.0)), atol=1e-9
+    )
     rows = np.array(contract.golden["observations"])
     with Board(folder, link=Link(late=1.0)) as late, Board(folder) as prompt:
         held = [late.command(one) for one in rows]
@@ -223,17 +283,24 @@ def test_encoders_and_late_answers_come_between(folder):
     np.testing.assert_array_equal(held[1:], given[:-1])
     assert not held[0].any()
     python = OnnxPolicy(folder)
-    for one in board_test(folder, episodes=2, link=Link(late=1.0)).on_board:  # the command before, of that episode
+    for one in board_test(
+        folder, episodes=2, link=Link(late=1.0)
+    ).on_board:  # the command before, of that episode
         assert not one.action[0].any()
-        np.testing.assert_allclose(one.action[1:], python.predict(one.observation[:-2])[0], atol=1e-5)
+        np.testing.assert_allclose(
+            one.action[1:], python.predict(one.observation[:-2])[0], atol=1e-5
+        )
 
 
 @of_furuta
 def test_the_simulation_may_have_another_motor_than_the_one_the_loop_is_for(folder):
-    real = DRIVE.replaced({"motor.torque_constant": 0.03, "motor.back_emf_constant": 0.03, "motor.resistance": 9.0})
+    real = DRIVE.replaced(
+        {"motor.torque_constant": 0.03, "motor.back_emf_constant": 0.03, "motor.resistance": 9.0}
+    )
     done = board_test(folder, episodes=1, actuator=real)
     assert done.on_board[0].actuator.motor == real.motor
-    # the C asks for what its own motor would need; Python, which knows the real one, for more, up to the drive's 2 A
+    # the C asks for what its own motor would need; Python, which knows the real one, for more, up
+    # to the drive's 2 A
     board, python = (side[0].signals["current"][0] for side in (done.on_board, done.in_python))
     asked = abs(float(done.on_board[0].action[0, 0]))
     assert abs(board) == pytest.approx(asked / 0.042, rel=0.02)
@@ -247,7 +314,10 @@ def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
     policy, _ = trained("furuta", "ppo")
     export(policy, FURUTA, "ppo", tmp_path / "out", 1, limits=limits)
     contract, python = Contract.read(tmp_path / "out"), OnnxPolicy(tmp_path / "out")
-    assert contract.limits == {"arm_velocity": [-4.0, 4.0], "cos_rod": [pytest.approx(np.cos(3.0)), None]}
+    assert contract.limits == {
+        "arm_velocity": [-4.0, 4.0],
+        "cos_rod": [pytest.approx(np.cos(3.0)), None],
+    }
     assert "arm_velocity, at least -4, at most 4" in (tmp_path / "out/controller.h").read_text()
     angles = np.random.default_rng(0).uniform(-np.pi, np.pi, 200)
     rows = np.array([[1.0, 0.0, np.cos(one), np.sin(one), 3.0 * one, 0.0] for one in angles])
@@ -269,11 +339,15 @@ def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
             export(policy, FURUTA, "ppo", tmp_path / "other", 1, limits={name: limit})
 
 
-@pytest.mark.skipif(bool(missing_tools("cortex-m4f")), reason=f"NOT RUN: {missing_tools('cortex-m4f')}")
+@pytest.mark.skipif(
+    bool(missing_tools("cortex-m4f")), reason=f"NOT RUN: {missing_tools('cortex-m4f')}"
+)
 def test_instructions_are_counted_on_the_emulated_board(folder):
     policy, sample = instructions(folder)
     products = 6 * 64 + 64 * 64 + 64
-    assert 2 * products < policy < (20 if kind_of(folder) == "f" else 400) * products  # a Cortex-M4F has no double
+    assert (
+        2 * products < policy < (20 if kind_of(folder) == "f" else 400) * products
+    )  # a Cortex-M4F has no double
     assert 10 < sample < 2000
 
 
@@ -282,7 +356,9 @@ def test_lost_and_damaged_frames_are_answered_for_safety(folder):
     done = board_test(folder, episodes=2, link=Link(lost=0.1, damaged=0.1), loop=False)
     assert done.refused > 0
     assert done.unanswered > 0
-    with Board(folder, link=Link(damaged=1.0)) as board:  # whichever bit it is: never a command of the policy
+    with Board(
+        folder, link=Link(damaged=1.0)
+    ) as board:  # whichever bit it is: never a command of the policy
         for row in Contract.read(folder).golden["observations"]:
             assert not board.command(np.array(row)).any()
         assert board.refused == board.frames
@@ -292,7 +368,10 @@ def test_lost_and_damaged_frames_are_answered_for_safety(folder):
 @pytest.mark.parametrize("noise", [b"\xa5", b"\xa5\x5a" + bytes(21), b"\x00\xa5\xa5"])
 def test_an_answer_is_found_again_behind_noise(folder, noise):
     contract = Contract.read(folder)
-    numbers = np.full(len(contract.observations) + 4 * len(contract.actions), struct.unpack("<d", b"\xa5\x5a" * 4)[0])
+    numbers = np.full(
+        len(contract.observations) + 4 * len(contract.actions),
+        struct.unpack("<d", b"\xa5\x5a" * 4)[0],
+    )
     (to, sent), (back, said) = os.pipe(), os.pipe()
     wire = Wire(contract, sent, back)
     os.write(said, noise)
@@ -315,7 +394,9 @@ def kind_of(folder):
 def form_of(folder):
     """An answer: of a controller with k observations and m commands k + 4 m numbers."""
     contract = Contract.read(folder)
-    return struct.Struct(f"<HBBI{len(contract.observations) + 4 * len(contract.actions)}{kind_of(folder)}H")
+    return struct.Struct(
+        f"<HBBI{len(contract.observations) + 4 * len(contract.actions)}{kind_of(folder)}H"
+    )
 
 
 def asked(folder, program, sent):
@@ -337,7 +418,15 @@ def program(folder, tmp_path_factory):
     """The controller for this machine, with gcc's sanitizers."""
     built = str(tmp_path_factory.mktemp("sanitized") / "controller")
     sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
-    strict = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-Wconversion", "-Wpedantic", "-fsanitize=address,undefined"]
+    strict = [
+        "-std=c99",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        "-Wconversion",
+        "-Wpedantic",
+        "-fsanitize=address,undefined",
+    ]
     subprocess.run(["cc", *strict, *sources, "-lm", "-o", built], check=True)
     return built
 
@@ -347,19 +436,42 @@ def frame(folder, sequence, stamp, row, kind=0, spoilt=False):
     return b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF) ^ spoilt)
 
 
-def test_every_frame_damaged_doubled_late_or_old_is_told_and_the_next_is_understood(folder, program):
+def test_every_frame_damaged_doubled_late_or_old_is_told_and_the_next_is_understood(
+    folder, program
+):
     rows = Contract.read(folder).golden["observations"]
-    good = [frame(folder, n, 2**32 - 40_000 + 20_000 * n, rows[n]) for n in range(6)]  # the clock comes around
+    good = [
+        frame(folder, n, 2**32 - 40_000 + 20_000 * n, rows[n]) for n in range(6)
+    ]  # the clock comes around
     want = [command for *_, command in asked(folder, program, b"".join(good))]
     flipped = bytearray(good[1])
     flipped[11] ^= 4
     hours = frame(folder, 7, 3_600_000_000, rows[5])
     infinite = frame(folder, 8, 60_000, [np.inf, *rows[5][1:]])
-    sent = [b"\xa5noise\xa5\x5a", good[0], bytes(flipped), good[1], good[1], good[0], good[4], infinite, hours]
+    sent = [
+        b"\xa5noise\xa5\x5a",
+        good[0],
+        bytes(flipped),
+        good[1],
+        good[1],
+        good[0],
+        good[4],
+        infinite,
+        hours,
+    ]
     got = asked(folder, program, b"".join(sent[1:]))
     safe = [0.0] * len(want[0])
     assert [status for _, status, *_ in got] == [OK, DAMAGED, OK, OLD, OLD, LATE, NOT_FINITE, OLD]
-    assert [command for *_, command in got] == [want[0], safe, want[1], want[1], want[1], want[4], safe, safe]
+    assert [command for *_, command in got] == [
+        want[0],
+        safe,
+        want[1],
+        want[1],
+        want[1],
+        want[4],
+        safe,
+        safe,
+    ]
     # noise that begins like a frame takes the next one with it; the one after is understood
     after = asked(folder, program, sent[0] + b"".join(good))
     assert [command for _, status, _, command in after if status == OK] == want
@@ -367,7 +479,9 @@ def test_every_frame_damaged_doubled_late_or_old_is_told_and_the_next_is_underst
 
 @of_furuta
 @pytest.mark.parametrize("lacking", [1, 9])
-def test_a_frame_of_which_bytes_are_lost_is_refused_and_those_after_it_come_through(folder, program, lacking):
+def test_a_frame_of_which_bytes_are_lost_is_refused_and_those_after_it_come_through(
+    folder, program, lacking
+):
     rows = Contract.read(folder).golden["observations"]
     good = [frame(folder, n, 20_000 * n + 1, rows[n]) for n in range(8)]
     want = [command for *_, command in asked(folder, program, b"".join(good))]
@@ -403,10 +517,16 @@ def test_the_watchdog_goes_by_the_board_s_own_clock_and_stops_the_drive(wired):
     after = round(1e6 * contract.late["after"])
     assert late(5_000_000) == (True, False)  # nothing came yet
     assert send(1_000, DRIVING) == (OK, True)
-    assert late(5_000_100) == (False, True)  # when it came, by this clock, which began before the host's
+    assert late(5_000_100) == (
+        False,
+        True,
+    )  # when it came, by this clock, which began before the host's
     assert late(5_000_100 + after) == (False, True)
     assert late(5_000_101 + after) == (True, False)
-    assert send(1, DRIVING) == (OK, True)  # another run of the host, whose stamps begin anew, or hours later
+    assert send(1, DRIVING) == (
+        OK,
+        True,
+    )  # another run of the host, whose stamps begin anew, or hours later
     assert late(2**32 - 10) == (False, True)
     assert late(after - 10) == (False, True)  # the clock comes around
     assert late(after - 9) == (True, False)
@@ -423,7 +543,9 @@ def test_an_old_frame_moves_nothing_that_did_not_move(wired):
     assert send(10_000, DRIVING) == (OLD, False)
 
 
-def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(folder, tmp_path, capsys):
+def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(
+    folder, tmp_path, capsys
+):
     log = tmp_path / "log.csv"
     assert main(["board", "test", str(folder), "--episodes", "1", "--log", str(log)]) == 0
     assert "1 of 1" in capsys.readouterr().out
@@ -452,7 +574,9 @@ def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(
         log.write_text(text(*table))
         with pytest.raises(ValueError, match=says):
             check_log(folder, log)
-    log.write_text("\ufeff" + text(header, rows, "\r\n") + "\r\n\r\n", encoding="utf-8")  # as a spreadsheet saves it
+    log.write_text(
+        "\ufeff" + text(header, rows, "\r\n") + "\r\n\r\n", encoding="utf-8"
+    )  # as a spreadsheet saves it
     assert check_log(folder, log) == found
     for row in rows:
         row[sent] = str(float(row[sent]) + 0.01)
@@ -475,8 +599,19 @@ def test_a_program_that_ends_is_an_error(folder, tmp_path, capsys):
 @of_cartpole
 def test_what_cannot_be_run_is_said(folder, tmp_path, monkeypatch, capsys):
     for line, says in {
-        ("test", str(folder), "--lost", "1.5"): "Link.lost = 1.5: must be a finite number >= 0 and <= 1",
-        ("test", str(folder), "--no-loop", "--pwm-bits", "8"): "the simulation closes the current loop: leave",
+        (
+            "test",
+            str(folder),
+            "--lost",
+            "1.5",
+        ): "Link.lost = 1.5: must be a finite number >= 0 and <= 1",
+        (
+            "test",
+            str(folder),
+            "--no-loop",
+            "--pwm-bits",
+            "8",
+        ): "the simulation closes the current loop: leave",
         ("test", str(folder), "--target", "avr"): "avr",
         ("test", str(tmp_path)): "contract.json",
     }.items():
@@ -488,17 +623,26 @@ def test_what_cannot_be_run_is_said(folder, tmp_path, monkeypatch, capsys):
     (folder / "elsewhere.c").rename(folder / "board.c")
     monkeypatch.setenv("PATH", "")
     assert main(["board", "test", str(folder), "--target", "cortex-m4f"]) == 2
-    assert "apt-get install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm" in capsys.readouterr().err
+    assert (
+        "apt-get install gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
+        in capsys.readouterr().err
+    )
 
 
 @of_furuta
 @pytest.mark.parametrize("weight", ["0.0f / 0.0f + ", "1.5f + "])
-def test_a_wrong_weight_fails_the_golden_check_and_fast_math_does_not_compile(folder, tmp_path, weight):
+def test_a_wrong_weight_fails_the_golden_check_and_fast_math_does_not_compile(
+    folder, tmp_path, weight
+):
     program = tmp_path / "golden"
     controller = spoilt(folder, tmp_path, "bias_0[64] = {", weight) / "controller.c"
     sources = [str(controller), str(folder / "main.c")]
-    subprocess.run(["cc", "-std=c99", f"-I{folder}", *sources, "-lm", "-o", str(program)], check=True)
+    subprocess.run(
+        ["cc", "-std=c99", f"-I{folder}", *sources, "-lm", "-o", str(program)], check=True
+    )
     assert subprocess.run([program], check=False, capture_output=True).returncode == 1
     for flag in ("-ffast-math", "-ffinite-math-only"):
-        refused = subprocess.run(["cc", flag, "-c", f"-I{folder}", sources[1], "-o", str(program)], capture_output=True)
+        refused = subprocess.run(
+            ["cc", flag, "-c", f"-I{folder}", sources[1], "-o", str(program)], capture_output=True
+        )
         assert b"without -ffast-math" in refused.stderr

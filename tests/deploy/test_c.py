@@ -29,7 +29,9 @@ KINDS = {False: ctypes.c_float, True: ctypes.c_double}
 
 def each(names, in_float):
     """All names in double and one in float; all others in float are parts of the full matrix."""
-    return but([(in_float, False), *((name, True) for name in names)], itertools.product(names, KINDS))
+    return but(
+        [(in_float, False), *((name, True) for name in names)], itertools.product(names, KINDS)
+    )
 
 
 def written(folder, task, agent="ppo", settings=(), double=False, **changes):
@@ -43,7 +45,14 @@ def written(folder, task, agent="ppo", settings=(), double=False, **changes):
 
 def compiled(folder, double, *functions):
     """The controller of a folder as a library, of which some functions return a number; and the kind of its numbers."""
-    out = ["-shared", "-fPIC", str(folder / "controller.c"), "-lm", "-o", str(folder / "controller.so")]
+    out = [
+        "-shared",
+        "-fPIC",
+        str(folder / "controller.c"),
+        "-lm",
+        "-o",
+        str(folder / "controller.so"),
+    ]
     subprocess.run([COMPILERS[0], *STRICT, *out], check=True)
     library = ctypes.CDLL(out[-1])
     for name in functions:
@@ -72,12 +81,16 @@ def test_the_policy_in_c_is_the_policy(tmp_path, task, agent, settings, double):
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize(("task", "agent"), [("furuta", "sac"), ("acrobot", "dqn"), ("acrobot", "sarsa")])
+@pytest.mark.parametrize(
+    ("task", "agent"), [("furuta", "sac"), ("acrobot", "dqn"), ("acrobot", "sarsa")]
+)
 def test_golden_commands_are_computed_again_without_a_warning(tmp_path, compiler, task, agent):
     written(tmp_path, task, agent)
     program = str(tmp_path / "main")
     files = [str(tmp_path / name) for name in ("controller.c", "main.c")]
-    subprocess.run([compiler, *STRICT, "-fsanitize=undefined", *files, "-lm", "-o", program], check=True)
+    subprocess.run(
+        [compiler, *STRICT, "-fsanitize=undefined", *files, "-lm", "-o", program], check=True
+    )
     done = subprocess.run([program], capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert float(done.stdout.split(": ")[1]) < 1e-6
@@ -97,7 +110,9 @@ LOOPS = {
 def test_the_current_loop_in_c_is_the_drive_s_sample_by_sample(tmp_path, name, double):
     (usual,) = EnvConfig("furuta").driven.values()
     changed = {f"controller.{field}": value for field, value in LOOPS[name].items()}
-    drive = usual.replaced(changed | {"motor.load_inertia": np.inf})  # a held speed, as the engine gives it
+    drive = usual.replaced(
+        changed | {"motor.load_inertia": np.inf}
+    )  # a held speed, as the engine gives it
     motor = drive.motor
     written(tmp_path, "furuta", double=double, actuator=drive)
     library, kind = compiled(tmp_path, double, "current_step", "current_reference")
@@ -120,7 +135,9 @@ def test_the_current_loop_in_c_is_the_drive_s_sample_by_sample(tmp_path, name, d
         assert reference == pytest.approx(signals.reference_current, abs=tolerance * 10)
         assert volts == pytest.approx(signals.voltage, abs=tolerance * drive.voltage_limit)
         reached = (signals.voltage - motor.back_emf_constant * speed) / motor.resistance
-        assert after.current == pytest.approx(reached + (ours.current - reached) * decay, abs=1e-9)  # the winding's
+        assert after.current == pytest.approx(
+            reached + (ours.current - reached) * decay, abs=1e-9
+        )  # the winding's
         saturated += signals.voltage_saturated
         ours = after
     assert 20 < saturated < 1900
@@ -128,7 +145,13 @@ def test_the_current_loop_in_c_is_the_drive_s_sample_by_sample(tmp_path, name, d
 
 PID = {
     "the paper's": {},
-    "filtered": {"kp": 3.0, "ki": 15.0, "kd": 1e-3, "integral_leak": 0.4, "derivative_time_constant": 5e-3},
+    "filtered": {
+        "kp": 3.0,
+        "ki": 15.0,
+        "kd": 1e-3,
+        "integral_leak": 0.4,
+        "derivative_time_constant": 5e-3,
+    },
     "fed forward": {"kff": 0.7, "bemf_compensation": False, "max_voltage": math.inf},
     "sagging": {"max_voltage": 9.0, "substeps": 4},
 }
@@ -144,8 +167,12 @@ def test_the_paper_s_loop_in_c_is_the_actuator_s_sample_by_sample(tmp_path, name
     library, kind = compiled(tmp_path, double, "current_step", "current_reference")
     parameters = parameters_type(Actuator)(*actuator.numbers)
     header = (tmp_path / "controller.h").read_text()
-    period = 1.0 / float(header.partition("CONTROLLER_CURRENT_RATE ")[2].partition(" ")[0].rstrip("f"))
-    assert period == pytest.approx(EnvConfig("cartpole").make().unwrapped.model.opt.timestep / controller.substeps)
+    period = 1.0 / float(
+        header.partition("CONTROLLER_CURRENT_RATE ")[2].partition(" ")[0].rstrip("f")
+    )
+    assert period == pytest.approx(
+        EnvConfig("cartpole").make().unwrapped.model.opt.timestep / controller.substeps
+    )
     state, random, saturated = (kind * 2)(), np.random.default_rng(0), 0
     library.current_reset(state)
     current = integral = error = 0.0
@@ -156,22 +183,43 @@ def test_the_paper_s_loop_in_c_is_the_actuator_s_sample_by_sample(tmp_path, name
             state[:] = integral, error
         available = min(controller.max_voltage, math.inf if supply is None else supply.voltage)
         if name == "sagging":
-            available = min(controller.max_voltage, max(supply.voltage - supply.resistance * abs(current), 0.0))
+            available = min(
+                controller.max_voltage, max(supply.voltage - supply.resistance * abs(current), 0.0)
+            )
         reference = kind(library.current_reference(kind(force)))
         volts = library.current_step(state, reference, kind(current), kind(speed))
         torque = force * actuator.arm_radius
         given = parameters, period, current, integral, error, torque, speed, 0.0, available
         current, integral, error, wanted = electrical_step(*given)
-        assert volts == pytest.approx(wanted, rel=1e-12 if double else 1e-5, abs=1e-11 if double else 2e-5)
+        assert volts == pytest.approx(
+            wanted, rel=1e-12 if double else 1e-5, abs=1e-11 if double else 2e-5
+        )
         saturated += abs(wanted) == available
     assert (saturated > 20) == (name != "fed forward")
-    assert list(state) == pytest.approx([integral, error], rel=1e-9 if double else 1e-4, abs=1e-9 if double else 1e-4)
+    assert list(state) == pytest.approx(
+        [integral, error], rel=1e-9 if double else 1e-4, abs=1e-9 if double else 1e-4
+    )
 
 
 SERVOS = {
-    "position": {"velocity_gain": 0.02, "position_gain": 15.0, "velocity_integral_gain": 3.0, "max_torque": 0.2},
-    "ahead": {"velocity_gain": 0.005, "position_gain": 4.0, "velocity_feed_forward": 0.9, "max_velocity": 8.0},
-    "velocity": {"controls": "velocity", "velocity_gain": 0.01, "inertia_feed_forward": 2e-5, "max_torque": 0.1},
+    "position": {
+        "velocity_gain": 0.02,
+        "position_gain": 15.0,
+        "velocity_integral_gain": 3.0,
+        "max_torque": 0.2,
+    },
+    "ahead": {
+        "velocity_gain": 0.005,
+        "position_gain": 4.0,
+        "velocity_feed_forward": 0.9,
+        "max_velocity": 8.0,
+    },
+    "velocity": {
+        "controls": "velocity",
+        "velocity_gain": 0.01,
+        "inertia_feed_forward": 2e-5,
+        "max_torque": 0.1,
+    },
 }
 
 
@@ -179,7 +227,9 @@ SERVOS = {
 def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name, double):
     (drive,) = EnvConfig("furuta").driven.values()
     loop = ServoLoop(servo_rate=500.0, **SERVOS[name])
-    servo = Servo(dataclasses.replace(drive.motor, gear_ratio=3.0), drive.controller, drive.supply, loop)
+    servo = Servo(
+        dataclasses.replace(drive.motor, gear_ratio=3.0), drive.controller, drive.supply, loop
+    )
     written(tmp_path, "furuta", double=double, actuator=servo, action=loop.controls)
     library, kind = compiled(tmp_path, double, "servo_step", "servo_target")
     assert library.servo_target(kind(0.5)) == pytest.approx(0.5 * 3.0)
@@ -189,7 +239,11 @@ def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name,
     ours, position, speed = Servo.State(*[0.0] * len(Servo.State._fields)), 0.0, 0.0
     for sample in range(1000):
         if sample % 50 == 0:
-            target = random.uniform(-6.0, 6.0) if loop.controls == "position" else random.uniform(-30.0, 30.0)
+            target = (
+                random.uniform(-6.0, 6.0)
+                if loop.controls == "position"
+                else random.uniform(-30.0, 30.0)
+            )
         target += random.uniform(-0.01, 0.01)
         position, speed = 0.9 * position + random.uniform(-1.0, 1.0), random.uniform(-20.0, 20.0)
         rate = (target - ours.target) / period if ours.due > 0.0 else 0.0
@@ -198,8 +252,12 @@ def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name,
         inputs = Inputs(target, position, speed, sample * period, 0.0)
         ours, _, signals = Servo.advance(parameters, period, ours, inputs)
         reference = library.servo_step(state, kind(target), kind(rate), kind(position), kind(speed))
-        assert reference == pytest.approx(signals.reference_current, rel=0, abs=1e-12 if double else 5e-6)
-        assert state[0] == pytest.approx(ours.velocity_integral, rel=0, abs=1e-12 if double else 1e-7)
+        assert reference == pytest.approx(
+            signals.reference_current, rel=0, abs=1e-12 if double else 5e-6
+        )
+        assert state[0] == pytest.approx(
+            ours.velocity_integral, rel=0, abs=1e-12 if double else 1e-7
+        )
         limited += signals.current_saturated
         free += not signals.current_saturated
     assert min(limited, free) > (50 if loop.max_torque < math.inf else -1)
@@ -225,10 +283,28 @@ MLP, SARSA = ("pendulum", "ppo"), ("acrobot", "sarsa")
 @pytest.mark.parametrize(
     ("board", "policy", "hidden", "double", "says"),
     [
-        ("arduino-uno", MLP, 128, False, r"arduino-uno: .* needs about \d+ bytes of flash, must be at most 32256"),
-        ("arduino-uno", MLP, 48, False, r"arduino-uno: .* needs about 1\d+ bytes of RAM, must be at most 2048"),
+        (
+            "arduino-uno",
+            MLP,
+            128,
+            False,
+            r"arduino-uno: .* needs about \d+ bytes of flash, must be at most 32256",
+        ),
+        (
+            "arduino-uno",
+            MLP,
+            48,
+            False,
+            r"arduino-uno: .* needs about 1\d+ bytes of RAM, must be at most 2048",
+        ),
         ("arduino-uno", MLP, 48, True, "double has 4 bytes"),
-        ("arduino-uno", SARSA, None, False, r"train a smaller one \(--agent.tilings 4\), or name a larger"),
+        (
+            "arduino-uno",
+            SARSA,
+            None,
+            False,
+            r"train a smaller one \(--agent.tilings 4\), or name a larger",
+        ),
         ("arduino-un", MLP, 48, False, "did you mean arduino-uno"),
     ],
 )

@@ -50,9 +50,13 @@ def test_another_motor_is_seen_and_what_identifies_it_takes_the_difference_away(
     (drive,) = FURUTA.driven.values()
     real = drive.replaced({"motor.torque_constant": 0.03, "motor.viscous_friction": 3e-5})
     log, contract, *_ = logged("furuta")
-    done = board_test(log.parent / "out", episodes=1, actuator=real)  # its loop knows the motor of the training alone
+    done = board_test(
+        log.parent / "out", episodes=1, actuator=real
+    )  # its loop knows the motor of the training alone
     write_log(tmp_path / "rig.csv", contract, done.on_board[0])
-    as_trained, as_it_is = (compare(FURUTA, tmp_path / "rig.csv", actuator=one).errors for one in (None, real))
+    as_trained, as_it_is = (
+        compare(FURUTA, tmp_path / "rig.csv", actuator=one).errors for one in (None, real)
+    )
     assert (as_trained > 20.0 * as_it_is).all()
 
 
@@ -69,7 +73,9 @@ def test_windows_begin_at_what_was_observed_and_the_motor_goes_on(logged):
 
 def test_a_log_has_what_the_motor_did(logged):
     log, contract, _, episode = logged("furuta")
-    rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(log.open())]
+    rows = [
+        {name: float(value) for name, value in row.items()} for row in csv.DictReader(log.open())
+    ]
     assert [row["motor_voltage:V"] for row in rows[1:]] == episode.signals["voltage"][:-1].tolist()
     assert rows[0]["motor_current:A"] == 0.0
     turned = np.array([row["motor_position:rad"] for row in rows])
@@ -83,7 +89,14 @@ def test_from_the_command_line(logged, tmp_path, capsys):
     line = ["identify", "compare", str(log.parent / "out"), str(log)]
     assert main([*line, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert [one["name"] for one in told] == ["cos_arm", "sin_arm", "cos_rod", "sin_rod", "arm_velocity", "rod_velocity"]
+    assert [one["name"] for one in told] == [
+        "cos_arm",
+        "sin_arm",
+        "cos_rod",
+        "sin_rod",
+        "arm_velocity",
+        "rod_velocity",
+    ]
     assert all(one["error"] < 0.01 * one["if_nothing_changed"] for one in told)
     line += ["--actuator", "ideal"]  # whose torque is what was asked for, as the rig's is soon
     assert main([*line, "--json"]) == 0
@@ -108,12 +121,16 @@ def test_what_cannot_be_compared_is_said(logged, tmp_path, capsys):
     with pytest.raises(ValueError, match="the policy knows none"):
         compare(EnvConfig("cartpole"), log)
     (drive,) = FURUTA.driven.values()
-    with pytest.raises(ValueError, match=r"as this motor gives it, is beyond the simulation's bound, \["):
+    with pytest.raises(
+        ValueError, match=r"as this motor gives it, is beyond the simulation's bound, \["
+    ):
         compare(FURUTA, log, actuator=drive.replaced({"motor.torque_constant": 1e3}))
 
 
 def test_identify_reads_what_a_board_logged(tmp_path):
-    drive = find_drive("maxon-ec45-flat-50w").replaced({"motor.gear_ratio": 20.0, "motor.coulomb_friction": 0.0})
+    drive = find_drive("maxon-ec45-flat-50w").replaced(
+        {"motor.gear_ratio": 20.0, "motor.coulomb_friction": 0.0}
+    )
     env = EnvConfig("pendulum", actuator=drive, inner_steps=50)
 
     class Slow:

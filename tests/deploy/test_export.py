@@ -18,7 +18,13 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy
 from codrl_mj.runs.policies import load_policy, save_policy
 
-TASKS = {"cartpole": "ppo", "pendulum": "ddpg", "acrobot": "dqn", "mountain_car_continuous": "td3", "furuta": "sac"}
+TASKS = {
+    "cartpole": "ppo",
+    "pendulum": "ddpg",
+    "acrobot": "dqn",
+    "mountain_car_continuous": "td3",
+    "furuta": "sac",
+}
 SMALL = {"hidden": (16, 16)}
 
 
@@ -92,8 +98,13 @@ def test_the_table_is_the_policy(tmp_path):
     low, high = np.array([-1.2, -0.07]), np.array([0.6, 0.07])
     seen = np.random.default_rng(0).uniform(low, high, (300, 2)).astype(np.float32)
     for one, action in zip(seen, policy.predict(seen, deterministic=True)[0], strict=True):
-        eighths = np.floor((one.astype(float) - low) / (high - low) * 64)  # Sutton's displacements: 1 and 3 a tiling
-        tiles = [(tiling, *((eighths + tiling * np.array([1, 3]) % 8) // 8).astype(int)) for tiling in range(8)]
+        eighths = np.floor(
+            (one.astype(float) - low) / (high - low) * 64
+        )  # Sutton's displacements: 1 and 3 a tiling
+        tiles = [
+            (tiling, *((eighths + tiling * np.array([1, 3]) % 8) // 8).astype(int))
+            for tiling in range(8)
+        ]
         assert sum(weights[tile] for tile in tiles).argmax() == action
     done = board_test(tmp_path / "out", episodes=2)
     np.testing.assert_array_equal(done.on_board[1].action, done.in_python[1].action)
@@ -106,7 +117,13 @@ def test_the_table_is_the_policy(tmp_path):
 def exported(tmp_path_factory):
     """A folder of a policy for Furuta behind its motor."""
     folder = tmp_path_factory.mktemp("out") / "furuta"
-    export(trained("furuta", "ppo")[0], EnvConfig("furuta", observe_actuator=False), "ppo", folder, episodes=2)
+    export(
+        trained("furuta", "ppo")[0],
+        EnvConfig("furuta", observe_actuator=False),
+        "ppo",
+        folder,
+        episodes=2,
+    )
     return folder
 
 
@@ -145,7 +162,12 @@ CURRENTS = {"action": "current", "observe_actuator": True}
         ("pendulum", CURRENTS, ["1", "1", "rad/s", "A", "A"], ("motor", "A", None, 2.0)),
         ("acrobot", {}, ["1"] * 4 + ["rad/s"] * 2, ("motor", "N*m", [-1.0, 0.0, 1.0], None)),
         ("mountain_car", {}, ["m", "m/s"], ("motor", "N", [-1.0, 0.0, 1.0], None)),
-        ("InvertedPendulum-v5", {}, [None] * 4, ("slide", None, None, 3.0)),  # of others: bounds and no units
+        (
+            "InvertedPendulum-v5",
+            {},
+            [None] * 4,
+            ("slide", None, None, 3.0),
+        ),  # of others: bounds and no units
     ],
 )
 def test_units_are_those_of_state_signals_and_commands(task, changes, units, actions):
@@ -160,7 +182,11 @@ def test_units_are_those_of_state_signals_and_commands(task, changes, units, act
     [
         (lambda seen: [seen[1], seen[0], *seen[2:]], None, "their order is sin_arm, cos_arm"),
         (lambda seen: seen[:-1], None, "rod_velocity missing"),
-        (lambda seen: [*seen[:4], ("arm_velocity", "deg/s"), seen[5]], None, "its unit is deg/s, must be rad/s"),
+        (
+            lambda seen: [*seen[:4], ("arm_velocity", "deg/s"), seen[5]],
+            None,
+            "its unit is deg/s, must be rad/s",
+        ),
         (lambda seen: [*seen[:5], ("rod_velocty", "rad/s")], None, "did you mean 'rod_velocity'"),
         (lambda seen: seen, 100.0, "at 100 Hz, must be 50 Hz"),
     ],
@@ -178,7 +204,10 @@ def test_another_actuator_is_refused_by_the_number_that_differs(exported):
     (drive,) = EnvConfig("furuta").driven.values()
     contract.admit_actuators({"motor": drive})
     weaker = drive.replaced({"supply.voltage": 6.0})
-    for other, message in {weaker: r"supply\.voltage = 6\.0, must be 18\.0", Actuator(): "must be drive"}.items():
+    for other, message in {
+        weaker: r"supply\.voltage = 6\.0, must be 18\.0",
+        Actuator(): "must be drive",
+    }.items():
         with pytest.raises(ValueError, match=message):
             contract.admit_actuators({"motor": other})
 
@@ -192,7 +221,9 @@ def test_an_edited_contract_is_refused(exported, tmp_path):
 
 @pytest.mark.parametrize("agent", ["sac", "td3"])
 def test_large_commands_may_be_off_by_more(agent, tmp_path):
-    env = EnvConfig("pendulum", {"name": "paper", "controller": {"max_voltage": 200.0}}, action="voltage")
+    env = EnvConfig(
+        "pendulum", {"name": "paper", "controller": {"max_voltage": 200.0}}, action="voltage"
+    )
     policy, _ = trained("pendulum", agent)
     policy.action_space = policy.actor.action_space = env.make().action_space
     export(policy, env, agent, tmp_path / "out", 1)
@@ -207,7 +238,9 @@ def test_what_cannot_be_exported_is_said_and_leaves_nothing(tmp_path):
     layered.mlp_extractor.policy_net[1] = torch.nn.ELU()
     for policy, message in {
         layered: "a layer is ELU",
-        RandomPolicy("pendulum"): "RandomPolicy cannot be exported: it must be of PPO, SAC, TD3, DDPG or",
+        RandomPolicy(
+            "pendulum"
+        ): "RandomPolicy cannot be exported: it must be of PPO, SAC, TD3, DDPG or",
     }.items():
         with pytest.raises(ValueError, match=message):
             export(policy, EnvConfig("pendulum"), "ppo", tmp_path / "out")
@@ -218,7 +251,16 @@ def test_from_the_command_line(tmp_path, capsys):
     policy, config = trained("pendulum", "ppo", **SMALL)
     save_policy(policy, config, tmp_path / "policy")
     out = tmp_path / "out"
-    line = ["export", str(tmp_path / "policy"), "--task", "pendulum", "--agent", "ppo", "--episodes", "1"]
+    line = [
+        "export",
+        str(tmp_path / "policy"),
+        "--task",
+        "pendulum",
+        "--agent",
+        "ppo",
+        "--episodes",
+        "1",
+    ]
     assert main([*line, "--out", str(out)]) == 0
     told = capsys.readouterr().out
     assert "angular_velocity" in told
@@ -228,9 +270,13 @@ def test_from_the_command_line(tmp_path, capsys):
     assert (contract.task, contract.agent) == ("pendulum", "ppo")
     again = load_policy(tmp_path / "policy")
     seen = np.array(contract.golden["observations"], np.float32)
-    np.testing.assert_array_equal(again.predict(seen, deterministic=True)[0], contract.golden["actions"])
+    np.testing.assert_array_equal(
+        again.predict(seen, deterministic=True)[0], contract.golden["actions"]
+    )
     assert "typedef float real" in (out / "controller.h").read_text()
-    assert main([*line, "--out", str(tmp_path / "small"), "--board", "arduino-due", "--float64"]) == 0
+    assert (
+        main([*line, "--out", str(tmp_path / "small"), "--board", "arduino-due", "--float64"]) == 0
+    )
     assert "typedef double real" in (tmp_path / "small" / "controller.h").read_text()
     assert main([*line, "--out", str(out)]) == 2
     assert "is no empty folder" in capsys.readouterr().err

@@ -69,7 +69,9 @@ def registered(request):
 @pytest.mark.parametrize("env_id", V5)
 def test_of_gymnasiums_environments(env_id):
     with gym.make(env_id) as env:
-        assert Interface.between(EnvConfig(env_id)).rate == pytest.approx(1.0 / env.unwrapped.dt, rel=1e-9)
+        assert Interface.between(EnvConfig(env_id)).rate == pytest.approx(
+            1.0 / env.unwrapped.dt, rel=1e-9
+        )
 
 
 def test_of_another_frame_skip():
@@ -81,17 +83,24 @@ def test_of_another_frame_skip():
 
 @pytest.mark.parametrize("task", TASKS)
 def test_of_tasks(task):
-    assert Interface.between(EnvConfig(task)).rate == pytest.approx(1.0 / TASKS[task].step_duration, rel=1e-12)
+    assert Interface.between(EnvConfig(task)).rate == pytest.approx(
+        1.0 / TASKS[task].step_duration, rel=1e-12
+    )
 
 
 def test_of_a_world_and_of_a_task_of_ones_own():
-    assert Interface.between(EnvConfig("tests.envs.rig:RIG")).rate == pytest.approx(50.0)  # 10 steps of 2 ms
+    assert Interface.between(EnvConfig("tests.envs.rig:RIG")).rate == pytest.approx(
+        50.0
+    )  # 10 steps of 2 ms
     assert Interface.between(EnvConfig("tests.own_project.arm:TASK")).rate == pytest.approx(20.0)
 
 
 @pytest.mark.parametrize(
     ("registered", "rate"),
-    [(BareEnv, 100.0), (functools.partial(repeated, 4), 25.0)],  # without a dt; with a wrapper inside
+    [
+        (BareEnv, 100.0),
+        (functools.partial(repeated, 4), 25.0),
+    ],  # without a dt; with a wrapper inside
     indirect=["registered"],
 )
 def test_of_functions_that_make_environments(registered, rate):
@@ -104,12 +113,16 @@ def test_steps_of_no_one_duration_are_refused(registered):
         Interface.between(EnvConfig(registered))
 
 
-@pytest.mark.parametrize("name", ["cartpole/swingup", "pendulum/swingup", "reacher/easy", "finger/spin", "walker/walk"])
+@pytest.mark.parametrize(
+    "name", ["cartpole/swingup", "pendulum/swingup", "reacher/easy", "finger/spin", "walker/walk"]
+)
 def test_of_dm_controls_environments(name):
     """Their physics takes one integration step in halves."""
     domain, task = name.split("/")
     inner = suite.load(domain, task)
-    env = codrl_mj.make(functools.partial(OfDmControl, domain, task), {".*": "ideal"}, disable_env_checker=True)
+    env = codrl_mj.make(
+        functools.partial(OfDmControl, domain, task), {".*": "ideal"}, disable_env_checker=True
+    )
     recorder = env.recorder
     env.reset(seed=0)
     env.step(np.zeros(env.action_space.shape))

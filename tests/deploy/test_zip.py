@@ -1,6 +1,7 @@
 """Zips of Stable-Baselines3 in and out: with the statistics of `VecNormalize`, and in the units of their training.
 
-What is expected is what Stable-Baselines3 itself computes: `VecNormalize.normalize_obs`, then the model's `predict`.
+What is expected is what Stable-Baselines3 itself computes: `VecNormalize.normalize_obs`, then the
+model's `predict`.
 """
 
 import json
@@ -23,7 +24,10 @@ from codrl_mj.evaluation import evaluate
 from codrl_mj.runs.policies import load_sb3_zip
 from codrl_mj.training.folder import load_config
 
-LEARNS = {"ppo": {"n_steps": 16, "batch_size": 16, "n_epochs": 1}, "sac": {"learning_starts": 8, "batch_size": 8}}
+LEARNS = {
+    "ppo": {"n_steps": 16, "batch_size": 16, "n_epochs": 1},
+    "sac": {"learning_starts": 8, "batch_size": 8},
+}
 LEARNS["dqn"] = LEARNS["sac"]
 TASK_IDS = {"pendulum": "codrl_mj/Pendulum-v0", "cartpole": "codrl_mj/CartPole-v0"}
 
@@ -34,7 +38,9 @@ ZIP = ["--task", "pendulum", "--agent", "ppo", "--trust"]
 def model_of(agent, envs):
     """A small model that learned nothing."""
     settings = LEARNS[agent] | {"policy_kwargs": {"net_arch": [16]}}
-    return getattr(stable_baselines3, agent.upper())("MlpPolicy", envs, **settings, seed=0, device="cpu")
+    return getattr(stable_baselines3, agent.upper())(
+        "MlpPolicy", envs, **settings, seed=0, device="cpu"
+    )
 
 
 def saved(folder, agent, task, normalized=True, steps=32, **options):
@@ -45,7 +51,9 @@ def saved(folder, agent, task, normalized=True, steps=32, **options):
     model.learn(steps)
     (folder / "apart").mkdir()
     model.save(folder / "policy.zip")
-    if normalized:  # as after a long training of observations far from zero, beside which they hardly change
+    if (
+        normalized
+    ):  # as after a long training of observations far from zero, beside which they hardly change
         envs.obs_rms.mean[:] = np.linspace(-300.0, 200.0, len(envs.obs_rms.mean))
         envs.obs_rms.var[:] = np.geomspace(1e-6, 9.0, len(envs.obs_rms.mean))
         envs.save(folder / "apart/statistics.pkl")
@@ -56,10 +64,16 @@ def observed(statistics, count=500):
     """Raw observations of which some are beyond the clip."""
     rms = statistics.obs_rms
     random = np.random.default_rng(1)
-    return (rms.mean + 1.5 * np.sqrt(rms.var) * random.normal(size=(count, len(rms.mean)))).astype(np.float32)
+    return (rms.mean + 1.5 * np.sqrt(rms.var) * random.normal(size=(count, len(rms.mean)))).astype(
+        np.float32
+    )
 
 
-@pytest.fixture(scope="module", params=[("pendulum", "ppo"), ("pendulum", "sac"), ("cartpole", "dqn")], ids="-".join)
+@pytest.fixture(
+    scope="module",
+    params=[("pendulum", "ppo"), ("pendulum", "sac"), ("cartpole", "dqn")],
+    ids="-".join,
+)
 def normalized(request, tmp_path_factory):
     """Task and agent, a folder with the zip, the model, and its statistics."""
     task, agent = request.param
@@ -93,15 +107,22 @@ def test_onnx_and_c_and_contract_have_the_statistics(normalized, tmp_path, doubl
     assert 0.05 < (within == 2.0).mean() < 0.5
     expected = model.predict(statistics.normalize_obs(seen), deterministic=True)[0]
     assert len(np.unique(expected)) > 1
-    acted = onnxruntime.InferenceSession(tmp_path / "out/policy.onnx").run(None, {"observation": seen})[0]
+    acted = onnxruntime.InferenceSession(tmp_path / "out/policy.onnx").run(
+        None, {"observation": seen}
+    )[0]
     np.testing.assert_allclose(acted, expected, atol=1e-5)
     contract, rms = Contract.read(tmp_path / "out"), statistics.obs_rms
     mean, variance, scale, offset = np.array(
-        [[one[name] for name in ("mean", "variance", "scale", "offset")] for one in contract.observations]
+        [
+            [one[name] for name in ("mean", "variance", "scale", "offset")]
+            for one in contract.observations
+        ]
     ).T
     np.testing.assert_array_equal(mean, rms.mean)
     np.testing.assert_allclose(variance, rms.var + statistics.epsilon, rtol=1e-12)
-    np.testing.assert_allclose(scale * seen[0] + offset, (seen[0] - rms.mean) / np.sqrt(rms.var + 1e-8), atol=1e-6)
+    np.testing.assert_allclose(
+        scale * seen[0] + offset, (seen[0] - rms.mean) / np.sqrt(rms.var + 1e-8), atol=1e-6
+    )
     assert {one["clip"] for one in contract.observations} == {2.0}
     if missing_tools("host"):
         pytest.skip("NOT RUN: no C compiler: apt-get install gcc")
@@ -110,7 +131,9 @@ def test_onnx_and_c_and_contract_have_the_statistics(normalized, tmp_path, doubl
     np.testing.assert_allclose(commands, contract.commands(expected[:100]), atol=1e-5)
 
 
-@pytest.mark.parametrize("changes", [{"norm_obs": False}, {"clip_obs": np.inf}], ids=lambda one: next(iter(one)))
+@pytest.mark.parametrize(
+    "changes", [{"norm_obs": False}, {"clip_obs": np.inf}], ids=lambda one: next(iter(one))
+)
 def test_other_settings_of_vecnormalize(half, tmp_path, changes):
     envs = codrl_mj.make_sb3_vec_env(TASK_IDS["pendulum"], 1)
     statistics = VecNormalize.load(str(half / "apart/statistics.pkl"), envs)
@@ -121,11 +144,15 @@ def test_other_settings_of_vecnormalize(half, tmp_path, changes):
     seen = observed(statistics)
     model = stable_baselines3.PPO.load(half / "policy.zip", device="cpu")
     expected = model.predict(statistics.normalize_obs(seen), deterministic=True)[0]
-    acted = onnxruntime.InferenceSession(tmp_path / "out/policy.onnx").run(None, {"observation": seen})[0]
+    acted = onnxruntime.InferenceSession(tmp_path / "out/policy.onnx").run(
+        None, {"observation": seen}
+    )[0]
     np.testing.assert_allclose(acted, expected, atol=1e-5)
     if not missing_tools("host"):
         with Board(tmp_path / "out") as board:
-            np.testing.assert_allclose([board.command(row) for row in seen[:50]], expected[:50], atol=1e-5)
+            np.testing.assert_allclose(
+                [board.command(row) for row in seen[:50]], expected[:50], atol=1e-5
+            )
 
 
 def test_an_evaluation_has_the_returns_of_stable_baselines3(normalized, capsys):
@@ -141,30 +168,45 @@ def test_an_evaluation_has_the_returns_of_stable_baselines3(normalized, capsys):
         expected.append(total)
     line = f"evaluate {folder}/policy.zip --task {task} --agent {agent} --trust --episodes 2 --json"
     assert main([*line.split(), "--normalize", str(folder / "apart/statistics.pkl")]) == 0
-    assert json.loads(capsys.readouterr().out)["returns"]["mean"] == pytest.approx(np.mean(expected), rel=1e-6)
+    assert json.loads(capsys.readouterr().out)["returns"]["mean"] == pytest.approx(
+        np.mean(expected), rel=1e-6
+    )
     policy = load_sb3_zip(folder / "policy.zip", agent, True, folder / "apart/statistics.pkl")
-    assert evaluate(policy, EnvConfig(task), 2).returns.mean == pytest.approx(np.mean(expected), rel=1e-6)
+    assert evaluate(policy, EnvConfig(task), 2).returns.mean == pytest.approx(
+        np.mean(expected), rel=1e-6
+    )
 
 
 def test_half_a_policy_is_refused(half, tmp_path, capsys):
     for verb in ("evaluate", "export"):
         assert main([verb, str(half / "policy.zip"), *ZIP]) == 2
         said = capsys.readouterr().err
-        assert "half of a policy that was trained behind VecNormalize: its last observations were normalized" in said
+        assert (
+            "half of a policy that was trained behind VecNormalize: its last observations were"
+            " normalized" in said
+        )
         assert "--normalize FILE.pkl, or say --normalize none" in said
     assert not list(tmp_path.iterdir())
     raw = load_sb3_zip(half / "policy.zip", "ppo", True, "none")
-    expected = stable_baselines3.PPO.load(half / "policy.zip").predict(np.ones((1, 3)), deterministic=True)[0]
+    expected = stable_baselines3.PPO.load(half / "policy.zip").predict(
+        np.ones((1, 3)), deterministic=True
+    )[0]
     np.testing.assert_array_equal(raw.predict(np.ones((1, 3)), deterministic=True)[0], expected)
 
 
-@pytest.mark.parametrize("place", ["statistics.pkl", "CartPole-v0/vecnormalize.pkl"])  # the second: rl-zoo3's
+@pytest.mark.parametrize(
+    "place", ["statistics.pkl", "CartPole-v0/vecnormalize.pkl"]
+)  # the second: rl-zoo3's
 def test_statistics_beside_a_zip_are_asked_for(tmp_path, place):
     model, _ = saved(tmp_path, "ppo", "cartpole", normalized=False)
-    assert load_sb3_zip(tmp_path / "policy.zip", "ppo", True) is not None  # nothing hints at statistics
+    assert (
+        load_sb3_zip(tmp_path / "policy.zip", "ppo", True) is not None
+    )  # nothing hints at statistics
     (tmp_path / place).parent.mkdir(exist_ok=True)
     (tmp_path / place).write_bytes(b"")
-    with pytest.raises(ValueError, match=rf"half of a policy.*{place} may have its statistics.*--normalize none"):
+    with pytest.raises(
+        ValueError, match=rf"half of a policy.*{place} may have its statistics.*--normalize none"
+    ):
         load_sb3_zip(tmp_path / "policy.zip", "ppo", True)
     assert load_sb3_zip(tmp_path / "policy.zip", "ppo", True, "none") is not None
     assert model.num_timesteps > 0
@@ -178,7 +220,9 @@ def test_a_zip_that_says_nothing_is_warned_of(tmp_path):
 
 def test_normalized_observations_in_a_zip_give_it_away(tmp_path):
     model, _ = saved(tmp_path, "dqn", "cartpole", normalized=False)
-    model._last_obs = model._last_obs + np.float32([0.0, 0.0, 1.0, 0.0])  # a pole at more than its 24 degrees
+    model._last_obs = model._last_obs + np.float32(
+        [0.0, 0.0, 1.0, 0.0]
+    )  # a pole at more than its 24 degrees
     model.save(tmp_path / "policy.zip")
     with pytest.raises(ValueError, match="lie outside of its observation space"):
         load_sb3_zip(tmp_path / "policy.zip", "dqn", True)
@@ -197,7 +241,9 @@ def test_files_that_are_no_statistics_of_the_policy_are_refused(half, tmp_path):
         "none.pkl": "no such file; name what VecNormalize.save wrote",
         "text.pkl": "must be a file that VecNormalize.save wrote",
         "list.pkl": "holds a list: must be a file that VecNormalize.save wrote",
-        "cartpole.pkl": r"the policy observes Box.*\(3,\).*: name the file that was saved with the policy",
+        "cartpole.pkl": (
+            r"the policy observes Box.*\(3,\).*: name the file that was saved with the policy"
+        ),
     }.items():
         with pytest.raises((ValueError, FileNotFoundError), match=says):
             load_sb3_zip(half / "policy.zip", "ppo", True, tmp_path / name)
@@ -232,24 +278,48 @@ def test_volts_are_not_exported_as_torques(volts, tmp_path, capsys):
         assert main(verb) == 2
         said = capsys.readouterr().err
         assert "action_space: the policy was trained with Box(-12.0, 12.0, (1,), float32)" in said
-        assert "pendulum as it is set has Box(-2.0, 2.0, (1,), float32): set what it was trained with" in said
+        assert (
+            "pendulum as it is set has Box(-2.0, 2.0, (1,), float32): set what it was trained with"
+            in said
+        )
         assert "--env.action" in said
-    assert main(["export", path, *ZIP, "--env.action", "voltage"]) == 2  # of the task's own motor, which has others
+    assert (
+        main(["export", path, *ZIP, "--env.action", "voltage"]) == 2
+    )  # of the task's own motor, which has others
     assert "Box(-12.0, 12.0, (1,), float32)" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-    assert main(["export", path, *ZIP, "--env.action", "voltage", "--actuator", motor, "--out", "out"]) == 0
+    assert (
+        main(["export", path, *ZIP, "--env.action", "voltage", "--actuator", motor, "--out", "out"])
+        == 0
+    )
     assert "no current loop: this policy commands a voltage" in capsys.readouterr().out
     (acts,) = Contract.read(tmp_path / "out").actions
     assert (acts["unit"], acts["least"], acts["most"]) == ("V", -12.0, 12.0)
     with pytest.raises(ValueError, match=r"Box\(-12\.0, 12\.0.*has Box\(-2\.0, 2\.0"):
-        export(load_sb3_zip(volts / "policy.zip", "ppo", True), EnvConfig("pendulum"), "ppo", tmp_path / "other")
+        export(
+            load_sb3_zip(volts / "policy.zip", "ppo", True),
+            EnvConfig("pendulum"),
+            "ppo",
+            tmp_path / "other",
+        )
 
 
 @pytest.mark.filterwarnings("default::UserWarning")
 def test_another_motor_in_an_evaluation_is_warned_of(volts, capsys):
-    line = ["evaluate", str(volts / "policy.zip"), *ZIP, "--episodes", "1", "--env.action", "voltage"]
+    line = [
+        "evaluate",
+        str(volts / "policy.zip"),
+        *ZIP,
+        "--episodes",
+        "1",
+        "--env.action",
+        "voltage",
+    ]
     assert main([*line, "--actuator", "paper", "--actuator.controller.max-voltage", "6"]) == 0
-    assert "warning: action_space: the policy was trained with Box(-12.0, 12.0" in capsys.readouterr().err
+    assert (
+        "warning: action_space: the policy was trained with Box(-12.0, 12.0"
+        in capsys.readouterr().err
+    )
     assert main([*line, "--actuator", str(volts / "apart/motor.yaml")]) == 0
     assert "warning" not in capsys.readouterr().err
 
@@ -257,24 +327,46 @@ def test_another_motor_in_an_evaluation_is_warned_of(volts, capsys):
 def test_other_observations_are_refused(tmp_path, capsys):
     envs = VecFrameStack(codrl_mj.make_sb3_vec_env(TASK_IDS["pendulum"], 1), 4)
     model_of("ppo", envs).save(tmp_path / "stacked.zip")
-    envs = codrl_mj.make_sb3_vec_env(TASK_IDS["pendulum"], 1, actuator="paper", observe_actuator=True)
+    envs = codrl_mj.make_sb3_vec_env(
+        TASK_IDS["pendulum"], 1, actuator="paper", observe_actuator=True
+    )
     model_of("ppo", envs).save(tmp_path / "current.zip")
     assert main(["export", "stacked.zip", *ZIP]) == 2
-    assert "(4 times as many: stacked frames, as of VecFrameStack, are not supported)" in capsys.readouterr().err
+    assert (
+        "(4 times as many: stacked frames, as of VecFrameStack, are not supported)"
+        in capsys.readouterr().err
+    )
     assert main(["export", "current.zip", *ZIP]) == 2
     assert "observation_space: the policy was trained with" in capsys.readouterr().err
-    line = ["export", "current.zip", *ZIP, "--episodes", "1", "--actuator", "paper", "--env.observe-actuator"]
+    line = [
+        "export",
+        "current.zip",
+        *ZIP,
+        "--episodes",
+        "1",
+        "--actuator",
+        "paper",
+        "--env.observe-actuator",
+    ]
     assert main(line) == 0
-    assert [one["unit"] for one in Contract.read(tmp_path / "exported").observations][3:] == ["A", "A"]
+    assert [one["unit"] for one in Contract.read(tmp_path / "exported").observations][3:] == [
+        "A",
+        "A",
+    ]
 
 
 def test_a_run_is_exported_as_it_was_trained(tmp_path, capsys):
-    tiny = "--num-envs 1 --agent.rollout-steps 64 --agent.batch-size 64 --agent.epochs 1 --agent.hidden 8"
+    tiny = (
+        "--num-envs 1 --agent.rollout-steps 64 --agent.batch-size 64 --agent.epochs 1"
+        " --agent.hidden 8"
+    )
     line = f"train pendulum --agent ppo --total-steps 64 {tiny} --actuator weaker --out run"
     assert main(line.split()) == 0
     for flags, names in {"--actuator ideal": "actuator", "--env.action voltage": "action"}.items():
         assert main(["export", "run", *flags.split()]) == 2
-        assert f"{names}: run says what it was trained in" in capsys.readouterr().err.replace("actuator.controller", "")
+        assert f"{names}: run says what it was trained in" in capsys.readouterr().err.replace(
+            "actuator.controller", ""
+        )
     assert main(["export", "run", "--episodes", "1"]) == 0
     assert Contract.read(tmp_path / "exported").assumed == load_config(Path("run")).env.as_mapping()
 

@@ -20,7 +20,9 @@ commands = st.lists(st.floats(-10, 10), min_size=1, max_size=30)
 
 def _arrivals(disturbances, timestep, given_commands, limit=10.0):
     disturber = Disturber(disturbances, timestep, np.array([limit]), 1)
-    return np.array([disturber.disturbed(np.array([[command]]))[0][0, 0] for command in given_commands])
+    return np.array(
+        [disturber.disturbed(np.array([[command]]))[0][0, 0] for command in given_commands]
+    )
 
 
 @given(commands, st.floats(0.0, 0.2))
@@ -31,7 +33,9 @@ def test_a_delayed_command_is_the_interpolation_of_the_commands(values, delay):
     padded = np.concatenate([np.zeros(40), values])
     expected = np.interp(np.arange(count) - delay / timestep, steps, padded)
     arrived = _arrivals(Disturbances(command_delay=delay), timestep, values)
-    np.testing.assert_allclose(arrived, expected, rtol=0, atol=1e-7)  # 1e-9 of a step is rounded to none
+    np.testing.assert_allclose(
+        arrived, expected, rtol=0, atol=1e-7
+    )  # 1e-9 of a step is rounded to none
 
 
 @pytest.mark.parametrize("delay", [0.02, 0.06, 0.3])
@@ -46,7 +50,9 @@ def test_whole_steps_shift_without_rounding(delay):
 @pytest.mark.parametrize("actuator", ["ideal", "paper"])
 def test_a_delayed_environment_is_one_that_is_told_everything_later(physics, actuator):
     arguments = {"physics": physics, "actuator": actuator}
-    delayed = gymnasium.make("codrl_mj/Pendulum-v0", disturbances={"command_delay": 0.1}, **arguments)
+    delayed = gymnasium.make(
+        "codrl_mj/Pendulum-v0", disturbances={"command_delay": 0.1}, **arguments
+    )
     plain = gymnasium.make("codrl_mj/Pendulum-v0", **arguments)
     delayed.reset(seed=0)
     plain.reset(seed=0)
@@ -74,7 +80,9 @@ def test_a_late_position_is_held_where_the_episode_starts(physics, more):
     """As in an environment without delay that is asked to stay there first; again after a second reset elsewhere."""
     arguments = {"actuator": SERVO, "action": "position", "timestep": 0.01}
     if physics == "batch":
-        make = functools.partial(gymnasium.make_vec, num_envs=2, vectorization_mode="vector_entry_point")
+        make = functools.partial(
+            gymnasium.make_vec, num_envs=2, vectorization_mode="vector_entry_point"
+        )
     else:
         make, arguments = gymnasium.make, {"physics": physics, **arguments}
     late = make("codrl_mj/Pendulum-v0", disturbances={"command_delay": 0.1, **more}, **arguments)
@@ -87,21 +95,34 @@ def test_a_late_position_is_held_where_the_episode_starts(physics, more):
         for action, earlier in zip(rows[2:], rows, strict=False):
             shape = late.action_space.shape
             ours, theirs = late.step(action.reshape(shape)), plain.step(earlier.reshape(shape))
-            np.testing.assert_allclose(late.unwrapped.state, plain.unwrapped.state, rtol=0, atol=2e-6)
+            np.testing.assert_allclose(
+                late.unwrapped.state, plain.unwrapped.state, rtol=0, atol=2e-6
+            )
             np.testing.assert_allclose(ours[4]["current"], theirs[4]["current"], rtol=0, atol=2e-4)
 
 
 def test_a_late_velocity_is_zero_before():
-    servo = dataclasses.replace(SERVO, loop=ServoLoop("velocity", servo_rate=100.0, velocity_gain=3.0))
+    servo = dataclasses.replace(
+        SERVO, loop=ServoLoop("velocity", servo_rate=100.0, velocity_gain=3.0)
+    )
     env = gymnasium.make(
-        "codrl_mj/Pendulum-v0", actuator=servo, action="velocity", timestep=0.01, disturbances={"command_delay": 0.1}
+        "codrl_mj/Pendulum-v0",
+        actuator=servo,
+        action="velocity",
+        timestep=0.01,
+        disturbances={"command_delay": 0.1},
     )
     env.reset(seed=4)
     assert (env.unwrapped.physics.memory == 0.0).all()
 
 
 def test_a_snapshot_keeps_the_positions_on_their_way():
-    arguments = {"actuator": SERVO, "action": "position", "timestep": 0.01, "disturbances": {"command_delay": 0.1}}
+    arguments = {
+        "actuator": SERVO,
+        "action": "position",
+        "timestep": 0.01,
+        "disturbances": {"command_delay": 0.1},
+    }
     env, other = (gymnasium.make("codrl_mj/Pendulum-v0", **arguments).unwrapped for _ in range(2))
     env.reset(seed=4)
     other.reset(seed=5)
@@ -115,7 +136,10 @@ def test_a_snapshot_keeps_the_positions_on_their_way():
 
 def test_the_delay_counts_integration_steps_within_an_environment_step():
     env = gymnasium.make(
-        "codrl_mj/MountainCar-v0", actuator="ideal", inner_steps=20, disturbances={"command_delay": 0.5}
+        "codrl_mj/MountainCar-v0",
+        actuator="ideal",
+        inner_steps=20,
+        disturbances={"command_delay": 0.5},
     )
     half = gymnasium.make("codrl_mj/MountainCar-v0", actuator="ideal", inner_steps=20)
     env.reset(seed=1)
@@ -142,7 +166,9 @@ def test_a_quantised_command_is_the_nearest_multiple_within_the_limit(command, q
 
 
 def test_half_way_goes_to_the_even_multiple():
-    np.testing.assert_array_equal(quantised(np.array([0.25, 0.75, -0.25, 1.25]), 0.5, 9.0), [0.0, 1.0, 0.0, 1.0])
+    np.testing.assert_array_equal(
+        quantised(np.array([0.25, 0.75, -0.25, 1.25]), 0.5, 9.0), [0.0, 1.0, 0.0, 1.0]
+    )
 
 
 @given(commands, st.floats(1e-3, 5))
@@ -159,7 +185,11 @@ def test_a_rate_limited_command_moves_towards_its_target_and_never_faster(values
 
 
 def test_delay_comes_before_the_quantiser_and_the_quantiser_before_the_rate_limit():
-    arrived = _arrivals(Disturbances(command_delay=0.01, command_quantum=1.0, command_rate=30.0), 0.02, [1.4, 1.4, 4.0])
+    arrived = _arrivals(
+        Disturbances(command_delay=0.01, command_quantum=1.0, command_rate=30.0),
+        0.02,
+        [1.4, 1.4, 4.0],
+    )
     # interpolated: 0.7, 1.4, 2.7; quantised: 1, 1, 3; at most 0.6 a step
     np.testing.assert_allclose(arrived, [0.6, 1.0, 1.6], rtol=1e-12)
 

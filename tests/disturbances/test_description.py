@@ -10,7 +10,9 @@ import codrl_mj
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve
 from tests.disturbances.everything import MOST, RUBBED
 
-FIELDS = [(kind, field.name) for kind in (Disturbances, Joint) for field in dataclasses.fields(kind)]
+FIELDS = [
+    (kind, field.name) for kind in (Disturbances, Joint) for field in dataclasses.fields(kind)
+]
 
 
 def test_everything_is_off_by_default_and_public():
@@ -24,15 +26,23 @@ def test_everything_is_off_by_default_and_public():
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "1", None, True, -1.0])
 @pytest.mark.parametrize(("kind", "field"), FIELDS)
 def test_a_bad_value_is_refused_by_name(kind, field, value):
-    with pytest.raises(ValueError, match=rf"{kind.__name__}\.{field} = .*: must be a finite number >= 0"):
+    with pytest.raises(
+        ValueError, match=rf"{kind.__name__}\.{field} = .*: must be a finite number >= 0"
+    ):
         kind(**{field: value})
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"pulse_force": 1.0, "pulse_interval": 1.0}, "pulse_duration = 0: must be a finite number > 0 where there"),
-        ({"pulse_force": 1.0, "pulse_duration": 1.0}, "pulse_interval = 0: must be a finite number > 0"),
+        (
+            {"pulse_force": 1.0, "pulse_interval": 1.0},
+            "pulse_duration = 0: must be a finite number > 0 where there",
+        ),
+        (
+            {"pulse_force": 1.0, "pulse_duration": 1.0},
+            "pulse_interval = 0: must be a finite number > 0",
+        ),
         ({"pulse_duration": 2.0}, "pulse_duration = 2: there are no pulses"),
     ],
 )
@@ -41,17 +51,25 @@ def test_pulses_need_a_duration_and_an_interval_and_these_need_pulses(fields, me
         Disturbances(**fields)
 
 
-@pytest.mark.parametrize(("kind", "off", "given"), [(Disturbances, OFF, MOST), (Joint, PLAIN, RUBBED)])
+@pytest.mark.parametrize(
+    ("kind", "off", "given"), [(Disturbances, OFF, MOST), (Joint, PLAIN, RUBBED)]
+)
 def test_a_mapping_is_as_good(kind, off, given):
     full = kind(**given)
-    assert resolve(given, off) == resolve(full, off) == resolve(dataclasses.asdict(full), off) == full
+    assert (
+        resolve(given, off) == resolve(full, off) == resolve(dataclasses.asdict(full), off) == full
+    )
     assert resolve(None, off) == off
 
 
 @pytest.mark.parametrize(
     ("given", "off", "message"),
     [
-        ({"comand_delay": 1}, OFF, "unknown field disturbances.comand_delay; did you mean disturbances.command_delay?"),
+        (
+            {"comand_delay": 1},
+            OFF,
+            "unknown field disturbances.comand_delay; did you mean disturbances.command_delay?",
+        ),
         ({"frictoin": 1}, PLAIN, "unknown field joint.frictoin; did you mean joint.friction?"),
         (3, OFF, "'disturbances' = 3: must be a mapping of Disturbances's fields"),
         (3, PLAIN, "'joint' = 3: must be a mapping of Joint's fields"),
@@ -65,12 +83,17 @@ def test_what_is_no_description_is_refused(given, off, message):
 @pytest.mark.parametrize("make", [gymnasium.make, codrl_mj.make, codrl_mj.make_vec])
 def test_a_delay_in_milliseconds_is_refused_where_no_command_would_arrive(make):
     env = "codrl_mj/Pendulum-v0" if make is gymnasium.make else "pendulum"
-    with pytest.raises(ValueError, match=r"command_delay = 20: must be < 10 s, .*for 20 ms write 0\.02"):
+    with pytest.raises(
+        ValueError, match=r"command_delay = 20: must be < 10 s, .*for 20 ms write 0\.02"
+    ):
         make(env, actuator="ideal", disturbances={"command_delay": 20})
 
 
 @pytest.mark.filterwarnings("default::UserWarning")
 def test_a_delay_of_many_steps_is_warned_of():
     for env in ("pendulum", "HalfCheetah-v5"):
-        with pytest.warns(UserWarning, match=r"command_delay = 5: a delay of 100 environment steps; .* write 0\.005"):
+        with pytest.warns(
+            UserWarning,
+            match=r"command_delay = 5: a delay of 100 environment steps; .* write 0\.005",
+        ):
             codrl_mj.make(env, "ideal", disturbances={"command_delay": 5})

@@ -24,7 +24,9 @@ two_tasks = pytest.mark.parametrize("task", but(["pendulum", "cartpole"], TASKS)
 
 def _env(task, **arguments):
     """An environment in its first episode."""
-    env = gymnasium.make(TASKS[task].env_id, disable_env_checker=True, **{"actuator": WEAK} | arguments).unwrapped
+    env = gymnasium.make(
+        TASKS[task].env_id, disable_env_checker=True, **{"actuator": WEAK} | arguments
+    ).unwrapped
     env.reset(seed=1)
     return env
 
@@ -41,7 +43,11 @@ def test_each_alone_changes_what_happens(what):
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
 @two_tasks
 def test_off_is_bit_for_bit_as_without(task, physics):
-    off = {**WEAK, "controller": {**WEAK["controller"], "current_noise": 0.0, "current_bias": 0.0}, "supply": {}}
+    off = {
+        **WEAK,
+        "controller": {**WEAK["controller"], "current_noise": 0.0, "current_bias": 0.0},
+        "supply": {},
+    }
     env = _env(task, disturbances={}, joint={}, actuator=off, physics=physics)
     # the episodes after the first, too: nothing was drawn for a key in between
     assert_same(run(env, 60, seed=0), run(_env(task, physics=physics), 60, seed=0))

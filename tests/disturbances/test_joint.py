@@ -15,7 +15,9 @@ START = np.array([2.0, 1.0])
 
 
 def _pendulum(inner_steps, torque, **joint):
-    physics = MujocoPhysics(Plant(TASKS["pendulum"], [IDEAL], inner_steps, "semi-implicit", joint=Joint(**joint)))
+    physics = MujocoPhysics(
+        Plant(TASKS["pendulum"], [IDEAL], inner_steps, "semi-implicit", joint=Joint(**joint))
+    )
     physics.reset(START)
     for _ in range(10):
         physics.step(torque)
@@ -36,7 +38,9 @@ def _solved(torque, damping=0.0, friction=0.0):
 
 def test_damping_is_a_torque_against_the_speed():
     expected = _solved(0.5, damping=0.4)
-    coarse, fine = (np.abs(_pendulum(steps, 0.5, damping=0.4) - expected).max() for steps in (250, 500))
+    coarse, fine = (
+        np.abs(_pendulum(steps, 0.5, damping=0.4) - expected).max() for steps in (250, 500)
+    )
     assert fine < 1e-3
     assert coarse / fine == pytest.approx(2.0, rel=0.1)  # of first order, as the integrator is
     assert np.abs(_solved(0.5) - expected).max() > 0.1
@@ -50,7 +54,9 @@ def test_friction_is_a_constant_torque_against_the_motion():
 
 @pytest.mark.parametrize(("torque", "sticks"), [(0.9, True), (-0.9, True), (1.4, False)])
 def test_friction_holds_what_does_not_exceed_it(torque, sticks):
-    physics = MujocoPhysics(Plant(TASKS["pendulum"], [IDEAL], 10, "semi-implicit", joint=Joint(friction=1.0)))
+    physics = MujocoPhysics(
+        Plant(TASKS["pendulum"], [IDEAL], 10, "semi-implicit", joint=Joint(friction=1.0))
+    )
     physics.reset(np.array([np.pi, 0.0]))
     for _ in range(40):
         physics.step(torque)
@@ -77,7 +83,9 @@ def test_the_solver_is_off_without_friction_and_starts_from_nothing_with_it():
 def test_the_explicit_integrator_stays_explicit():
     """CartPole: positions move by the old velocity, and damping is that of the old velocity: a force like any other."""
     damping, cartpole = 2.0, TASKS["cartpole"]
-    damped = MujocoPhysics(Plant(cartpole, [IDEAL], 1, "euler", np.array([1e6]), joint=Joint(damping=damping)))
+    damped = MujocoPhysics(
+        Plant(cartpole, [IDEAL], 1, "euler", np.array([1e6]), joint=Joint(damping=damping))
+    )
     plain = MujocoPhysics(Plant(cartpole, [IDEAL], 1, "euler", np.array([1e6])))
     generator = np.random.default_rng(0)
     for _ in range(50):
@@ -87,7 +95,9 @@ def test_the_explicit_integrator_stays_explicit():
         damped.step(force)
         plain.step(force - damping * state[1])
         np.testing.assert_allclose(damped.state, plain.state, rtol=1e-12, atol=1e-12)
-    rubbed = MujocoPhysics(Plant(cartpole, [IDEAL], 1, "euler", joint=Joint(damping=1.0, friction=1.0)))
+    rubbed = MujocoPhysics(
+        Plant(cartpole, [IDEAL], 1, "euler", joint=Joint(damping=1.0, friction=1.0))
+    )
     rubbed.reset(state)
     rubbed.step(3.0)
     np.testing.assert_array_equal(rubbed.state[[0, 2]], state[[0, 2]] + 0.02 * state[[1, 3]])
@@ -96,7 +106,9 @@ def test_the_explicit_integrator_stays_explicit():
 def test_armature_is_an_inertia_of_the_joint():
     """From rest the pendulum turns by tau/(m l^2/3 + I) for a step of semi-implicit Euler, whatever gravity adds."""
     rotor, torque = 0.25, 1.5
-    physics = MujocoPhysics(Plant(TASKS["pendulum"], [IDEAL], 4, "semi-implicit", joint=Joint(armature=rotor)))
+    physics = MujocoPhysics(
+        Plant(TASKS["pendulum"], [IDEAL], 4, "semi-implicit", joint=Joint(armature=rotor))
+    )
     physics.reset(np.zeros(2))
     physics.step(torque)
     timestep, speed, angle = 0.05 / 4, 0.0, 0.0

@@ -59,7 +59,9 @@ def test_the_impulse_does_not_depend_on_the_integration_step():
 
 
 def test_a_lone_pulse_is_a_force_times_its_duration():
-    disturber = Disturber(Disturbances(pulse_force=3.0, pulse_duration=0.07, pulse_interval=40.0), 0.02, np.ones(1), 1)
+    disturber = Disturber(
+        Disturbances(pulse_force=3.0, pulse_duration=0.07, pulse_interval=40.0), 0.02, np.ones(1), 1
+    )
     disturber.reset(np.zeros(1, np.int64), 5.0)
     loads = np.array([disturber.disturbed(np.zeros((1, 1)))[1][0, 0] for _ in range(4000)])
     (first,) = np.flatnonzero(np.diff((loads != 0).astype(int)) == 1)[:1]
@@ -67,13 +69,17 @@ def test_a_lone_pulse_is_a_force_times_its_duration():
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
-@pytest.mark.parametrize("task", ["Pendulum", "CartPole", "Acrobot", "MountainCar", "MountainCarContinuous"])
+@pytest.mark.parametrize(
+    "task", ["Pendulum", "CartPole", "Acrobot", "MountainCar", "MountainCarContinuous"]
+)
 def test_a_pulse_that_never_ends_is_a_force_like_the_actuators(task, physics):
     force = {"Pendulum": 1.5, "CartPole": 10.0, "Acrobot": 1.0}.get(task, 0.5)
     endless = {"pulse_force": force, "pulse_duration": 1e9, "pulse_interval": 1e-12}
 
     def run(actual, disturbances=None):
-        env = gymnasium.make(f"codrl_mj/{task}-v0", actuator="ideal", physics=physics, disturbances=disturbances)
+        env = gymnasium.make(
+            f"codrl_mj/{task}-v0", actuator="ideal", physics=physics, disturbances=disturbances
+        )
         env.reset(seed=3)
         for _ in range(10):
             env.unwrapped.physics.step(actual)

@@ -14,7 +14,10 @@ from tests.engine.models import VOLTAGE
 
 def _still(**controller):
     """A motor without back-EMF under a proportional loop, with whatever else its controller has."""
-    return {"motor": {"back_emf_constant": 0.0}, "controller": {"kp": 1.0, "max_voltage": float("inf"), **controller}}
+    return {
+        "motor": {"back_emf_constant": 0.0},
+        "controller": {"kp": 1.0, "max_voltage": float("inf"), **controller},
+    }
 
 
 @pytest.mark.parametrize(
@@ -67,7 +70,9 @@ def test_the_controller_of_every_environment_has_its_own_white_noise():
 
 @pytest.mark.parametrize("task", ["Pendulum", "Acrobot"])
 def test_the_noise_of_a_tick_is_the_same_for_whoever_computes_it(task):
-    env = gymnasium.make(f"codrl_mj/{task}-v0", actuator={"controller": {"current_noise": 0.5}}).unwrapped
+    env = gymnasium.make(
+        f"codrl_mj/{task}-v0", actuator={"controller": {"current_noise": 0.5}}
+    ).unwrapped
     env.reset(seed=4)
     env.action_space.seed(0)
     env.step(env.action_space.sample())
@@ -93,7 +98,9 @@ def test_the_noise_of_a_tick_is_the_same_for_whoever_computes_it(task):
 
 def test_episodes_and_seeds_have_their_own_noise_and_seeds_repeat():
     def voltages(*seeds):
-        env = gymnasium.make("codrl_mj/Pendulum-v0", actuator={"controller": {"current_noise": 0.5}})
+        env = gymnasium.make(
+            "codrl_mj/Pendulum-v0", actuator={"controller": {"current_noise": 0.5}}
+        )
         found = []
         for seed in seeds:
             env.reset(seed=seed)
@@ -113,7 +120,9 @@ def test_a_bias_shifts_the_steady_current_by_the_closed_form(physics):
     start = env.reset(seed=0)[0]
     for _ in range(60):
         observation, *_, info = env.step(np.array([1.5], np.float32))
-    assert info["current"] == pytest.approx(kp * (1.5 - bias) / (1.0 + kp), rel=1e-9)  # kp*(i_ref - i - b) = R*i
+    assert info["current"] == pytest.approx(
+        kp * (1.5 - bias) / (1.0 + kp), rel=1e-9
+    )  # kp*(i_ref - i - b) = R*i
     assert start[-2] == np.float32(bias)
     assert observation[-2] == pytest.approx(info["current"] + bias, rel=1e-6)
 
@@ -122,7 +131,9 @@ def test_a_bias_shifts_the_steady_current_by_the_closed_form(physics):
     env.reset(seed=0)
     for _ in range(150):
         info = env.step(np.array([1.5], np.float32))[4]
-    assert info["current"] == pytest.approx(1.5 - bias, rel=1e-9)  # the integral makes the *measured* current right
+    assert info["current"] == pytest.approx(
+        1.5 - bias, rel=1e-9
+    )  # the integral makes the *measured* current right
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])

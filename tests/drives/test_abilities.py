@@ -10,7 +10,15 @@ import pytest
 import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, Ideal, SampledLoop, Supply
 from codrl_mj.catalogue import motor_entry, motor_names
-from codrl_mj.drives import abilities, catalogue_rows, explain, find_drive, find_entry, respond, torque_limits
+from codrl_mj.drives import (
+    abilities,
+    catalogue_rows,
+    explain,
+    find_drive,
+    find_entry,
+    respond,
+    torque_limits,
+)
 
 
 @pytest.mark.parametrize("name", motor_names())
@@ -21,7 +29,9 @@ def test_stall_and_no_load_are_what_the_datasheet_prints(name):
     for field, ours in (("stall_torque", can.stall_torque), ("no_load_speed", can.no_load_speed)):
         if field in printed:
             at_motor = printed[field].shaft == "motor"
-            seen = printed[field].value * (ratio if field == "stall_torque" else 1 / ratio) ** at_motor
+            seen = (
+                printed[field].value * (ratio if field == "stall_torque" else 1 / ratio) ** at_motor
+            )
             assert ours == pytest.approx(seen, rel=entry.tolerance), field
 
 
@@ -45,7 +55,11 @@ def test_the_limits_are_where_the_drive_ends_up(most, sag):
 
 
 def test_the_gear_takes_its_share_of_the_motor_s_torque_and_friction_of_what_is_left():
-    drive = Drive(GearMotor(gear_ratio=10.0, gear_efficiency=0.8, coulomb_friction=2e-3, viscous_friction=1e-5))
+    drive = Drive(
+        GearMotor(
+            gear_ratio=10.0, gear_efficiency=0.8, coulomb_friction=2e-3, viscous_friction=1e-5
+        )
+    )
     low, high = torque_limits(drive, [-20.0, 0.0, 20.0], 0.1)
     motor, friction = 0.042 * 0.1, 2e-3 + 1e-5 * 200.0
     expected = [motor / 0.8 + friction, 0.8 * motor - 2e-3, 0.8 * motor - friction]
@@ -53,7 +67,9 @@ def test_the_gear_takes_its_share_of_the_motor_s_torque_and_friction_of_what_is_
     np.testing.assert_allclose(low, -high[::-1], rtol=1e-12)
 
 
-LOSSY = GearMotor(gear_ratio=20.0, gear_efficiency=0.7, coulomb_friction=3e-3, viscous_friction=4e-6)
+LOSSY = GearMotor(
+    gear_ratio=20.0, gear_efficiency=0.7, coulomb_friction=3e-3, viscous_friction=4e-6
+)
 
 
 def hinge(drive, inertia):
@@ -116,8 +132,14 @@ def test_what_a_largest_current_leaves_of_torque_and_power():
     ("drive", "said"),
     [
         (Drive(GearMotor(), SampledLoop(max_current=3.0), Supply(5.0)), ""),
-        (Drive(GearMotor(), SampledLoop(max_current=3.0)), "assumed, for none is given: supply.voltage = 24 V"),
-        (Drive(GearMotor(rotor_inertia=0.0), SampledLoop(), Supply(5.0)), "max_current = inf, motor.rotor_inertia = 0"),
+        (
+            Drive(GearMotor(), SampledLoop(max_current=3.0)),
+            "assumed, for none is given: supply.voltage = 24 V",
+        ),
+        (
+            Drive(GearMotor(rotor_inertia=0.0), SampledLoop(), Supply(5.0)),
+            "max_current = inf, motor.rotor_inertia = 0",
+        ),
         (Ideal(), ""),
     ],
 )
@@ -152,10 +174,19 @@ def test_flags_are_set_over_the_named_drive(tmp_path):
     ("arguments", "message"),
     [
         (("maxon-ec45-flat-50",), "did you mean 'maxon-ec45-flat-50w'"),
-        (("ideal",), "motor = 'ideal': no motor behind a drive, but the actuator family ideal; name a motor of the"),
+        (
+            ("ideal",),
+            (
+                "motor = 'ideal': no motor behind a drive, but the actuator family ideal; name a"
+                " motor of the"
+            ),
+        ),
         (("current_loop",), "no motor behind a drive, but the actuator family current_loop"),
         (("rev-neo", 0.0), r"GearMotor\.gear_ratio = 0\.0: must be a finite number > 0"),
-        (("rev-neo", None, 10e3, 2e3), r"bandwidth = 2000: must be <= 1591\.55 Hz at sample_rate = 10000"),
+        (
+            ("rev-neo", None, 10e3, 2e3),
+            r"bandwidth = 2000: must be <= 1591\.55 Hz at sample_rate = 10000",
+        ),
         (("rev-neo", None, None, None, -1.0), r"Supply\.voltage = -1\.0: must be"),
     ],
 )
@@ -167,13 +198,19 @@ def test_bad_input_is_refused(arguments, message):
 def test_the_catalogue_in_rows_is_sorted_with_what_is_not_known_last():
     rows = catalogue_rows("mechanical_time_constant")
     assert sorted(row["name"] for row in rows) == motor_names()
-    known = [row["mechanical_time_constant"] for row in rows if row["mechanical_time_constant"] is not None]
+    known = [
+        row["mechanical_time_constant"]
+        for row in rows
+        if row["mechanical_time_constant"] is not None
+    ]
     assert known == sorted(known, reverse=True)
     assert rows[-1]["mechanical_time_constant"] is None
     row = next(row for row in rows if row["name"] == "quanser-qube-servo-2")
     assert row["electrical_time_constant"] == pytest.approx(1.16e-3 / 8.4, rel=1e-12)
     assert row["mechanical_time_constant"] == pytest.approx(8.4 * 4e-6 / 0.042**2, rel=1e-12)
-    with pytest.raises(ValueError, match=r"unknown column stall_torqe; did you mean stall_torque\?"):
+    with pytest.raises(
+        ValueError, match=r"unknown column stall_torqe; did you mean stall_torque\?"
+    ):
         catalogue_rows("stall_torqe")
 
 
@@ -182,15 +219,28 @@ def test_every_number_is_explained(name):
     entry = motor_entry(name)
     found = explain(Drive.of(entry.numbers), entry)
     shown = {row["name"]: row for row in found["numbers"]}
-    fields = {field.name for field in dataclasses.fields(entry.numbers)} - {"derived", "disagreements"}
+    fields = {field.name for field in dataclasses.fields(entry.numbers)} - {
+        "derived",
+        "disagreements",
+    }
     assert shown.keys() | set(found["unknown"]) == fields
     assert shown["inductance"]["unit"] == "H"
     for field, row in shown.items():
         assert row["how"] == entry.numbers.derived[field]
-        if "printed" in row["how"] and not row["how"].endswith("is printed") and field not in entry.estimated:
+        if (
+            "printed" in row["how"]
+            and not row["how"].endswith("is printed")
+            and field not in entry.estimated
+        ):
             assert row["sources"], field
-    told = [one for one in found["disagreements"] if not one.startswith("less than 1%, by rounding: ")]
+    told = [
+        one for one in found["disagreements"] if not one.startswith("less than 1%, by rounding: ")
+    ]
     large = [one for one in entry.numbers.disagreements if abs(one.difference) >= 0.01]
-    small = ", ".join(one.quantity for one in entry.numbers.disagreements if abs(one.difference) < 0.01)
+    small = ", ".join(
+        one.quantity for one in entry.numbers.disagreements if abs(one.difference) < 0.01
+    )
     assert told == list(map(str, large))
-    assert found["disagreements"][len(told) :] == ([f"less than 1%, by rounding: {small}"] if small else [])
+    assert found["disagreements"][len(told) :] == (
+        [f"less than 1%, by rounding: {small}"] if small else []
+    )

@@ -56,7 +56,11 @@ def is_png(path):
 def test_list_has_every_motor(capsys):
     text = printed(capsys, "list", "--sort", "stall_torque")
     assert max(map(len, map(str.rstrip, text.splitlines()[:-1]))) <= 80
-    first = [line.split()[0] for line in text.splitlines()[5:] if line.split()[:1] and line.split()[0] in motor_names()]
+    first = [
+        line.split()[0]
+        for line in text.splitlines()[5:]
+        if line.split()[:1] and line.split()[0] in motor_names()
+    ]
     assert sorted(first) == motor_names()
     assert first[0] == "heinzmann-pmg-132"
     assert "mN·m/A" in text
@@ -69,7 +73,9 @@ def test_list_has_every_motor(capsys):
 
 
 def test_show_says_where_every_number_is_from(capsys):
-    text = " ".join(printed(capsys, "show", "pololu-37d-30", "--gear-ratio", "50", "--out", "pictures").split())
+    text = " ".join(
+        printed(capsys, "show", "pololu-37d-30", "--gear-ratio", "50", "--out", "pictures").split()
+    )
     for part in (
         "Pololu 37D",
         "nominal_voltage / stall_current",
@@ -85,7 +91,9 @@ def test_show_says_where_every_number_is_from(capsys):
     content = read(capsys, "show", "rev-neo", "--voltage", "24")
     assert any("torque_constant" in one for one in content["disagreements"])
     assert {"name": "supply.voltage", "value": 24.0, "unit": "V"} in content["drive"]
-    assert {row["name"]: row["value"] for row in content["abilities"]}["mechanical_time_constant"] is None
+    assert {row["name"]: row["value"] for row in content["abilities"]}[
+        "mechanical_time_constant"
+    ] is None
 
 
 def test_show_takes_a_datasheet_of_one_s_own_and_any_drive(capsys):
@@ -100,7 +108,9 @@ def test_show_takes_a_datasheet_of_one_s_own_and_any_drive(capsys):
     )
     assert sorted(parts, key=text.index) == list(parts)
     found = read(capsys, "show", "own.toml")
-    assert {row["name"]: row["value"] for row in found["abilities"]}["stall_torque"] == pytest.approx(0.12)
+    assert {row["name"]: row["value"] for row in found["abilities"]}[
+        "stall_torque"
+    ] == pytest.approx(0.12)
     assert "numbers" not in read(capsys, "show", "codrl_mj.actuators:Drive")
 
 
@@ -129,7 +139,15 @@ def test_a_file_is_written_filled_in_and_shown(capsys):
 
 def test_design_prints_the_gains_and_the_margins(capsys):
     printed(capsys, "design", "quanser-qube-servo-2", "--bandwidth", "1500")
-    arguments = ("design", "quanser-qube-servo-2", "--bandwidth", "2000", "--delayed", "--out", "pictures")
+    arguments = (
+        "design",
+        "quanser-qube-servo-2",
+        "--bandwidth",
+        "2000",
+        "--delayed",
+        "--out",
+        "pictures",
+    )
     text = printed(capsys, *arguments)
     assert "20000 Hz, a sample of delay: kp = 8.98171 V/A, ki = 78374 V/(A·s)" in text
     assert re.search(r"\*20 +1 ", text)
@@ -140,7 +158,9 @@ def test_design_prints_the_gains_and_the_margins(capsys):
     assert len(content["others"]) == 4
     assert not read(capsys, *arguments[:4], "--no-delayed")["delayed"]
     assert "a sample lasts" not in text
-    slow = " ".join(printed(capsys, "design", "quanser-qube-servo-2", "--sample-rate", "2000").split())
+    slow = " ".join(
+        printed(capsys, "design", "quanser-qube-servo-2", "--sample-rate", "2000").split()
+    )
     assert "2000 Hz: a sample lasts 3.6 times the winding's L/R = 0.138 ms" in slow
     assert "take 2,414 Hz or more" in slow
 
@@ -183,7 +203,9 @@ def test_operating_points_are_laid_over_the_diagram():
     drive, entry = find_drive("maxon-ec45-flat-50w"), find_entry("maxon-ec45-flat-50w")
     plot = torque_speed_diagram(drive, entry.numbers, points)
     curves = {curve.label: curve for curve in plot.curves}
-    np.testing.assert_array_equal(np.column_stack([curves["operating points"].x, curves["operating points"].y]), points)
+    np.testing.assert_array_equal(
+        np.column_stack([curves["operating points"].x, curves["operating points"].y]), points
+    )
     limit = curves["continuous current, 2.52 A, highest"]
     assert limit.x.max() > 800.0
     assert plot.y_most > 2.0
@@ -203,8 +225,11 @@ def test_every_verb_s_help_teaches_with_an_example(capsys, verb):
 
 def test_help_imports_no_library_that_draws_or_computes():
     program = (
-        "import sys; from codrl_mj.cli import main\ntry: main(['motor', '--help'])\nexcept SystemExit: pass\n"
-        "print([name for name in ('matplotlib', 'control', 'pint', 'scipy', 'numba', 'torch') if name in sys.modules])"
+        "import sys; from codrl_mj.cli import main\ntry: main(['motor', '--help'])\nexcept"
+        " SystemExit: pass\nprint([name for name in ('matplotlib', 'control', 'pint', 'scipy',"
+        " 'numba', 'torch') if name in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
+    )
     assert done.stdout.splitlines()[-1] == "[]"

@@ -26,7 +26,9 @@ from codrl_mj.validation import motor_loops
 MOTORS = ("quanser-qube-servo-2", "maxon-dcx22l", "heinzmann-pmg-132", "lego-ev3-large")
 every_motor = pytest.mark.parametrize("name", MOTORS)
 every_rate = pytest.mark.parametrize("rate", [10e3, 40e3])
-with_and_without_delay = pytest.mark.parametrize("delayed", [False, True], ids=["no delay", "delayed"])
+with_and_without_delay = pytest.mark.parametrize(
+    "delayed", [False, True], ids=["no delay", "delayed"]
+)
 
 
 def measured(drive, frequency, samples=400):
@@ -56,7 +58,9 @@ def test_the_design_is_that_of_the_closed_forms(name, rate, delayed):
         left = 1 - share
         angle = math.acos((1 + left**2 - 2 * share**2) / (2 * left))
         assert found.bandwidth == pytest.approx(angle / (2 * math.pi) * rate, rel=1e-6)
-        assert found.settling_time == pytest.approx(math.ceil(math.log(0.02) / math.log(left)) / rate, rel=1e-9)
+        assert found.settling_time == pytest.approx(
+            math.ceil(math.log(0.02) / math.log(left)) / rate, rel=1e-9
+        )
         assert found.overshoot < 1e-9
 
 
@@ -73,13 +77,17 @@ def test_the_simulated_loop_has_the_bandwidth_and_the_margins_that_are_computed(
     opened = closed / (1 - closed)
     assert abs(opened) == pytest.approx(1.0, rel=1e-4)
     assert math.degrees(np.angle(opened)) == pytest.approx(found.phase_margin - 180.0, abs=0.01)
-    if delayed:  # a sixth of the rate is where the phase is -180 degrees: the closed form's angle of 60
+    if (
+        delayed
+    ):  # a sixth of the rate is where the phase is -180 degrees: the closed form's angle of 60
         closed = measured(drive, drive.controller.sample_rate / 6)
         assert closed / (1 - closed) == pytest.approx(-1 / found.gain_margin, rel=1e-3)
 
 
 @with_and_without_delay
-@pytest.mark.parametrize("own", [{}, {"kp": 2.0, "ki": 9e3}, {"kp": 3.0}], ids=["designed", "given", "kp alone"])
+@pytest.mark.parametrize(
+    "own", [{}, {"kp": 2.0, "ki": 9e3}, {"kp": 3.0}], ids=["designed", "given", "kp alone"]
+)
 def test_the_simulated_step_is_python_control_s(delayed, own):
     drive = Drive(controller=SampledLoop(delayed=delayed, **own))
     response = respond(drive, np.full(200, 0.01))
@@ -93,12 +101,16 @@ def test_the_simulated_step_is_python_control_s(delayed, own):
 
 
 @with_and_without_delay
-@pytest.mark.parametrize("own", [{"kp": 9.0, "ki": 2e4}, {"kp": 2.0, "ki": 6e4}, {"bandwidth": 800.0}])
+@pytest.mark.parametrize(
+    "own", [{"kp": 9.0, "ki": 2e4}, {"kp": 2.0, "ki": 6e4}, {"bandwidth": 800.0}]
+)
 def test_the_margins_are_those_that_python_control_finds(own, delayed):
     drive = Drive(controller=SampledLoop(delayed=delayed, **own))
     gain_margin, phase_margin, gain_at, phase_at = control.margin(open_loop(drive))
     found = design(drive)
-    assert (found.phase_margin, found.crossover) == pytest.approx((phase_margin, phase_at / 2 / math.pi), rel=1e-6)
+    assert (found.phase_margin, found.crossover) == pytest.approx(
+        (phase_margin, phase_at / 2 / math.pi), rel=1e-6
+    )
     if delayed:  # without, the crossing is where it does not look
         expected = pytest.approx((gain_margin, gain_at / 2 / math.pi), rel=1e-6)
         assert (found.gain_margin, found.phase_crossover) == expected
@@ -120,9 +132,16 @@ def test_an_actuators_loop_is_the_one_that_python_control_joins(loop):
     at = np.exp(1j * np.linspace(0.01, 3.1, 40))
     np.testing.assert_allclose(closed_loop(actuator, timestep)(at), other(at), rtol=1e-9)
     response = respond(actuator, np.full(200, 0.01), timestep=timestep)
-    np.testing.assert_allclose(response.current, 0.01 * control.step_response(other, response.time)[1], atol=1e-9)
-    found, (_, phase_margin, _, phase_at) = design(actuator, timestep), control.margin(open_loop(actuator, timestep))
-    assert (found.phase_margin, found.crossover) == pytest.approx((phase_margin, phase_at / 2 / math.pi), rel=1e-6)
+    np.testing.assert_allclose(
+        response.current, 0.01 * control.step_response(other, response.time)[1], atol=1e-9
+    )
+    found, (_, phase_margin, _, phase_at) = (
+        design(actuator, timestep),
+        control.margin(open_loop(actuator, timestep)),
+    )
+    assert (found.phase_margin, found.crossover) == pytest.approx(
+        (phase_margin, phase_at / 2 / math.pi), rel=1e-6
+    )
     assert found.sample_rate == loop.substeps / timestep
 
 
@@ -150,7 +169,9 @@ def test_a_slow_loop_has_a_bandwidth_too_and_does_not_settle_within_sight():
 
 def test_an_unstable_loop_is_refused():
     for judge in (design, step):
-        with pytest.raises(ValueError, match=r"unstable: spectral radius .* Lower controller\.kp = 500"):
+        with pytest.raises(
+            ValueError, match=r"unstable: spectral radius .* Lower controller\.kp = 500"
+        ):
             judge(Drive(controller=SampledLoop(kp=500.0)))
 
 
@@ -159,14 +180,21 @@ def test_anti_windup_is_what_makes_it_come_back(name):
     """Also where the largest current is within reach at half the no-load speed: then the speed is a higher one."""
     drive = find_drive(name)
     steps = step(drive)
-    within = (drive.voltage_limit - drive.motor.back_emf_constant * steps.speed) / drive.motor.resistance
+    within = (
+        drive.voltage_limit - drive.motor.back_emf_constant * steps.speed
+    ) / drive.motor.resistance
     assert steps.unreachable == pytest.approx(1.8 * within, rel=1e-9)
     assert steps.unreachable <= drive.controller.max_current
     times = {kind: 1e3 * steps.recoveries[kind].settling_time(0.05) for kind in ANTI_WINDUPS}
     assert times["back_calculation"] <= 1.0
     assert times["clamping"] <= 4.0
     assert 15.0 < times["none"] < 60.0
-    assert steps.recoveries["back_calculation"].undershoot < 1e-3 < steps.recoveries["clamping"].undershoot < 1.0
+    assert (
+        steps.recoveries["back_calculation"].undershoot
+        < 1e-3
+        < steps.recoveries["clamping"].undershoot
+        < 1.0
+    )
     reached = steps.recoveries["none"].current[round(0.0199 * drive.controller.sample_rate)]
     assert reached == pytest.approx(within, rel=0.01)
 

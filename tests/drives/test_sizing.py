@@ -35,8 +35,16 @@ from codrl_mj.evaluation import run_episodes
 from codrl_mj.tasks import TASKS
 from tests.matrix import but
 
-PAPER = GearMotor(resistance=1.0, inductance=0.01, torque_constant=1.0, back_emf_constant=1.0, rotor_inertia=1e-9)
-MOTOR = GearMotor(resistance=2.0, inductance=1e-3, torque_constant=0.05, back_emf_constant=0.04, rotor_inertia=1e-5)
+PAPER = GearMotor(
+    resistance=1.0, inductance=0.01, torque_constant=1.0, back_emf_constant=1.0, rotor_inertia=1e-9
+)
+MOTOR = GearMotor(
+    resistance=2.0,
+    inductance=1e-3,
+    torque_constant=0.05,
+    back_emf_constant=0.04,
+    rotor_inertia=1e-5,
+)
 COOL = math.inf
 """A continuous current for which heat does not matter."""
 
@@ -60,7 +68,10 @@ def pendulum():
 
 def from_hanging(actuator, steps=400):
     """States of the scripted swing-up on an actuator, from almost hanging, shape (steps + 1, 2)."""
-    env, policy = EnvConfig("pendulum", actuator, max_episode_steps=steps).make(), Scripted(TASKS["pendulum"])
+    env, policy = (
+        EnvConfig("pendulum", actuator, max_episode_steps=steps).make(),
+        Scripted(TASKS["pendulum"]),
+    )
     env.reset(seed=0)
     env.unwrapped.physics.state = np.array([np.pi - 0.05, 0.0])
     states = [env.unwrapped.physics.state]
@@ -78,7 +89,9 @@ def swings_up(actuator):
 
 
 def test_a_steady_load_takes_what_the_motor_equation_says():
-    motor = dataclasses.replace(MOTOR, gear_ratio=20.0, coulomb_friction=1e-3, viscous_friction=1e-6)
+    motor = dataclasses.replace(
+        MOTOR, gear_ratio=20.0, coulomb_friction=1e-3, viscous_friction=1e-6
+    )
     asked = operation(steady(1.5, 8.0), drive(motor))
     torque = 1.5 / 20.0 + 1e-3 + 1e-6 * 160.0
     assert asked.torque == pytest.approx(torque)
@@ -103,7 +116,12 @@ def test_a_change_of_the_torque_takes_l_di_dt_within_its_step():
     torque = np.array([0.0, 1.5, 1.5, 0.0])
     asked = operation(recorded(0.1 * np.arange(4), torque, np.full(4, 8.0)), drive(slow))
     current, rise, back_emf = 1.5 / 0.05, 0.05 * 30.0 / 0.1, 0.04 * 8.0
-    expected = [back_emf, 2.0 * current + rise + back_emf, 2.0 * current + back_emf, rise - back_emf]
+    expected = [
+        back_emf,
+        2.0 * current + rise + back_emf,
+        2.0 * current + back_emf,
+        rise - back_emf,
+    ]
     assert asked.voltage == pytest.approx(expected)
 
 
@@ -113,7 +131,9 @@ def test_the_best_gear_takes_the_least_voltage():
     light = dataclasses.replace(MOTOR, rotor_inertia=0.0)
 
     def voltage(gear):
-        return operation(steady(1.5, 8.0), drive(dataclasses.replace(light, gear_ratio=gear))).voltage[0]
+        return operation(
+            steady(1.5, 8.0), drive(dataclasses.replace(light, gear_ratio=gear))
+        ).voltage[0]
 
     assert voltage(ratio) == pytest.approx(2.0 * math.sqrt(2.0 * 12.0 * 0.04 / 0.05))
     assert voltage(ratio) < min(voltage(0.95 * ratio), voltage(1.05 * ratio))
@@ -134,20 +154,24 @@ def test_power_is_a_quarter_of_what_a_blocked_motor_burns():
 
 
 def test_stall_and_heat():
-    found = bounds(feasibility(drive(voltage=24.0, max_current=3.0), steady(2.0, 1.0), continuous_current=1.9))
+    found = bounds(
+        feasibility(drive(voltage=24.0, max_current=3.0), steady(2.0, 1.0), continuous_current=1.9)
+    )
     assert found["stall"].available == pytest.approx(3.0)
     assert (found["heat"].needed, found["heat"].verdict) == (pytest.approx(2.0), TRY_IT)
     stiff = dataclasses.replace(PAPER, coulomb_friction=30.0)
-    assert bounds(feasibility(drive(stiff), dataclasses.replace(steady(2.0, 1.0), exact=False)))["stall"].verdict == (
-        SURELY_NOT
-    )
+    assert bounds(feasibility(drive(stiff), dataclasses.replace(steady(2.0, 1.0), exact=False)))[
+        "stall"
+    ].verdict == (SURELY_NOT)
 
 
 def test_what_is_recorded_is_to_be_delivered_and_what_a_policy_asks_may_be_asked_otherwise():
     asked = steady(2.0, 8.0)
     assert feasibility(drive(voltage=10.0), asked, COOL).verdict == SURELY
     assert feasibility(drive(voltage=9.9), asked).verdict == SURELY_NOT
-    assert feasibility(drive(voltage=9.9), dataclasses.replace(asked, exact=False)).verdict == TRY_IT
+    assert (
+        feasibility(drive(voltage=9.9), dataclasses.replace(asked, exact=False)).verdict == TRY_IT
+    )
 
 
 @pytest.mark.parametrize(
@@ -171,7 +195,9 @@ def test_what_is_short_by_ten_is_hopeless(voltage, loop, continuous, verdict):
 
 
 def test_the_scripted_swing_up_reaches_upright_and_says_so(pendulum):
-    assert pendulum.source == "scripted swing-up and hold of pendulum, 10 of 10 episodes at the goal"
+    assert (
+        pendulum.source == "scripted swing-up and hold of pendulum, 10 of 10 episodes at the goal"
+    )
     assert len(pendulum.torque) == len(pendulum.speed) == len(pendulum.acceleration) == 2000
     assert np.abs(pendulum.torque).max() == 2.0
 
@@ -237,13 +263,17 @@ def test_the_first_choice_delivers_what_was_asked(pendulum):
     )
     parameters = parameters_type(family)(*first.drive.numbers)
     for torque, speed in zip(asked.torque, asked.speed, strict=True):
-        state, made, _ = Drive.advance(parameters, 0.05, state, Inputs(torque, 0.0, speed, 0.0, 0.0))
+        state, made, _ = Drive.advance(
+            parameters, 0.05, state, Inputs(torque, 0.0, speed, 0.0, 0.0)
+        )
         delivered.append(made)
     error = np.array(delivered) - asked.torque
     assert np.abs(error).max() < 0.02 * np.abs(asked.torque).max()
 
 
-def test_the_smallest_motor_that_does_it_with_a_margin_comes_first_and_the_others_say_what_they_lack(pendulum):
+def test_the_smallest_motor_that_does_it_with_a_margin_comes_first_and_the_others_say_what_they_lack(
+    pendulum,
+):
     choices = choose(pendulum)
     good = [one for one in choices if not one.lacks]
     assert choices[: len(good)] == good
@@ -269,7 +299,9 @@ def test_the_power_of_a_motor_is_what_it_makes_at_its_best():
     for most in (math.inf, 2.0):
         one = drive(MOTOR, max_current=most)
         currents = np.linspace(0.0, min(most, 12.0), 100_001)
-        assert most_power(one) == pytest.approx(np.max(currents * (24.0 - 2.0 * currents) * 0.05 / 0.04), rel=1e-8)
+        assert most_power(one) == pytest.approx(
+            np.max(currents * (24.0 - 2.0 * currents) * 0.05 / 0.04), rel=1e-8
+        )
 
 
 def test_a_motor_that_moves_itself_is_none_for_a_policy_and_any_for_a_recording():
@@ -277,7 +309,10 @@ def test_a_motor_that_moves_itself_is_none_for_a_policy_and_any_for_a_recording(
     time = np.linspace(0.0, 2.0, 2001)
     swinging = recorded(time, 0.02 * np.cos(4.0 * time), 10.0 * np.sin(4.0 * time))
     name = ["cubemars-ak80-6"]  # has a gear of its own: 6.07e-5 * 36 * 40 = 0.087 N*m
-    assert "needs 437.2 %, has 50 %" in choose(dataclasses.replace(swinging, exact=False), name)[0].lacks
+    assert (
+        "needs 437.2 %, has 50 %"
+        in choose(dataclasses.replace(swinging, exact=False), name)[0].lacks
+    )
     assert choose(swinging, name)[0].lacks == ""
 
 
@@ -297,17 +332,26 @@ def arrivals(task, actuator, episodes=5):
     env = EnvConfig(task, actuator, inner_steps=TASKS[task].motor_inner_steps)
     policy = Scripted(TASKS[task])
     ran = run_episodes(policy, lambda: state_observed(env.make()), episodes, 0)
-    return sum(not one.terminated if task == "cartpole" else bool(TASKS[task].goal(one.state[-1])) for one in ran)
+    return sum(
+        not one.terminated if task == "cartpole" else bool(TASKS[task].goal(one.state[-1]))
+        for one in ran
+    )
 
 
-@pytest.mark.parametrize("task", but(["pendulum"], ["pendulum", "cartpole", "acrobot", "mountain_car_continuous"]))
+@pytest.mark.parametrize(
+    "task", but(["pendulum"], ["pendulum", "cartpole", "acrobot", "mountain_car_continuous"])
+)
 def test_the_first_choice_does_the_task_in_the_engine(task):
     assert arrivals(task, choose(demand_of(task))[0].drive) == 5
 
 
 def test_a_motor_that_lacks_voltage_stall_torque_and_power_does_not(pendulum):
     (choice,) = choose(pendulum, ["quanser-srv02"])
-    assert {bound.name for bound in choice.feasibility.bounds if not bound.holds} >= {"voltage", "stall", "power"}
+    assert {bound.name for bound in choice.feasibility.bounds if not bound.holds} >= {
+        "voltage",
+        "stall",
+        "power",
+    }
     assert arrivals("pendulum", choice.drive) == 0
 
 
@@ -331,7 +375,10 @@ def test_on_a_slide_a_geared_motor_gets_a_wheel():
         (lambda: find_drive("frc-cim", gear_ratio=0.0), "gear_ratio = 0"),
         (lambda: find_drive("frc-cim", voltage=-1.0), "voltage = -1"),
         (lambda: find_drive("lag"), "no motor behind a drive"),
-        (lambda: choose(steady(1.0, 1.0), ["frc-cim"], least_margin=1.0), r"least_margin = 1: must be >= 0 and < 1"),
+        (
+            lambda: choose(steady(1.0, 1.0), ["frc-cim"], least_margin=1.0),
+            r"least_margin = 1: must be >= 0 and < 1",
+        ),
         (lambda: recorded([0.0, 1.0], [1.0], [1.0, 1.0]), "torque: shape"),
         (lambda: recorded([0.0, 0.0], [1.0, 1.0], [1.0, 1.0]), r"time\[1\] = 0 s"),
         (lambda: recorded([0.0, 1.0], [1.0, math.nan], [1.0, 1.0]), r"torque\[1\] = nan"),
@@ -353,8 +400,16 @@ def test_a_file_that_is_no_recording_is_refused(tmp_path):
 
 
 def test_the_command_judges_a_recording_and_draws_it(tmp_path, capsys):
-    np.savez(tmp_path / "joint.npz", time=np.arange(3.0), torque=np.full(3, 1.0), speed=np.full(3, 8.0))
-    judge = ["motor", "feasible", "maxon-ec45-flat-50w", str(tmp_path / "joint.npz"), "--gear-ratio"]
+    np.savez(
+        tmp_path / "joint.npz", time=np.arange(3.0), torque=np.full(3, 1.0), speed=np.full(3, 8.0)
+    )
+    judge = [
+        "motor",
+        "feasible",
+        "maxon-ec45-flat-50w",
+        str(tmp_path / "joint.npz"),
+        "--gear-ratio",
+    ]
     assert main([*judge, "20", "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "surely"
     assert (tmp_path / "out" / "torque_speed.png").read_bytes().startswith(b"\x89PNG")
@@ -402,7 +457,10 @@ def test_ones_own_motors_are_ranked_among_themselves(tmp_path, capsys, monkeypat
         assert printed.index("b.toml") < printed.index("a.toml")
         assert printed.count("unknown") == 1
         assert "a.toml at gear" in printed
-        assert "supply.voltage = 24 V, controller.max_current = inf, motor.rotor_inertia = 0" in printed
+        assert (
+            "supply.voltage = 24 V, controller.max_current = inf, motor.rotor_inertia = 0"
+            in printed
+        )
     for words, said in (
         (["a.toml"], "nothing to choose for: name one task"),
         (["pendulum", "cartpole"], "pendulum and cartpole to choose for"),

@@ -11,7 +11,9 @@ from codrl_mj.own_code import asset_path
 from codrl_mj.physics.mjcf import drive
 
 FULL = Actuator(
-    Motor(resistance=1.2, inductance=0.05, torque_constant=0.8, back_emf_constant=0.7, arm_radius=0.5),
+    Motor(
+        resistance=1.2, inductance=0.05, torque_constant=0.8, back_emf_constant=0.7, arm_radius=0.5
+    ),
     CurrentLoop(
         kp=2.0,
         ki=5.0,
@@ -38,7 +40,10 @@ def changed(actuator, **fields):
     """The actuator with some fields of its motor or controller changed."""
     motor = {name: value for name, value in fields.items() if hasattr(actuator.motor, name)}
     loop = {name: value for name, value in fields.items() if name not in motor}
-    return Actuator(dataclasses.replace(actuator.motor, **motor), dataclasses.replace(actuator.controller, **loop))
+    return Actuator(
+        dataclasses.replace(actuator.motor, **motor),
+        dataclasses.replace(actuator.controller, **loop),
+    )
 
 
 _ROTOR = """

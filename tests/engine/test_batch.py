@@ -17,10 +17,16 @@ pytestmark = pytest.mark.usefixtures("installed")
 
 SIMULATIONS, STEPS = 24, 60
 DRAWS = np.random.default_rng(0).uniform(0.5, 2.0, (SIMULATIONS, 3)) * (1, 1, 0.1)
-LOOPS = [changed(FULL, kp=kp, resistance=resistance, inductance=inductance) for kp, resistance, inductance in DRAWS]
+LOOPS = [
+    changed(FULL, kp=kp, resistance=resistance, inductance=inductance)
+    for kp, resistance, inductance in DRAWS
+]
 FAMILIES = {  # name: the motor of each simulation
     "current loops": LOOPS,
-    "somebody's": [dataclasses.replace(SPRINGS[index % 3], arm_radius=0.4 + 0.01 * index) for index in range(24)],
+    "somebody's": [
+        dataclasses.replace(SPRINGS[index % 3], arm_radius=0.4 + 0.01 * index)
+        for index in range(24)
+    ],
 }
 
 
@@ -44,7 +50,9 @@ def batched(batch, model):
     ctrl = batch.bind("ctrl").reshape(SIMULATIONS, -1)
     for ctrl[:] in inputs_of(model):
         batch.step()
-    return np.concatenate([batch.bind(name).reshape(SIMULATIONS, -1) for name in ("time", "qpos", "qvel", "act")], 1)
+    return np.concatenate(
+        [batch.bind(name).reshape(SIMULATIONS, -1) for name in ("time", "qpos", "qvel", "act")], 1
+    )
 
 
 @pytest.mark.parametrize("nthread", [1, 2])

@@ -28,7 +28,9 @@ pytestmark = pytest.mark.usefixtures("installed")
 
 STEPS = 100
 INPUTS = controls(STEPS, size=0.6)
-every_integrator = pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit", "RK4"])
+every_integrator = pytest.mark.parametrize(
+    "integrator", ["Euler", "implicitfast", "implicit", "RK4"]
+)
 
 
 def follow(model, data, reference, inputs):
@@ -70,7 +72,9 @@ def test_forward_calls_under_any_control_change_nothing_between_steps(integrator
             mujoco.mj_forward(model, data)
         data.ctrl[:] = wanted
 
-    np.testing.assert_array_equal(trajectory(model, INPUTS), trajectory(model, INPUTS, before_step=forward))
+    np.testing.assert_array_equal(
+        trajectory(model, INPUTS), trajectory(model, INPUTS, before_step=forward)
+    )
 
 
 def test_step1_and_step2_are_one_step():
@@ -99,7 +103,9 @@ def went_back(model, data):
 
 
 def of_keyframe(model, data):
-    spec = rotor_spec(integrator=mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_"))
+    spec = rotor_spec(
+        integrator=mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_")
+    )
     spec.add_key(time=data.time, qpos=data.qpos, qvel=data.qvel, act=data.act)
     keyed = spec.compile()
     fresh = mujoco.MjData(keyed)
@@ -108,7 +114,9 @@ def of_keyframe(model, data):
 
 
 @every_integrator
-@pytest.mark.parametrize("carried", [lambda _, data: copy.copy(data), of_state, went_back, of_keyframe])
+@pytest.mark.parametrize(
+    "carried", [lambda _, data: copy.copy(data), of_state, went_back, of_keyframe]
+)
 def test_what_has_the_state_goes_on_bit_for_bit(carried, integrator):
     """A copy, fresh data with the state vector, data that went elsewhere and back, and a keyframe."""
     model = rotor(integrator=integrator)
@@ -167,7 +175,9 @@ def test_parameters_are_read_from_the_model_at_every_step():
 def test_control_is_clamped_to_its_range_unless_clamping_is_disabled():
     model, free = rotor(max_force=1.0), rotor()  # the arm is 0.5 m: the range is +-0.5 N*m
     inputs = controls(STEPS, size=2.0)
-    np.testing.assert_array_equal(trajectory(model, inputs), trajectory(free, inputs.clip(-0.5, 0.5)))
+    np.testing.assert_array_equal(
+        trajectory(model, inputs), trajectory(free, inputs.clip(-0.5, 0.5))
+    )
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
     np.testing.assert_array_equal(trajectory(model, inputs), trajectory(free, inputs))
 
@@ -195,7 +205,9 @@ def remove_callbacks(_, off):
     engine.uninstall() if off else engine.install()
 
 
-@pytest.mark.parametrize("switch", [disable_group(3), disable_group(0), disable_actuation, remove_callbacks])
+@pytest.mark.parametrize(
+    "switch", [disable_group(3), disable_group(0), disable_actuation, remove_callbacks]
+)
 def test_what_is_switched_off_has_no_force_and_holds_its_state_to_go_on_from(switch):
     model, reference = rotor(), MotorSimulation(FULL)
     data = mujoco.MjData(model)

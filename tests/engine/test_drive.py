@@ -1,8 +1,8 @@
 """The drive on a hinge: MuJoCo's own `<dcmotor>` as an oracle of its mean torque, and the envelope that mjlab expects.
 
-Against `<dcmotor>` the loop is off: a gain is so small that only the reference counts, u = kp*(i_ref - i),
-kp = 1e-9 V/A. Over a step the winding's equation integrates to
-mean(i) = (u - kE*omega)/R - L/(R*h)*(i_after - i_before), whatever happens within.
+Against `<dcmotor>` the loop is off: a gain is so small that only the reference counts, u =
+kp*(i_ref - i), kp = 1e-9 V/A. Over a step the winding's equation integrates to mean(i) = (u -
+kE*omega)/R - L/(R*h)*(i_after - i_before), whatever happens within.
 """
 
 import math
@@ -55,10 +55,14 @@ def run(model, voltages, speed, unit=1.0):
 
 @pytest.mark.parametrize("samples", [1, 5])
 @pytest.mark.parametrize("speed", [0.0, 8.0, -8.0, 30.0])
-@pytest.mark.parametrize("timestep", [0.0005, 0.005, 0.05])  # the electrical time constant is 0.01 s
+@pytest.mark.parametrize(
+    "timestep", [0.0005, 0.005, 0.05]
+)  # the electrical time constant is 0.01 s
 def test_the_mean_torque_is_that_of_mujoco_s_current(timestep, speed, samples):
     """At a speed that is kept; then a voltage that stays, which ends at K*(V - K*omega)/R."""
-    voltages = np.concatenate([np.random.default_rng(0).uniform(-12.0, 12.0, 200), np.full(400, 9.0)])
+    voltages = np.concatenate(
+        [np.random.default_rng(0).uniform(-12.0, 12.0, 200), np.full(400, 9.0)]
+    )
     theirs = run(native(timestep), voltages, speed)
     current = np.append(0.0, theirs[:, 2])
     expected = K * ((voltages - K * speed) / R - L / (R * timestep) * np.diff(current))
@@ -73,13 +77,19 @@ def test_a_free_hinge_comes_up_to_the_same_speed_on_the_same_way_as_the_step_shr
     timesteps, errors = np.array([4e-3, 2e-3, 1e-3, 5e-4]), []
     for timestep in timesteps:
         voltages = np.full(round(0.2 / timestep), 9.0)
-        theirs, found = run(native(timestep, 0.01), voltages, 0.0), run(ours(timestep, 1, 0.01), voltages, 0.0, K / KP)
+        theirs, found = (
+            run(native(timestep, 0.01), voltages, 0.0),
+            run(ours(timestep, 1, 0.01), voltages, 0.0, K / KP),
+        )
         errors.append(np.abs(theirs - found)[:, 0].max())
     assert np.polyfit(np.log(timesteps), np.log(errors), 1)[0] == pytest.approx(1.0, abs=0.15)
-    assert run(ours(1e-3, 1, 0.01), np.full(2000, 9.0), 0.0, K / KP)[-1, 0] == pytest.approx(9.0 / K, rel=1e-6)
+    assert run(ours(1e-3, 1, 0.01), np.full(2000, 9.0), 0.0, K / KP)[-1, 0] == pytest.approx(
+        9.0 / K, rel=1e-6
+    )
 
 
-# mjlab, tests/test_builtin_dcmotor_actuator.py: a motor by its nominal voltage, stall torque and no-load speed
+# mjlab, tests/test_builtin_dcmotor_actuator.py: a motor by its nominal voltage, stall torque and
+# no-load speed
 VOLTAGE, STALL, NO_LOAD = 24.0, 2.0, 100.0
 LIMIT = 0.25 * STALL * NO_LOAD / VOLTAGE
 """A drive's largest current [A]: a quarter of the stall current, and so of the stall torque."""
@@ -105,7 +115,9 @@ CASES = {  # name: demand, speed, largest current, gear, expected
 def test_the_torque_is_within_the_line_and_the_limit(case, sign):
     demand, speed, most, gear, expected = CASES[case]
     constant = VOLTAGE / NO_LOAD
-    motor = GearMotor(constant * VOLTAGE / STALL, 1e-3, constant, constant, rotor_inertia=0.0, gear_ratio=gear)
+    motor = GearMotor(
+        constant * VOLTAGE / STALL, 1e-3, constant, constant, rotor_inertia=0.0, gear_ratio=gear
+    )
     drive = Drive(motor, SampledLoop(20e3, max_current=most), Supply(VOLTAGE))
     model = codrl_mj.motorise(hinge(0.002)[0], {"hinge": drive}).compile()
     torque = run(model, [sign * demand] * 50, sign * speed)[-1, 1]

@@ -71,7 +71,9 @@ def _softened(torque, limit):
 
 def _advance(parameters, timestep, state, inputs):
     draw = standard_normal(inputs.noise_key, int(inputs.time / timestep + 0.5), 7)
-    wanted = inputs.desired_torque - parameters.stiffness * math.sin(inputs.position) * parameters.turns
+    wanted = (
+        inputs.desired_torque - parameters.stiffness * math.sin(inputs.position) * parameters.turns
+    )
     wanted = wanted - parameters.brake_drag * inputs.speed * abs(inputs.speed) + 0.01 * draw
     filtered = state.filtered + (wanted - state.filtered) * timestep / (timestep + 0.03)
     if parameters.soft:
@@ -137,8 +139,16 @@ ALL = [
     Lag(0.02, 0.033),
     Lag(0.0, 0.08),
     TorqueSpeed(0.4, 3.0, 0.3),
-    Drive(GearMotor(torque_constant=0.5, gear_ratio=2.0), SampledLoop(10e3, max_current=0.3), Supply(2.0)),
-    Drive(GearMotor(torque_constant=0.5), SampledLoop(10e3, anti_windup="clamping", delayed=True), Supply(2.0, 0.5)),
+    Drive(
+        GearMotor(torque_constant=0.5, gear_ratio=2.0),
+        SampledLoop(10e3, max_current=0.3),
+        Supply(2.0),
+    ),
+    Drive(
+        GearMotor(torque_constant=0.5),
+        SampledLoop(10e3, anti_windup="clamping", delayed=True),
+        Supply(2.0, 0.5),
+    ),
     Drive(
         GearMotor(
             torque_constant=0.5,
@@ -150,11 +160,24 @@ ALL = [
         SampledLoop(10e3, deadband=0.1, max_current=0.3),
         Supply(2.0),
     ),
-    Drive(GearMotor(torque_constant=0.5), SampledLoop(10e3), Supply(2.0)).commands()["voltage"].actuator,
-    Servo(GearMotor(torque_constant=0.5, gear_ratio=2.0), SampledLoop(10e3), Supply(2.0), ServoLoop(servo_rate=500.0)),
-    Servo(loop=ServoLoop("velocity", 50.0, velocity_integral_gain=2.0, inertia_feed_forward=0.01, max_torque=0.3)),
+    Drive(GearMotor(torque_constant=0.5), SampledLoop(10e3), Supply(2.0))
+    .commands()["voltage"]
+    .actuator,
+    Servo(
+        GearMotor(torque_constant=0.5, gear_ratio=2.0),
+        SampledLoop(10e3),
+        Supply(2.0),
+        ServoLoop(servo_rate=500.0),
+    ),
+    Servo(
+        loop=ServoLoop(
+            "velocity", 50.0, velocity_integral_gain=2.0, inertia_feed_forward=0.01, max_torque=0.3
+        )
+    ),
     FULL,
-    dataclasses.replace(changed(FULL, current_noise=0.2, current_bias=0.1), supply=Supply(5.0, 0.7)),
+    dataclasses.replace(
+        changed(FULL, current_noise=0.2, current_bias=0.1), supply=Supply(5.0, 0.7)
+    ),
     FULL.commands()["voltage"].actuator,
 ]
 STEPS = 80
@@ -176,7 +199,11 @@ def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integr
     data, parameters = mujoco.MjData(model), parameters_type(family)(*actuator.numbers)
     states, shown = len(family.State._fields), signals_at(family)
     data.act[Slot._fields.index("noise_key")] = KEY
-    state, timestep, gear = family.State(*[0.0] * states), model.opt.timestep, model.actuator_gear[0, 0]
+    state, timestep, gear = (
+        family.State(*[0.0] * states),
+        model.opt.timestep,
+        model.actuator_gear[0, 0],
+    )
     assert gear == 1.0 / actuator.arm_radius
     torques = []
     for (ctrl,) in controls(STEPS, size=0.6):
@@ -209,7 +236,8 @@ def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integr
 )
 def test_every_field_of_a_family_of_ones_own_acts(change):
     ends = [
-        trajectory(rotor(dataclasses.replace(Spring(), **one)), controls(STEPS, size=0.6))[-1] for one in ({}, change)
+        trajectory(rotor(dataclasses.replace(Spring(), **one)), controls(STEPS, size=0.6))[-1]
+        for one in ({}, change)
     ]
     assert np.abs(ends[1][1:3] - ends[0][1:3]).max() > 1e-6
 
@@ -227,11 +255,16 @@ def hinges(*actuators):
     """A model of a hinge for each actuator, none of which touches another."""
     spec = mujoco.MjSpec.from_string(
         "<mujoco><option timestep='0.01'><flag contact='disable'/></option><worldbody>"
-        + "".join(f"<body><joint name='{at}'/><geom size='.1' pos='.2 0 .1'/></body>" for at in range(len(actuators)))
+        + "".join(
+            f"<body><joint name='{at}'/><geom size='.1' pos='.2 0 .1'/></body>"
+            for at in range(len(actuators))
+        )
         + "</worldbody></mujoco>"
     )
     for index, actuator in enumerate(actuators):
-        drive(spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=str(index)), actuator, None)
+        drive(
+            spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=str(index)), actuator, None
+        )
     return spec.compile()
 
 
@@ -276,7 +309,9 @@ def test_a_model_compiles_its_families_on_installation():
     spec = rotor_spec()
     drive(spec.actuator("motor"), Late(), None)
     model = spec.compile()
-    with pytest.raises(ValueError, match=r"motor: .* is not known in this process: import its module"):
+    with pytest.raises(
+        ValueError, match=r"motor: .* is not known in this process: import its module"
+    ):
         motors(model)
     data = mujoco.MjData(model)
     data.ctrl[:] = 0.25
@@ -293,9 +328,13 @@ def test_two_families_of_one_number_are_refused_and_the_first_stays(monkeypatch)
     class Other(Spring):
         pass
 
-    monkeypatch.setattr("codrl_mj.engine.families.family_number", lambda family: family_number(Spring))  # noqa: ARG005
+    monkeypatch.setattr(
+        "codrl_mj.engine.families.family_number",
+        lambda family: family_number(Spring),  # noqa: ARG005
+    )
     with pytest.raises(
-        ValueError, match=f"Other and .*:Spring have the same number {family_number(Spring)}: rename one"
+        ValueError,
+        match=f"Other and .*:Spring have the same number {family_number(Spring)}: rename one",
     ):
         engine.load_family(Other)
     before = loaded_families()

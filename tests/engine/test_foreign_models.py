@@ -19,25 +19,39 @@ OURS = (*HEAD, *Actuator().numbers)
 
 def general(user=(), actdim=SIZE, **kinds):
     """An actuator with user dynamics and bias, or other kinds, and user data."""
-    kinds = {"dyntype": "user", "biastype": "user", "actdim": actdim, "user": " ".join(map(repr, user))} | kinds
-    return f'<general joint="a" {" ".join(f"""{name}="{value}" """ for name, value in kinds.items() if value)}/>'
+    kinds = {
+        "dyntype": "user",
+        "biastype": "user",
+        "actdim": actdim,
+        "user": " ".join(map(repr, user)),
+    } | kinds
+    return (
+        '<general joint="a"'
+        f' {" ".join(f"""{name}="{value}" """ for name, value in kinds.items() if value)}/>'
+    )
 
 
 FOREIGN = {
     "user dynamics and bias without user data": general(actdim=3),
     "as many activations and no user data": general(),
     "as many activations and other user data": general((HEAD[0], HEAD[1] + 1, *OURS[2:])),
-    "our signature and a family that nobody loaded": general((*HEAD[:2], (HEAD[2] + 1) % 10**6, *OURS[3:])),
+    "our signature and a family that nobody loaded": general(
+        (*HEAD[:2], (HEAD[2] + 1) % 10**6, *OURS[3:])
+    ),
     "our signature and a number that is no family's": general((*HEAD[:2], -1.0, *OURS[3:])),
     "short user data": general(HEAD[:2]),
     "our user data on a plain motor": general(OURS, actdim=0, dyntype="", biastype=""),
     "our user data on another dynamics": general(OURS, actdim=0, dyntype="filter", dynprm="0.1"),
     "our user data on another bias": general(OURS, biastype="affine", biasprm="1 2 3"),
     "our user data with another number of activations": general(OURS, actdim=SIZE - 1),
-    "user gain": general((HEAD[0], HEAD[1] + 1), actdim=0, dyntype="", biastype="", gaintype="user"),
+    "user gain": general(
+        (HEAD[0], HEAD[1] + 1), actdim=0, dyntype="", biastype="", gaintype="user"
+    ),
     "integrator": '<general joint="a" dyntype="integrator"/>',
     "muscle": '<muscle joint="a" lengthrange="-1 1" force="1"/>',
-    "dc motor": '<dcmotor joint="a" motorconst="0.5 0.5" resistance="1" inductance="0.1" input="voltage"/>',
+    "dc motor": (
+        '<dcmotor joint="a" motorconst="0.5 0.5" resistance="1" inductance="0.1" input="voltage"/>'
+    ),
     "pid": '<pid joint="a" kp="1" kv="1" ki="1"/>',
     "none": "",
 }
@@ -74,7 +88,9 @@ def test_a_foreign_model_moves_as_without_us(kind, integrator):
     np.testing.assert_array_equal(trajectory(model, inputs, _start(model)), without)
 
 
-@pytest.mark.parametrize("build", [rotor_spec, lambda: mujoco.MjSpec.from_string(_xml(FOREIGN["muscle"]))])
+@pytest.mark.parametrize(
+    "build", [rotor_spec, lambda: mujoco.MjSpec.from_string(_xml(FOREIGN["muscle"]))]
+)
 def test_models_compile_alike_while_installed(build):
     blobs = []
     for _ in range(2):

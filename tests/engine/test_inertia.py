@@ -12,7 +12,9 @@ from codrl_mj.engine.doors import MOST_ON_STACK, shaft_inertia
 MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 
-@pytest.mark.parametrize("name", ["humanoid.xml", "half_cheetah.xml", "ant.xml", "reacher.xml", "pusher_v5.xml"])
+@pytest.mark.parametrize(
+    "name", ["humanoid.xml", "half_cheetah.xml", "ant.xml", "reacher.xml", "pusher_v5.xml"]
+)
 def test_it_is_one_over_the_moment_through_the_inverse_inertia_matrix(name):
     model = mujoco.MjModel.from_xml_path(str(MODELS / name))
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
@@ -21,7 +23,11 @@ def test_it_is_one_over_the_moment_through_the_inverse_inertia_matrix(name):
         mujoco.mj_fwdPosition(model, data)
         moments = np.zeros((model.nu, model.nv))
         mujoco.mju_sparse2dense(
-            moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+            moments,
+            data.actuator_moment,
+            data.moment_rownnz,
+            data.moment_rowadr,
+            data.moment_colind,
         )
         solved = np.zeros_like(moments)
         mujoco.mj_solveM(model, data, solved, moments)
@@ -34,14 +40,18 @@ def test_it_is_one_over_the_moment_through_the_inverse_inertia_matrix(name):
 def test_a_slide_of_many_that_are_not_connected_has_its_bodys_mass(count):
     spec = mujoco.MjSpec()
     for index in range(count):
-        body = spec.worldbody.add_body(mass=0.5 + index, inertia=[1.0, 1.0, 1.0], explicitinertial=True)
+        body = spec.worldbody.add_body(
+            mass=0.5 + index, inertia=[1.0, 1.0, 1.0], explicitinertial=True
+        )
         joint = body.add_joint(name=str(index), type=mujoco.mjtJoint.mjJNT_SLIDE)
         spec.add_actuator(target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
     for index in (0, 1, count - 1):
-        assert shaft_inertia(model, data, index, 2.0) == pytest.approx((0.5 + index) / 4.0, rel=1e-15)
+        assert shaft_inertia(model, data, index, 2.0) == pytest.approx(
+            (0.5 + index) / 4.0, rel=1e-15
+        )
 
 
 def test_what_moves_nothing_has_no_end_of_inertia():

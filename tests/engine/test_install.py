@@ -50,7 +50,9 @@ def test_install_and_uninstall_are_idempotent():
 @pytest.mark.parametrize("name", FOREIGN)
 def test_a_foreign_callback_is_neither_replaced_nor_removed(name):
     _set(name, FOREIGN[name])
-    with pytest.raises(engine.CallbackInUseError, match=f"mjcb_{name} is already set.*set_mjcb_{name}.None."):
+    with pytest.raises(
+        engine.CallbackInUseError, match=f"mjcb_{name} is already set.*set_mjcb_{name}.None."
+    ):
         engine.install()
     alone = {"control": None, "act_bias": None, name: FOREIGN[name]}
     assert _present() == alone

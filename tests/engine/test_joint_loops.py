@@ -27,7 +27,12 @@ MOTOR = GearMotor(0.5, 2e-4, 0.05, 0.05, rotor_inertia=1e-6, gear_ratio=20.0)
 
 
 def servo(**loop):
-    return Servo(MOTOR, SampledLoop(20e3, max_current=20.0), Supply(24.0), ServoLoop(position_gain=10.0, **loop))
+    return Servo(
+        MOTOR,
+        SampledLoop(20e3, max_current=20.0),
+        Supply(24.0),
+        ServoLoop(position_gain=10.0, **loop),
+    )
 
 
 def pendulum(actuator, **more):
@@ -68,13 +73,17 @@ def test_a_servo_holds_a_rod_at_the_task_s_own_step(timestep):
 def test_a_servo_that_is_too_slow_for_its_gain_is_refused_with_a_step_that_does():
     """Sampled with the steps, the bound of 2 for velocity_gain*h/J is passed at 0.05 s with the position's share."""
     slow = servo(velocity_gain=14.0, servo_rate=20.0)
-    with pytest.raises(UnstableError, match=r"^motor: the outer loops are .* A shorter step does not help; or pass"):
+    with pytest.raises(
+        UnstableError, match=r"^motor: the outer loops are .* A shorter step does not help; or pass"
+    ):
         pendulum(slow)
     off, _ = held(pendulum(slow, allow_unstable=True))[1]
     assert np.ptp(off) > 0.02
     pendulum(dataclasses.replace(slow, loop=dataclasses.replace(slow.loop, velocity_gain=7.0)))
     fast = servo(velocity_gain=14.0, servo_rate=1000.0)
-    with pytest.raises(UnstableError, match=r"over a mechanical step of 0\.05 s.* step to 0\.025 s, which does \(s"):
+    with pytest.raises(
+        UnstableError, match=r"over a mechanical step of 0\.05 s.* step to 0\.025 s, which does \(s"
+    ):
         pendulum(dataclasses.replace(fast, motor=dataclasses.replace(MOTOR, load_inertia=math.inf)))
 
 
@@ -104,7 +113,9 @@ def test_a_family_of_somebody_s_is_refused_where_jury_says_so(shares):
     for factor, refused in ((0.98, False), (1.02, True)):
         one = Spring(stiffness=factor * stiffness, damping=factor * damping)
         if refused:
-            with pytest.raises(UnstableError, match=r"moves 0\.02 kg\*m\^2 .* Or shorten the step to 0\.005 s"):
+            with pytest.raises(
+                UnstableError, match=r"moves 0\.02 kg\*m\^2 .* Or shorten the step to 0\.005 s"
+            ):
                 codrl_mj.motorise(hinge(inertia), {"it": one})
         else:
             codrl_mj.motorise(hinge(inertia), {"it": one})
@@ -118,30 +129,40 @@ def test_a_torque_speed_line_that_overshoots_is_refused():
     """The speed swings between 0 and twice as much as the no-load speed and more, or reaches the no-load speed."""
     line = TorqueSpeed(stall_torque=1.0, no_load_speed=10.0, max_torque=1.0)
     for inertia, swings in ((0.01 * 0.1 / 1.9, False), (0.01 * 0.1 / 2.1, True)):
-        data = mujoco.MjData(codrl_mj.motorise(hinge(inertia), {"it": line}, allow_unstable=True).compile())
+        data = mujoco.MjData(
+            codrl_mj.motorise(hinge(inertia), {"it": line}, allow_unstable=True).compile()
+        )
         data.ctrl[:], speeds = 1.0, []
         for _ in range(400):
             mujoco.mj_step(data.model, data)
             speeds.append(data.qvel[0])
         assert (np.ptp(speeds[-20:]) > 1.0) == swings
         if swings:
-            with pytest.raises(UnstableError, match=r"takes 2\.1 of the way .* less than 0\.00952 s"):
+            with pytest.raises(
+                UnstableError, match=r"takes 2\.1 of the way .* less than 0\.00952 s"
+            ):
                 codrl_mj.motorise(hinge(inertia), {"it": line})
         else:
             codrl_mj.motorise(hinge(inertia), {"it": line})
 
 
-@pytest.mark.parametrize("draws", [{"loop.velocity_gain": "uniform(3, 14)"}, {"model.mass.rod": "uniform(0.5, 2)"}])
+@pytest.mark.parametrize(
+    "draws", [{"loop.velocity_gain": "uniform(3, 14)"}, {"model.mass.rod": "uniform(0.5, 2)"}]
+)
 def test_draws_that_reach_what_is_unstable_are_refused(draws):
     """Each extreme alone, and the worst of several together: a gain of 9 on half the mass."""
     slow = servo(velocity_gain=9.0, servo_rate=20.0)
-    with pytest.raises(ValueError, match=r"^randomize: .* = \S+: motor: the outer loops .* narrow the bounds"):
+    with pytest.raises(
+        ValueError, match=r"^randomize: .* = \S+: motor: the outer loops .* narrow the bounds"
+    ):
         pendulum(slow, randomize=draws)
     pendulum(slow, randomize=draws, allow_unstable=True).reset(seed=0)
     half = {name: text.replace("14", "8").replace("0.5", "0.9") for name, text in draws.items()}
     pendulum(slow, randomize=half).reset(seed=0)
     both = {"model.mass.rod": "uniform(0.6, 1)", "loop.velocity_gain": "uniform(3, 10)"}
-    with pytest.raises(ValueError, match=r"randomize: model\.mass\.rod = 0\.6, loop\.velocity_gain = 10: motor"):
+    with pytest.raises(
+        ValueError, match=r"randomize: model\.mass\.rod = 0\.6, loop\.velocity_gain = 10: motor"
+    ):
         pendulum(slow, randomize=both)
 
 
@@ -159,4 +180,8 @@ def test_draws_for_motors_of_somebody_s_model_are_checked_too():
 def test_a_position_loop_within_a_step_is_warned_of():
     """It is at its target late: the pole is not exp(-1.5), but 1 - 1.5*exp(-1.5)."""
     with pytest.warns(UserWarning, match=r"position_gain = 30: .* Shorten the step to 0\.0333 s"):
-        pendulum(dataclasses.replace(servo(velocity_gain=48.0), loop=ServoLoop(position_gain=30.0, velocity_gain=48.0)))
+        pendulum(
+            dataclasses.replace(
+                servo(velocity_gain=48.0), loop=ServoLoop(position_gain=30.0, velocity_gain=48.0)
+            )
+        )

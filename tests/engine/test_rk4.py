@@ -15,11 +15,19 @@ STEPS = 500
 HANGING = [(0.1, 0.2, np.pi - 0.3, 0.4), (-0.5, 0.0, np.pi + 0.2, -1.0), (0.0, -1.0, np.pi, 2.0)]
 
 
-@pytest.mark.parametrize("moved", [False, True], ids=["on", "moved to fresh data before every step"])
+@pytest.mark.parametrize(
+    "moved", [False, True], ids=["on", "moved to fresh data before every step"]
+)
 @pytest.mark.parametrize("actuator", [TASKS["cartpole"].paper[0], changed(FULL, max_voltage=24.0)])
 @pytest.mark.parametrize("seed", range(3))
-def test_rk4_is_the_hand_written_integration_with_the_motor_advanced_once_a_step(actuator, seed, moved):
-    model, motor, state = cartpole(actuator, integrator="RK4"), MotorSimulation(actuator), HANGING[seed]
+def test_rk4_is_the_hand_written_integration_with_the_motor_advanced_once_a_step(
+    actuator, seed, moved
+):
+    model, motor, state = (
+        cartpole(actuator, integrator="RK4"),
+        MotorSimulation(actuator),
+        HANGING[seed],
+    )
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = state[::2], state[1::2]
     for force in controls(STEPS, seed=seed, size=10.0)[:, 0]:

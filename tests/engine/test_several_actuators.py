@@ -15,7 +15,14 @@ from tests.reference import MotorSimulation
 pytestmark = pytest.mark.usefixtures("installed")
 
 # Bodies that do not touch: a motor's joint depends on its own actuators only.
-JOINTS = {"first": "hinge", "ball": "ball", "second": "hinge", "pid": "hinge", "third": "slide", "dc": "hinge"}
+JOINTS = {
+    "first": "hinge",
+    "ball": "ball",
+    "second": "hinge",
+    "pid": "hinge",
+    "third": "slide",
+    "dc": "hinge",
+}
 OURS = {
     "first": changed(FULL, kp=0.5),
     "second": changed(FULL, arm_radius=0.2, ki=1.0),
@@ -31,7 +38,8 @@ def _spec(with_ours=True):
         return f'<general name="{name}" joint="{name}"/>' if with_ours else ""
 
     bodies = "".join(
-        f'<body><joint name="{name}" type="{kind}" axis="0 1 0"/><geom size="0.1" pos="0.2 0 0.1"/></body>'
+        f'<body><joint name="{name}" type="{kind}" axis="0 1 0"/><geom size="0.1" pos="0.2 0'
+        ' 0.1"/></body>'
         for name, kind in JOINTS.items()
     )
     spec = mujoco.MjSpec.from_string(f"""
@@ -75,11 +83,17 @@ def test_the_counts_of_controls_outputs_activations_and_actuators_differ():
 @pytest.mark.parametrize("integrator", ["Euler", "RK4"])
 def test_every_motor_is_its_own_reference(integrator):
     model = model_of_several(integrator=integrator)
-    data, references = mujoco.MjData(model), {name: MotorSimulation(actuator) for name, actuator in OURS.items()}
+    data, references = (
+        mujoco.MjData(model),
+        {name: MotorSimulation(actuator) for name, actuator in OURS.items()},
+    )
     for data.ctrl[:] in controls(100, model.nu):
         forces = {}
         for name, reference in references.items():
-            wanted = data.ctrl[model.actuator_ctrladr[model.actuator(name).id]] / OURS[name].motor.arm_radius
+            wanted = (
+                data.ctrl[model.actuator_ctrladr[model.actuator(name).id]]
+                / OURS[name].motor.arm_radius
+            )
             wanted = np.clip(wanted, -0.5, 0.5) if name == "third" else wanted
             forces[name] = reference.step(TIMESTEP, wanted, data.joint(name).qvel[0])
         mujoco.mj_step(model, data)
@@ -88,7 +102,9 @@ def test_every_motor_is_its_own_reference(integrator):
             act = data.act[model.actuator_actadr[actuator] :][: slot_size(Actuator)]
             np.testing.assert_allclose(act[STATE], reference.state, rtol=1e-10, atol=1e-11)
             torque = OURS[name].motor.torque_constant * reference.current
-            assert data.actuator_force[model.actuator_outadr[actuator]] == pytest.approx(torque, **close)
+            assert data.actuator_force[model.actuator_outadr[actuator]] == pytest.approx(
+                torque, **close
+            )
             assert data.joint(name).qfrc_actuator[0] == pytest.approx(forces[name], **close)
 
 
@@ -97,13 +113,17 @@ def test_foreign_actuators_act_as_without_ours():
     inputs, data, alone = controls(100, model.nu), mujoco.MjData(model), mujoco.MjData(bare)
     foreign = [index for index in range(model.nactuator) if index not in motors(model)]
     starts, counts = model.actuator_ctrladr, model.actuator_ctrlnum
-    chosen = np.concatenate([np.arange(starts[index], starts[index] + counts[index]) for index in foreign])
+    chosen = np.concatenate(
+        [np.arange(starts[index], starts[index] + counts[index]) for index in foreign]
+    )
     trajectory(model, inputs, data)
     uninstall()
     trajectory(bare, inputs[:, chosen], alone)
     assert np.any(alone.act != 0.0)
     for name in ("ball", "pid", "dc"):
-        np.testing.assert_allclose(data.joint(name).qpos, alone.joint(name).qpos, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(
+            data.joint(name).qpos, alone.joint(name).qpos, rtol=1e-12, atol=1e-12
+        )
         assert np.any(data.joint(name).qfrc_actuator != 0.0)
 
 
@@ -118,7 +138,9 @@ def test_a_disabled_group_silences_one_motor_of_several():
 
 
 @pytest.mark.parametrize("index", [0, 1, -1])
-def test_a_bad_control_anywhere_counts_as_zero_everywhere_as_in_the_engine(index, tmp_path, monkeypatch):
+def test_a_bad_control_anywhere_counts_as_zero_everywhere_as_in_the_engine(
+    index, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)  # the engine writes a log
     model = model_of_several()
     inputs = controls(40, model.nu)

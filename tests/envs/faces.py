@@ -23,7 +23,9 @@ MOTOR = changed(FULL, inductance=0.2, substeps=3)
 LIMIT = {task: {"current": TASKS[task].max_force * 0.5 / 0.8, "voltage": 4.0} for task in TASKS}
 """Largest command by task and kind, for `MOTOR`: arm 0.5, kT 0.8 N m/A, 4 V."""
 DRIVE = {
-    "controller.kp": LogUniform(0.3, 15.0),  # straddles instability on every task; such draws are rejected
+    "controller.kp": LogUniform(
+        0.3, 15.0
+    ),  # straddles instability on every task; such draws are rejected
     "motor.inductance": Uniform(0.05, 0.2),
     "motor.torque_constant": Uniform(0.5, 1.5),
     "motor.arm_radius": Uniform(0.2, 1.2),
@@ -83,17 +85,27 @@ LIMITED = {"max_episode_steps": 11}
 FACES = {
     "one": ActuatedEnv,
     "one, analytic": lambda task, **given: ActuatedEnv(task, physics="analytic", **given),
-    "many, NextStep": lambda task, **given: batched(task, 3, "NextStep", **LIMITED, **given).unwrapped,
-    "many, SameStep": lambda task, **given: batched(task, 3, "SameStep", **LIMITED, **given).unwrapped,
-    "serial, analytic": lambda task, **given: SerialVectorEnv(3, task, physics="analytic", **LIMITED, **given),
-    "Stable-Baselines3": lambda task, **given: make_sb3_vec_env(TASKS[task].env_id, 3, **LIMITED, **given),
+    "many, NextStep": lambda task, **given: (
+        batched(task, 3, "NextStep", **LIMITED, **given).unwrapped
+    ),
+    "many, SameStep": lambda task, **given: (
+        batched(task, 3, "SameStep", **LIMITED, **given).unwrapped
+    ),
+    "serial, analytic": lambda task, **given: SerialVectorEnv(
+        3, task, physics="analytic", **LIMITED, **given
+    ),
+    "Stable-Baselines3": lambda task, **given: make_sb3_vec_env(
+        TASKS[task].env_id, 3, **LIMITED, **given
+    ),
     "dm_control": lambda task, **given: suite.load(task, **LIMITED, **given),
 }
 
 
 def made(face, task, setup):
     """An environment."""
-    return FACES[face](task, **arguments(task, setup, "analytic" if "analytic" in face else "mujoco"))
+    return FACES[face](
+        task, **arguments(task, setup, "analytic" if "analytic" in face else "mujoco")
+    )
 
 
 def begun(env, seed=None):
@@ -135,12 +147,17 @@ def run(env, count, seed, vandal=False):
     """
     generator = np.random.default_rng(seed)
     several, found, kept, over = hasattr(env, "num_envs"), [plain(env.randomization)], [], False
-    space, shape = getattr(env, "single_action_space", env.action_space), (env.num_envs,) if several else ()
+    space, shape = (
+        getattr(env, "single_action_space", env.action_space),
+        (env.num_envs,) if several else (),
+    )
     for index in range(count):
         if hasattr(space, "n"):
             action = generator.integers(space.n, size=shape or None)
         else:
-            action = (space.high * generator.uniform(-1.5, 1.5, (*shape, *space.shape))).astype(np.float32)
+            action = (space.high * generator.uniform(-1.5, 1.5, (*shape, *space.shape))).astype(
+                np.float32
+            )
         given = np.array(action)
         seen = begun(env) if over or index % 40 == 39 else env.step(action)
         np.testing.assert_array_equal(action, given)

@@ -29,7 +29,12 @@ class RigEnv(gymnasium.Env):
     def __init__(self, target: float = 1.0, render_mode: str | None = None) -> None:
         """Hang it up."""
         self.model = mujoco.MjModel.from_xml_string(XML)
-        self.data, self.dt, self._target, self.render_mode = mujoco.MjData(self.model), 0.02, target, render_mode
+        self.data, self.dt, self._target, self.render_mode = (
+            mujoco.MjData(self.model),
+            0.02,
+            target,
+            render_mode,
+        )
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
 
@@ -63,7 +68,10 @@ class Rig(World):
     name, time_limit = "rig", 30
 
     def make(self, config, **view):
-        arguments = config.as_arguments() | {"max_episode_steps": config.time_limit, "disable_env_checker": True}
+        arguments = config.as_arguments() | {
+            "max_episode_steps": config.time_limit,
+            "disable_env_checker": True,
+        }
         return codrl_mj.make(RigEnv, arguments.pop("actuator"), **arguments, **view)
 
 

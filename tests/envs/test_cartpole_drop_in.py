@@ -22,14 +22,18 @@ def pair(seed=0, **arguments):
 
 
 @every_physics
-@pytest.mark.parametrize("options", [{}, {"sutton_barto_reward": True}, {"integrator": "semi-implicit"}])
+@pytest.mark.parametrize(
+    "options", [{}, {"sutton_barto_reward": True}, {"integrator": "semi-implicit"}]
+)
 def test_random_episodes_are_gymnasiums(physics, options):
     for seed in range(20):
         ours, theirs = pair(seed, physics=physics, **options)
         terminated, count = False, 0
         for action in np.random.default_rng(seed).integers(0, 2, 500):
             found, expected = ours.step(action), theirs.step(action)
-            np.testing.assert_allclose(ours.unwrapped.state, theirs.unwrapped.state, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(
+                ours.unwrapped.state, theirs.unwrapped.state, rtol=0, atol=1e-9
+            )
             np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=1e-6)
             assert found[1:4] == expected[1:4]
             count += 1
@@ -65,11 +69,16 @@ def test_terminations_are_at_gymnasiums_limits():
 
 
 @every_physics
-@pytest.mark.parametrize("options", [{"low": -0.2, "high": 0.2}, {"low": 0.01, "high": 0.02}, {"high": 0.1}, None])
+@pytest.mark.parametrize(
+    "options", [{"low": -0.2, "high": 0.2}, {"low": 0.01, "high": 0.02}, {"high": 0.1}, None]
+)
 def test_reset_options_are_gymnasiums(physics, options):
     ours, theirs = pair(physics=physics)
     for seed in range(20):
-        found, expected = ours.reset(seed=seed, options=options), theirs.reset(seed=seed, options=options)
+        found, expected = (
+            ours.reset(seed=seed, options=options),
+            theirs.reset(seed=seed, options=options),
+        )
         np.testing.assert_array_equal(found[0], expected[0])
 
 
@@ -89,7 +98,9 @@ def test_sutton_and_bartos_reward_is_the_same_in_every_face():
     many = make_sb3_vec_env("codrl_mj/CartPole-v0", 3, **arguments)
     many.seed(0)
     many.reset()
-    rewards, ended = np.array([many.step(np.ones(3, dtype=int))[1:3] for _ in range(40)]).swapaxes(0, 1)
+    rewards, ended = np.array([many.step(np.ones(3, dtype=int))[1:3] for _ in range(40)]).swapaxes(
+        0, 1
+    )
     np.testing.assert_array_equal(rewards, -ended)
     assert ended.any(axis=0).all()
     theirs = suite.load("cartpole", **arguments)

@@ -21,7 +21,13 @@ from tests.tasks.faces import every_rebuilt
 
 DISCRETE = ("cartpole", "acrobot", "mountain_car")
 CONTINUOUS = ("pendulum", "mountain_car_continuous")
-SPEED = {"pendulum": 1, "cartpole": 1, "acrobot": 3, "mountain_car": 1, "mountain_car_continuous": 1}
+SPEED = {
+    "pendulum": 1,
+    "cartpole": 1,
+    "acrobot": 3,
+    "mountain_car": 1,
+    "mountain_car_continuous": 1,
+}
 
 every_task = pytest.mark.parametrize("task", TASKS)
 every_command = pytest.mark.parametrize("command", ["current", "voltage"])
@@ -65,7 +71,9 @@ def test_a_current_is_the_force_that_it_makes(task, physics):
             info = env.step(action)[-1]
         assert info["desired_force"] == pytest.approx(force, rel=1e-12)
         assert info["reference_current"] == pytest.approx(meant(env, action), rel=1e-12)
-        np.testing.assert_allclose(list(info.values()), list(expected.values()), rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(
+            list(info.values()), list(expected.values()), rtol=1e-12, atol=1e-12
+        )
         np.testing.assert_allclose(env.state, by_force.state, rtol=0, atol=1e-12)
 
 
@@ -84,9 +92,23 @@ def test_the_end_of_the_space_asks_for_no_more_than_the_limit(physics, command):
 @pytest.mark.parametrize(
     ("task", "command", "actuator", "high"),
     [
-        *((task, command, MOTOR, LIMIT[task][command]) for task in CONTINUOUS for command in ("current", "voltage")),
-        ("pendulum", "voltage", Actuator(controller=CurrentLoop(max_voltage=24.0), supply=Supply(12.0)), 12.0),
-        ("pendulum", "voltage", Actuator(controller=CurrentLoop(max_voltage=math.inf), supply=Supply(12.0)), 12.0),
+        *(
+            (task, command, MOTOR, LIMIT[task][command])
+            for task in CONTINUOUS
+            for command in ("current", "voltage")
+        ),
+        (
+            "pendulum",
+            "voltage",
+            Actuator(controller=CurrentLoop(max_voltage=24.0), supply=Supply(12.0)),
+            12.0,
+        ),
+        (
+            "pendulum",
+            "voltage",
+            Actuator(controller=CurrentLoop(max_voltage=math.inf), supply=Supply(12.0)),
+            12.0,
+        ),
     ],
 )
 def test_the_space_ends_at_the_largest_command(task, command, actuator, high):
@@ -119,13 +141,17 @@ def test_a_voltage_drives_the_winding_and_that_the_task(task, physics):
         state, voltage = env.state, meant(env, action)
         start = state.copy()
         for _ in range(inner):
-            current = winding(motor, dt, loop.substeps, loop.max_voltage, current, voltage, state[SPEED[task]])
+            current = winding(
+                motor, dt, loop.substeps, loop.max_voltage, current, voltage, state[SPEED[task]]
+            )
             force = motor.torque_constant * current / motor.arm_radius
             state = np.array(driver(state, force, dt, env.setup.plant.integrator))
         info = env.step(action)[-1]
         np.testing.assert_allclose(env.state, state, rtol=0, atol=1e-12)
         assert info["current"] == pytest.approx(current, rel=0, abs=1e-12)
-        assert info["desired_force"] == info["actual_force"] == pytest.approx(force, rel=0, abs=1e-12)
+        assert (
+            info["desired_force"] == info["actual_force"] == pytest.approx(force, rel=0, abs=1e-12)
+        )
         assert info["reference_current"] == info["current"]
         assert info["voltage"] == pytest.approx(voltage, rel=0, abs=1e-12)
         moved, current = max(moved, np.abs(state - start).max()), info["current"]
@@ -143,7 +169,9 @@ def test_without_back_emf_the_current_is_that_of_a_locked_winding(task, physics)
     voltage = 4.0 if task in DISCRETE else 3.7
     for step in range(1, 20):
         info = env.step(action)[-1]
-        assert info["current"] == pytest.approx(voltage / 1.2 * (1 - decay ** (3 * inner * step)), rel=1e-12)
+        assert info["current"] == pytest.approx(
+            voltage / 1.2 * (1 - decay ** (3 * inner * step)), rel=1e-12
+        )
 
 
 def test_pendulum_under_voltages_is_mujocos_dcmotor():
@@ -153,15 +181,22 @@ def test_pendulum_under_voltages_is_mujocos_dcmotor():
     spec.option.timestep = dt
     joint = spec.actuator("motor").target
     spec.delete(spec.actuator("motor"))
-    driver = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint, gear=[1 / arm, 0, 0, 0, 0, 0])
+    driver = spec.add_actuator(
+        trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint, gear=[1 / arm, 0, 0, 0, 0, 0]
+    )
     driver.set_to_dcmotor(
-        motorconst=[k, k], resistance=r, inductance=[inductance, 0.0], ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE)
+        motorconst=[k, k],
+        resistance=r,
+        inductance=[inductance, 0.0],
+        ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE),
     )
     native = spec.compile()
     data = mujoco.MjData(native)
     assert native.na == 1
     equivalent = r * dt / (1.0 - math.exp(-r * dt / inductance))
-    motor = Motor(resistance=r, inductance=equivalent, torque_constant=k, back_emf_constant=k, arm_radius=arm)
+    motor = Motor(
+        resistance=r, inductance=equivalent, torque_constant=k, back_emf_constant=k, arm_radius=arm
+    )
     env = make("pendulum", "voltage", actuator=Actuator(motor, CurrentLoop(max_voltage=5.0)))
     env.physics.reset(np.array([2.5, 0.0]))
     data.qpos[:] = 2.5
@@ -178,7 +213,14 @@ def test_pendulum_under_voltages_is_mujocos_dcmotor():
 @every_task
 @every_physics
 def test_under_voltages_the_controller_has_no_say_but_supply_and_substeps_count(task, physics):
-    gains = {"kp": 0.3, "ki": 7.0, "kd": 0.01, "kff": 3.0, "integral_leak": 0.0, "derivative_time_constant": 0.2}
+    gains = {
+        "kp": 0.3,
+        "ki": 7.0,
+        "kd": 0.01,
+        "kff": 3.0,
+        "integral_leak": 0.0,
+        "derivative_time_constant": 0.2,
+    }
     counting = [{"substeps": 1}, *([{"max_voltage": 3.0}] if task in CONTINUOUS else [])]
     actions, runs = sampled(make(task, "voltage"), 30), []
     for fields in ({}, {**gains, "bemf_compensation": False}, *counting):
@@ -204,7 +246,10 @@ def test_voltages_beyond_the_supply_saturate(task, physics):
     beyond, at = (make(task, "voltage", physics=physics) for _ in range(2))
     for voltage in (100.0, -np.inf, np.inf, 4.0):
         for _ in range(5):
-            found, expected = beyond.step(np.array([voltage])), at.step(np.array([np.clip(voltage, -4.0, 4.0)]))
+            found, expected = (
+                beyond.step(np.array([voltage])),
+                at.step(np.array([np.clip(voltage, -4.0, 4.0)])),
+            )
             np.testing.assert_array_equal(found[0], expected[0])
             assert found[-1] == expected[-1]
             assert found[-1]["voltage"] == pytest.approx(np.sign(voltage) * 4.0, rel=1e-15)
@@ -234,7 +279,18 @@ def test_the_table_is_the_environments_own():
     assert env.step(1)[-1]["voltage"] == pytest.approx(1.0)
 
 
-BAD_LEVELS = [None, (), (1.0,), (0.0, math.nan), (0.0, math.inf), (0.0, 9.0), ((0.0, 1.0),), 1.0, "ab", {"a": 1}]
+BAD_LEVELS = [
+    None,
+    (),
+    (1.0,),
+    (0.0, math.nan),
+    (0.0, math.inf),
+    (0.0, 9.0),
+    ((0.0, 1.0),),
+    1.0,
+    "ab",
+    {"a": 1},
+]
 
 
 @pytest.mark.parametrize("task", DISCRETE)
@@ -242,11 +298,15 @@ BAD_LEVELS = [None, (), (1.0,), (0.0, math.nan), (0.0, math.inf), (0.0, 9.0), ((
 @pytest.mark.parametrize("levels", BAD_LEVELS, ids=repr)
 def test_a_bad_table_is_refused_with_one_that_works(task, command, levels):
     actuator = changed(MOTOR, arm_radius=1 / 3, max_voltage=8 / 9)
-    with pytest.raises(ValueError, match=re.escape(f"levels = {levels!r}: {task} has discrete actions")) as refused:
+    with pytest.raises(
+        ValueError, match=re.escape(f"levels = {levels!r}: {task} has discrete actions")
+    ) as refused:
         make(task, command, actuator=actuator, levels=levels)
     found = re.search(r"such as levels=\((.*), 0, (.*)\)$", str(refused.value))
     make(task, command, actuator=actuator, levels=(float(found[1]), 0.0, float(found[2])))
-    assert float(found[2]) == pytest.approx(TASKS[task].max_force / 3 / 0.8 if command == "current" else 8 / 9)
+    assert float(found[2]) == pytest.approx(
+        TASKS[task].max_force / 3 / 0.8 if command == "current" else 8 / 9
+    )
 
 
 def test_a_level_may_be_at_the_limit_and_no_further():
@@ -277,7 +337,9 @@ def test_an_action_of_any_type_of_number_is_the_same(task, command):
 @every_physics
 @pytest.mark.parametrize("command", ["force", "current", "voltage"])
 def test_observed_currents_are_those_of_the_info_and_zero_at_the_start(task, command, physics):
-    env, blind = (make(task, command, physics=physics, observe_actuator=sees) for sees in (True, False))
+    env, blind = (
+        make(task, command, physics=physics, observe_actuator=sees) for sees in (True, False)
+    )
     space, plain = env.observation_space, TASKS[task].observation_space
     size = plain.shape[0]
     assert space.shape == (size + 2,)

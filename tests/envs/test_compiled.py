@@ -24,17 +24,28 @@ PULSES = {"pulse_force": 0.3, "pulse_duration": 0.1, "pulse_interval": 0.5}
 SETUPS = {
     "ideal": {"actuator": "ideal"},
     "motor": {"observe_actuator": True},
-    "disturbed": {"disturbances": {"command_delay": 0.03, "command_quantum": 0.1, "command_rate": 50.0, **PULSES}},
+    "disturbed": {
+        "disturbances": {
+            "command_delay": 0.03,
+            "command_quantum": 0.1,
+            "command_rate": 50.0,
+            **PULSES,
+        }
+    },
     "sensing": {"observe_actuator": True, "actuator": NOISY},
     "voltage": {"observe_actuator": True, "action": "voltage", "actuator": NOISY},
 }
 KEPT = [("pendulum", "motor"), ("cartpole", "disturbed")]
-every_setup = pytest.mark.parametrize(("task", "kind"), but(KEPT, itertools.product(REBUILT, SETUPS)))
+every_setup = pytest.mark.parametrize(
+    ("task", "kind"), but(KEPT, itertools.product(REBUILT, SETUPS))
+)
 
 
 def _env(task, kind="motor", **more):
     arguments = SETUPS[kind] | more
-    if arguments.get("action") == "voltage" and isinstance(TASKS[task].action_space, gymnasium.spaces.Discrete):
+    if arguments.get("action") == "voltage" and isinstance(
+        TASKS[task].action_space, gymnasium.spaces.Discrete
+    ):
         arguments |= {"levels": (-3.0, 0.0, 3.0)}
     if arguments.get("actuator") is NOISY:
         arguments |= {"actuator": actuator_over(named_actuator("paper", task), NOISY)}
@@ -80,7 +91,8 @@ def test_a_step_is_the_plain_composition_of_engine_bounds_and_task(task, kind):
             expected = np.array(definition.observation(after), np.float32)
             np.testing.assert_allclose(observation[:size], expected, rtol=2e-7, atol=0)
             np.testing.assert_array_equal(
-                observation[size:], np.float32([info["current"], info["reference_current"]])[: len(observation) - size]
+                observation[size:],
+                np.float32([info["current"], info["reference_current"]])[: len(observation) - size],
             )
             plain = definition.reward(before, info["actual_force"], after, definition.options())
             assert reward == pytest.approx(float(plain), rel=1e-14, abs=1e-14)
@@ -112,7 +124,10 @@ def test_a_compiled_loop_is_the_loop_over_the_environment_bit_for_bit(task, kind
     forces = parts.forces
     if forces is None:
         table = generator.uniform(-1, 1, (50, 1)).astype(np.float32) * ours.action_space.high
-        forces, chosen = np.array([theirs.setup.commands.force(action) for action in table]), np.arange(50)
+        forces, chosen = (
+            np.array([theirs.setup.commands.force(action) for action in table]),
+            np.arange(50),
+        )
         given = list(table)
     else:
         chosen = generator.integers(len(forces), size=50)
@@ -134,7 +149,10 @@ def test_a_compiled_loop_is_the_loop_over_the_environment_bit_for_bit(task, kind
 
 def test_what_python_has_to_do_is_not_offered_as_compiled():
     assert compiled_env(ActuatedEnv("pendulum", physics="analytic")) is None
-    assert compiled_env(ActuatedEnv("pendulum", randomize={"motor.inductance": Uniform(0.08, 0.12)})) is None
+    assert (
+        compiled_env(ActuatedEnv("pendulum", randomize={"motor.inductance": Uniform(0.08, 0.12)}))
+        is None
+    )
 
 
 def test_what_a_user_writes_into_the_data_is_where_the_step_begins():

@@ -22,7 +22,9 @@ every_setup = pytest.mark.parametrize("setup", SETUPS)
 
 def make(task, setup, physics="mujoco", **more):
     """The environment as a user makes it, in Gymnasium's wrappers."""
-    return gymnasium.make(TASKS[task].env_id, physics=physics, **arguments(task, setup, physics), **more)
+    return gymnasium.make(
+        TASKS[task].env_id, physics=physics, **arguments(task, setup, physics), **more
+    )
 
 
 class Blank(gymnasium.Env):
@@ -54,19 +56,27 @@ def _complaints(check, env, **options):
 @every_rebuilt
 @every_physics
 @every_setup
-@pytest.mark.parametrize("check", [check_env, check_env_sb3], ids=["gymnasium", "stable_baselines3"])
+@pytest.mark.parametrize(
+    "check", [check_env, check_env_sb3], ids=["gymnasium", "stable_baselines3"]
+)
 def test_the_checkers_complain_about_nothing_but_the_spaces(check, task, physics, setup):
     env = make(task, setup, physics).unwrapped
-    of_spaces = _complaints(check, Blank(env.action_space, env.observation_space), skip_render_check=True)
+    of_spaces = _complaints(
+        check, Blank(env.action_space, env.observation_space), skip_render_check=True
+    )
     assert _complaints(check, env, skip_render_check=True) <= of_spaces
 
 
 @pytest.mark.parametrize("task", but(["pendulum"], REBUILT))
 def test_gymnasiums_checker_has_no_complaint_about_rendering(task, monkeypatch):
-    monkeypatch.setattr("codrl_mj.envs.single.Window", unittest.mock.Mock())  # pygame may not be there
+    monkeypatch.setattr(
+        "codrl_mj.envs.single.Window", unittest.mock.Mock()
+    )  # pygame may not be there
     env = make(task, "force", render_mode="rgb_array", width=64, height=48)
     blank = Blank(env.action_space, env.observation_space)
-    assert _complaints(check_env, env.unwrapped) <= _complaints(check_env, blank, skip_render_check=True)
+    assert _complaints(check_env, env.unwrapped) <= _complaints(
+        check_env, blank, skip_render_check=True
+    )
     env.close()
 
 
@@ -74,14 +84,19 @@ def test_gymnasiums_checker_has_no_complaint_about_rendering(task, monkeypatch):
 @every_physics
 @every_setup
 def test_steps_have_gymnasiums_types_and_observations_are_in_the_space(task, physics, setup):
-    env, original = make(task, setup, physics, max_episode_steps=12), gymnasium.make(TASKS[task].gymnasium_id)
+    env, original = (
+        make(task, setup, physics, max_episode_steps=12),
+        gymnasium.make(TASKS[task].gymnasium_id),
+    )
     if setup in ("ideal", "force"):
         assert env.action_space == original.action_space
         assert env.observation_space == original.observation_space
     env.action_space.seed(0)
     for seed in range(12):
         observation, info = env.reset(seed=seed)
-        assert info.keys() == ({"randomization"} if "randomize" in arguments(task, setup, physics) else set())
+        assert info.keys() == (
+            {"randomization"} if "randomize" in arguments(task, setup, physics) else set()
+        )
         over = False
         while not over:
             assert observation in env.observation_space
@@ -89,7 +104,14 @@ def test_steps_have_gymnasiums_types_and_observations_are_in_the_space(task, phy
             assert observation.dtype == np.float32
             assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
             assert {*info} == {
-                *("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated")
+                *(
+                    "desired_force",
+                    "actual_force",
+                    "current",
+                    "reference_current",
+                    "voltage",
+                    "saturated",
+                )
             }
             assert isinstance(info["saturated"], bool)
             if setup != "voltage":
@@ -110,7 +132,9 @@ def test_the_ideal_actuator_delivers_what_is_desired_and_a_motor_tracks_its_curr
         assert info["current"] == info["reference_current"] == info["voltage"] == 0.0
         assert not info["saturated"]
         info = driven.step(action)[-1]
-        assert info["reference_current"] == pytest.approx(info["desired_force"] * 0.5 / 0.8)  # arm and kT
+        assert info["reference_current"] == pytest.approx(
+            info["desired_force"] * 0.5 / 0.8
+        )  # arm and kT
 
 
 @every_rebuilt
@@ -119,7 +143,9 @@ def test_mujoco_model_and_data_are_at_hand_and_analytic_physics_says_it_has_none
     env.reset(seed=0)
     env.step(env.action_space.sample())
     assert env.data.time == pytest.approx(env.task.step_duration)
-    assert env.model.opt.timestep == pytest.approx(env.task.step_duration / env.task.motor_inner_steps)
+    assert env.model.opt.timestep == pytest.approx(
+        env.task.step_duration / env.task.motor_inner_steps
+    )
     np.testing.assert_array_equal(env.state[list(env.task.qpos)], env.data.qpos)
     np.testing.assert_array_equal(env.state[list(env.task.qvel)], env.data.qvel)
     with pytest.raises(AttributeError, match="AnalyticPhysics has no MuJoCo model or data"):

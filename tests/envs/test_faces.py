@@ -13,7 +13,18 @@ from safetensors.numpy import load, load_file, save, save_file
 from codrl_mj import suite
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.tasks import TASKS
-from tests.envs.faces import FACES, LIMITED, PHYSICS, SETUPS, arguments, arrays, begun, made, plain, run
+from tests.envs.faces import (
+    FACES,
+    LIMITED,
+    PHYSICS,
+    SETUPS,
+    arguments,
+    arrays,
+    begun,
+    made,
+    plain,
+    run,
+)
 from tests.envs.vectors import assert_same
 from tests.tasks.faces import every_rebuilt
 
@@ -38,7 +49,9 @@ def test_copies_and_restored_snapshots_go_on_as_the_original(face, task, setup):
         following = []
         for one in (env, *twins):
             assert_same(one.snapshot(), kept)  # which moves with none of those before
-            if steps is None and face == "serial, analytic":  # Gymnasium's time limit insists on a reset
+            if (
+                steps is None and face == "serial, analytic"
+            ):  # Gymnasium's time limit insists on a reset
                 begun(one)
             following.append(run(one, 60, seed=1))
         for other in following[1:]:
@@ -72,7 +85,9 @@ def test_both_physics_tell_the_same_story(task, setup):
     """Over the first steps, before chaos: states, rewards, ends and signals."""
     given = arguments(task, setup, "analytic")
     pair = [ActuatedEnv(task, physics=physics, **given) for physics in PHYSICS]
-    for one, other in zip(*(arrays(plain((begun(env, 7), run(env, 15, seed=0)))) for env in pair), strict=True):
+    for one, other in zip(
+        *(arrays(plain((begun(env, 7), run(env, 15, seed=0)))) for env in pair), strict=True
+    ):
         rounding = 1e-6 if one.dtype == np.float32 else 1e-9
         np.testing.assert_allclose(one, other, rtol=rounding, atol=rounding)
 
@@ -89,9 +104,16 @@ def test_dm_control_has_the_episodes_of_a_single_environment(task, setup):
         assert theirs.randomization == info.get("randomization", {})
         while not step.last():
             action = ours.action_space.sample()
-            step, (seen, reward, terminated, truncated, info) = theirs.step(action), ours.step(action)
+            step, (seen, reward, terminated, truncated, info) = (
+                theirs.step(action),
+                ours.step(action),
+            )
             np.testing.assert_array_equal(np.concatenate([*step.observation.values()]), seen)
-            assert (step.reward, step.last(), theirs.info) == (reward, terminated or truncated, info)
+            assert (step.reward, step.last(), theirs.info) == (
+                reward,
+                terminated or truncated,
+                info,
+            )
             np.testing.assert_array_equal(theirs.state, ours.unwrapped.state)
 
 

@@ -25,7 +25,10 @@ ARGUMENTS = {
     "mapping": {"actuator": {"motor": {"inductance": 0.3}}},
     "pattern": {"actuator": {".*": "weak"}},
     "one for each": {"actuator": ["weak", "weaker"]},
-    "one for each, drawn": {"actuator": ["weak", "weaker"], "randomize": {"motor.resistance": "uniform(1, 2)"}},
+    "one for each, drawn": {
+        "actuator": ["weak", "weaker"],
+        "randomize": {"motor.resistance": "uniform(1, 2)"},
+    },
     "rendered": {"render_mode": "rgb_array", "width": 64, "height": 48, "num_threads": 1},
     "options": {"options": {"center_radius": 0.01}},
     "option": {"center_radius": 0.01, "sutton_barto_reward": True},
@@ -39,8 +42,12 @@ VECTORS = {
     "class": lambda num_envs, **given: ActuatedVectorEnv(
         num_envs, "cartpole", **{"autoreset_mode": "SameStep", **given}
     ),
-    "Gymnasium": lambda num_envs, **given: gymnasium.make_vec(ID, num_envs, **{"autoreset_mode": "SameStep", **given}),
-    "Stable-Baselines3, name": lambda num_envs, **given: make_sb3_vec_env("cartpole", num_envs, **given),
+    "Gymnasium": lambda num_envs, **given: gymnasium.make_vec(
+        ID, num_envs, **{"autoreset_mode": "SameStep", **given}
+    ),
+    "Stable-Baselines3, name": lambda num_envs, **given: make_sb3_vec_env(
+        "cartpole", num_envs, **given
+    ),
     "Stable-Baselines3, configuration": lambda num_envs, **given: make_sb3_vec_env(
         EnvConfig("cartpole"), num_envs, **given
     ),
@@ -55,7 +62,11 @@ SINGLE = {
 
 def of_gymnasium(given):
     """Gymnasium's loop over environments with the same arguments."""
-    single = {name: value for name, value in given.items() if name not in ("num_threads", "autoreset_mode")}
+    single = {
+        name: value
+        for name, value in given.items()
+        if name not in ("num_threads", "autoreset_mode")
+    }
     mode = AutoresetMode(given.get("autoreset_mode", "SameStep"))
     return looped("cartpole", COUNT, mode, **LIMITED, **single)
 
@@ -111,7 +122,10 @@ def test_one_by_one_too_an_episode_that_ended_is_reset_when_it_was_asked_for(mod
 
 
 def test_a_snapshot_knows_which_of_the_serial_environments_are_to_be_reset():
-    envs, other = (make_vec("cartpole", 2, physics="analytic", autoreset_mode="NextStep", **LIMITED) for _ in "12")
+    envs, other = (
+        make_vec("cartpole", 2, physics="analytic", autoreset_mode="NextStep", **LIMITED)
+        for _ in "12"
+    )
     generator = np.random.default_rng(0)
     envs.reset(seed=0)
     for _ in range(4):
@@ -135,23 +149,33 @@ def test_what_is_stepped_one_by_one_has_no_threads_and_says_so(env):
 
 
 def test_a_window_is_the_only_thing_that_makes_a_task_slow_and_that_is_said():
-    with pytest.warns(UserWarning, match="render_mode = 'human': 1 environments of pendulum are stepped one by one"):
+    with pytest.warns(
+        UserWarning,
+        match="render_mode = 'human': 1 environments of pendulum are stepped one by one",
+    ):
         envs = make_vec("pendulum", 1, render_mode="human")
     assert isinstance(envs, SerialVectorEnv)
     envs.close()
 
 
 def test_none_leaves_the_time_limit_of_a_task_as_it_is():
-    made = make_vec("cartpole", 1, max_episode_steps=None), make_sb3_vec_env("cartpole", 1, max_episode_steps=None).env
+    made = (
+        make_vec("cartpole", 1, max_episode_steps=None),
+        make_sb3_vec_env("cartpole", 1, max_episode_steps=None).env,
+    )
     assert [env.max_episode_steps for env in made] == [gymnasium.spec(ID).max_episode_steps] * 2
 
 
 def test_actuators_stand_third_in_every_factory():
-    for env, pattern in itertools.product(("pendulum", EnvConfig("pendulum", "weak")), (".*", "motor")):
+    for env, pattern in itertools.product(
+        ("pendulum", EnvConfig("pendulum", "weak")), (".*", "motor")
+    ):
         given = env, 2, {pattern: "lag"}
         for batch in make_vec(*given), make_sb3_vec_env(*given).env:
             assert batch.setup.config.actuator == codrl_mj.actuators.Lag()
-    with pytest.raises(ValueError, match=r"the function makes environments that have their motors: leave it out"):
+    with pytest.raises(
+        ValueError, match=r"the function makes environments that have their motors: leave it out"
+    ):
         make_sb3_vec_env(functools.partial(make, "Reacher-v5", "lag"), 1, "lag")
 
 
@@ -207,12 +231,27 @@ def test_another_task_given_over_a_configuration_is_that_task():
         (lambda: make_vec("pendulum", 3, ["lag", "lag"]), "2 actuators for 3 environments"),
         (
             lambda: make("pendulum", ["lag", "lag"]),
-            r"got 2 actuators, but pendulum has 1 motor \(motor\); a list .* is for codrl_mj.make_vec",
+            (
+                r"got 2 actuators, but pendulum has 1 motor \(motor\); a list .* is for"
+                r" codrl_mj.make_vec"
+            ),
         ),
-        (lambda: make_vec("pendulum", 2, actuater="lag"), "unknown option 'actuater' of pendulum: did you mean 'actua"),
-        (lambda: EnvConfig("cartpole", options=3), "options = 3: must be a mapping of option names to values"),
-        (lambda: make("cartpole", options="ab"), "options = 'ab': must be a mapping of option names to values"),
-        (lambda: suite.load(make), "must be a task's name or an EnvConfig; others go into DmEnvironment"),
+        (
+            lambda: make_vec("pendulum", 2, actuater="lag"),
+            "unknown option 'actuater' of pendulum: did you mean 'actua",
+        ),
+        (
+            lambda: EnvConfig("cartpole", options=3),
+            "options = 3: must be a mapping of option names to values",
+        ),
+        (
+            lambda: make("cartpole", options="ab"),
+            "options = 'ab': must be a mapping of option names to values",
+        ),
+        (
+            lambda: suite.load(make),
+            "must be a task's name or an EnvConfig; others go into DmEnvironment",
+        ),
     ],
 )
 def test_what_does_not_go_is_refused_by_its_name(act, message):

@@ -13,9 +13,34 @@ from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import every_rebuilt
 
-NOT_OF_THE_TASK = {"last_u", "np_random", "np_random_seed", "state", "steps_beyond_terminated", "unwrapped"}
-NOT_OF_THE_TASK |= {"action_space", "high", "high_state", "low", "low_state", "metadata", "observation_space", "spec"}
-NOT_OF_THE_TASK |= {"action_arrow", "actions_num", "clock", "domain_fig", "isopen", "render_mode", "screen", "surf"}
+NOT_OF_THE_TASK = {
+    "last_u",
+    "np_random",
+    "np_random_seed",
+    "state",
+    "steps_beyond_terminated",
+    "unwrapped",
+}
+NOT_OF_THE_TASK |= {
+    "action_space",
+    "high",
+    "high_state",
+    "low",
+    "low_state",
+    "metadata",
+    "observation_space",
+    "spec",
+}
+NOT_OF_THE_TASK |= {
+    "action_arrow",
+    "actions_num",
+    "clock",
+    "domain_fig",
+    "isopen",
+    "render_mode",
+    "screen",
+    "surf",
+}
 NOT_OF_THE_TASK |= {"SCREEN_DIM", "screen_dim", "screen_height", "screen_width"}
 
 WRITES = [
@@ -24,7 +49,10 @@ WRITES = [
     ("cartpole", {"length": 0.8, "polemass_length": 0.1 * 0.8}),
     ("cartpole", {"masscart": 2.5, "total_mass": 2.5 + 0.1}),
     ("cartpole", {"masspole": 0.3, "total_mass": 1.0 + 0.3, "polemass_length": 0.3 * 0.5}),
-    ("cartpole", {"length": 1.1, "masspole": 0.3, "total_mass": 1.0 + 0.3, "polemass_length": 0.3 * 1.1}),
+    (
+        "cartpole",
+        {"length": 1.1, "masspole": 0.3, "total_mass": 1.0 + 0.3, "polemass_length": 0.3 * 1.1},
+    ),
     ("cartpole", {"force_mag": 14.0}),
     ("cartpole", {"tau": 0.01}),
     ("pendulum", {"g": 3.7}),
@@ -58,7 +86,9 @@ def _run(env, task, seed):
     states = []
     for _ in range(50):
         forces = TASKS[task].forces
-        env.step(generator.uniform(-4.0, 4.0, 1) if forces is None else generator.integers(len(forces)))
+        env.step(
+            generator.uniform(-4.0, 4.0, 1) if forces is None else generator.integers(len(forces))
+        )
         states.append(np.array(env.state, dtype=np.float64))
     return np.array(states)
 
@@ -70,14 +100,18 @@ def test_every_number_that_gymnasiums_environment_has_can_be_read(task, physics)
     ours.reset(seed=0)
     ours.step(ours.action_space.sample())  # which drives the analytic physics through attributes
     names = [name for name in dir(theirs) if name[0] != "_" and name not in NOT_OF_THE_TASK]
-    expected = {name: value for name in names if not inspect.isroutine(value := getattr(theirs, name))}
+    expected = {
+        name: value for name in names if not inspect.isroutine(value := getattr(theirs, name))
+    }
     assert len(expected) >= 6
     assert {name: getattr(ours, name) for name in expected} == expected
 
 
 @pytest.mark.filterwarnings("ignore:.*already returned terminated")
 @pytest.mark.parametrize(
-    ("task", "values"), WRITES, ids=lambda given: given if isinstance(given, str) else "+".join(given)
+    ("task", "values"),
+    WRITES,
+    ids=lambda given: given if isinstance(given, str) else "+".join(given),
 )
 @pytest.mark.parametrize("physics", PHYSICS)
 def test_a_written_number_has_the_effect_that_it_has_in_gymnasium(task, values, physics):
@@ -129,7 +163,12 @@ def test_wrappers_and_copies_have_the_attributes():
     env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal")
     assert env.has_wrapper_attr("gravity")
     assert env.set_wrapper_attr("gravity", 10.0)
-    assert env.get_wrapper_attr("gravity") == env.unwrapped.gravity == copy.deepcopy(env).unwrapped.gravity == 10.0
+    assert (
+        env.get_wrapper_attr("gravity")
+        == env.unwrapped.gravity
+        == copy.deepcopy(env).unwrapped.gravity
+        == 10.0
+    )
     assert env.unwrapped.model.opt.gravity[2] == -10.0
     assert not env.has_wrapper_attr("gravitation")
     env.unwrapped.gravitation = 1  # any other attribute is just one
@@ -138,7 +177,8 @@ def test_wrappers_and_copies_have_the_attributes():
 @pytest.mark.filterwarnings("ignore:.*already returned terminated")
 @pytest.mark.parametrize("mode", ["sync", "vector_entry_point"])
 @pytest.mark.parametrize(
-    ("task", "name", "values"), [("cartpole", "gravity", [9.81, 3.72, 1.62]), ("pendulum", "l", [1.0, 1.5, 0.7])]
+    ("task", "name", "values"),
+    [("cartpole", "gravity", [9.81, 3.72, 1.62]), ("pendulum", "l", [1.0, 1.5, 0.7])],
 )
 def test_environments_of_a_vector_have_values_and_states_of_their_own(task, mode, name, values):
     env = gymnasium.make_vec(TASKS[task].env_id, 3, mode, actuator="ideal")
@@ -227,7 +267,9 @@ def test_a_physics_of_ones_own_without_a_model_says_that_it_has_no_such_number(m
     env = _pair("cartpole", physics="still")[0]
     assert (env.x_threshold, env.force_mag) == (2.4, 10.0)
     for name in ("gravity", "masspole"):
-        with pytest.raises(AttributeError, match=r"Still has no MuJoCo model or data.* use physics='mujoco'"):
+        with pytest.raises(
+            AttributeError, match=r"Still has no MuJoCo model or data.* use physics='mujoco'"
+        ):
             getattr(env, name)
     with pytest.raises(AttributeError, match="Still has no MuJoCo model or data"):
         env.tau = 0.1

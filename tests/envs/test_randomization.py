@@ -50,7 +50,9 @@ def test_values_have_the_distributions_that_were_asked_for():
         assert scipy.stats.chisquare(counts).pvalue > 1e-3
     assert drawn["controller.substeps"].dtype.kind == "i"
     assert drawn["controller.bemf_compensation"].dtype == bool
-    table = np.array([drawn[name] for name in asked if name != "controller.max_voltage"], dtype=float)
+    table = np.array(
+        [drawn[name] for name in asked if name != "controller.max_voltage"], dtype=float
+    )
     correlations = np.corrcoef(table) - np.eye(len(table))
     assert np.abs(correlations).max() < 0.07  # 4.4 standard deviations: no two share a draw
 
@@ -63,13 +65,20 @@ def test_values_have_the_distributions_that_were_asked_for():
         (Choice([3.0, 1.0, 2.0]), lambda draw: np.array([3.0, 1.0, 2.0])[(3 * draw).astype(int)]),
     ],
 )
-def test_a_value_is_the_formula_of_its_draw_within_the_bounds_however_many_are_drawn(distribution, formula):
+def test_a_value_is_the_formula_of_its_draw_within_the_bounds_however_many_are_drawn(
+    distribution, formula
+):
     draws = np.random.default_rng(0).random(257)
     draws[:2] = 0.0, np.nextafter(1.0, 0.0)
     values = distribution.transform(draws)
-    np.testing.assert_allclose(values, formula(draws), rtol=1e-15 if isinstance(distribution, LogUniform) else 0)
+    np.testing.assert_allclose(
+        values, formula(draws), rtol=1e-15 if isinstance(distribution, LogUniform) else 0
+    )
     for size in (1, 2, 3, 5, 8, 13, 64):
-        parts = [distribution.transform(draws[start : start + size]) for start in range(0, len(draws), size)]
+        parts = [
+            distribution.transform(draws[start : start + size])
+            for start in range(0, len(draws), size)
+        ]
         np.testing.assert_array_equal(np.concatenate(parts), values)
     assert min(distribution.extremes) <= values.min()
     assert values.max() <= max(distribution.extremes)
@@ -86,7 +95,8 @@ def test_seeds_draw_gymnasiums_initial_states_all_the_same(task):
         np.testing.assert_array_equal(seen, expected)
         assert info["randomization"]["rejected"] == 0
         assert undrawn.reset(seed=seed)[1] == {}
-    # without randomisation nothing more is drawn: a second episode is the second of Gymnasium's, too
+    # without randomisation nothing more is drawn: a second episode is the second of Gymnasium's,
+    # too
     np.testing.assert_array_equal(undrawn.reset()[0], gym.reset()[0])
 
 
@@ -105,7 +115,9 @@ def test_the_drawn_actuator_is_what_acts(task, physics):
         same = ActuatedEnv(task, physics=physics, actuator=actuator)
         same.reset(seed=seed)
         for action in actions(task, seed, 25):
-            assert_same(plain((ours.step(action), ours.state)), plain((same.step(action), same.state)))
+            assert_same(
+                plain((ours.step(action), ours.state)), plain((same.step(action), same.state))
+            )
         ends.add(tuple(ours.state))
         if physics == "mujoco":
             assert tuple(ours.model.actuator_user[0, HEAD:]) == actuator.numbers
@@ -125,7 +137,9 @@ class _DampedAcrobot:
 def changed_gymnasium(task, drawn):
     """Gymnasium's environment with its attributes changed as the drawn factors say, as a function: one step."""
     gravity = drawn["model.gravity"]
-    if task == "acrobot":  # its gravity is no attribute: lengths / k, masses * k, inertias and torque / k are the same
+    if (
+        task == "acrobot"
+    ):  # its gravity is no attribute: lengths / k, masses * k, inertias and torque / k are the same
         env = type("Damped", (_DampedAcrobot, type(gymnasiums(task).unwrapped)), {})()
     else:
         env = gymnasiums("mountain_car" if task == "mountain_car_continuous" else task).unwrapped
@@ -146,19 +160,26 @@ def changed_gymnasium(task, drawn):
         env.LINK_LENGTH_1 = drawn["model.length.upper"] / gravity
         env.LINK_COM_POS_1 = 0.5 * drawn["model.length.upper"] / gravity
         env.LINK_COM_POS_2 = 0.5 * drawn["model.length.lower"] / gravity
-        moments = [drawn[f"model.mass.{link}"] * drawn[f"model.length.{link}"] ** 2 for link in ("upper", "lower")]
+        moments = [
+            drawn[f"model.mass.{link}"] * drawn[f"model.length.{link}"] ** 2
+            for link in ("upper", "lower")
+        ]
         assert moments[0] == pytest.approx(moments[1], rel=1e-14)  # Gymnasium has one for both
         env.LINK_MOI = moments[0] / gravity
         env.AVAIL_TORQUE = [torque / gravity for torque in (-1.0, 0.0, 1.0)]
         env.damping = drawn.get("model.damping.elbow", 0.0) / gravity
     else:
         env.gravity *= gravity
-        env.force = (0.0015 if task == "mountain_car_continuous" else 0.001) / drawn["model.mass.car"]
+        env.force = (0.0015 if task == "mountain_car_continuous" else 0.001) / drawn[
+            "model.mass.car"
+        ]
 
     def step(state, action):
         env.reset(seed=0)
         env.state = tuple(state) if task != "acrobot" else np.array(state)
-        if task == "mountain_car_continuous":  # Gymnasium's own rounds its state: the discrete one, with its power
+        if (
+            task == "mountain_car_continuous"
+        ):  # Gymnasium's own rounds its state: the discrete one, with its power
             env.force *= abs(float(action[0]))
             env.step(2 if action[0] > 0 else 0)
             env.force /= abs(float(action[0]))
@@ -184,9 +205,15 @@ def test_masses_lengths_gravity_and_damping_are_those_of_gymnasium_with_changed_
     generator = np.random.default_rng(5)
     for _ in range(6):
         factors = _factors(task, generator)
-        ours = ActuatedEnv(task, "ideal", randomize={name: Uniform(value, value) for name, value in factors.items()})
+        ours = ActuatedEnv(
+            task,
+            "ideal",
+            randomize={name: Uniform(value, value) for name, value in factors.items()},
+        )
         assert ours.reset(seed=0)[1]["randomization"] == factors | {"rejected": 0}
-        step, unchanged = (changed_gymnasium(task, one) for one in (factors, dict.fromkeys(scales(task), 1.0)))
+        step, unchanged = (
+            changed_gymnasium(task, one) for one in (factors, dict.fromkeys(scales(task), 1.0))
+        )
         for state, action in zip(random_states(task, 1, 5), actions(task, 2, 5), strict=True):
             ours.physics.reset(state)
             ours.step(action)
@@ -215,25 +242,36 @@ def test_a_damped_pendulum_and_car_take_the_damping_implicitly(damping):
 
 def test_cartpoles_explicit_euler_takes_the_damping_explicitly():
     damping, step = {"slider": 0.7, "hinge": 0.02}, 0.02
-    randomize = {f"model.damping.{joint}": Uniform(value, value) for joint, value in damping.items()}
+    randomize = {
+        f"model.damping.{joint}": Uniform(value, value) for joint, value in damping.items()
+    }
     explicit, free = (ActuatedEnv("cartpole", "ideal", randomize=r) for r in (randomize, None))
     state = np.array([0.1, -0.8, 0.12, 1.1])
     for env in (explicit, free):
         env.reset(seed=0)
         env.physics.reset(state)
         env.step(1)
-    cosine = math.cos(state[2])  # inertia matrix of a cart of 1 kg and a rod of 0.1 kg and 2 * 0.5 m on it
+    cosine = math.cos(
+        state[2]
+    )  # inertia matrix of a cart of 1 kg and a rod of 0.1 kg and 2 * 0.5 m on it
     inertia = np.array([[1.1, 0.05 * cosine], [0.05 * cosine, 0.1 / 3.0]])
-    braking = np.linalg.solve(inertia, [-damping["slider"] * state[1], -damping["hinge"] * state[3]])
+    braking = np.linalg.solve(
+        inertia, [-damping["slider"] * state[1], -damping["hinge"] * state[3]]
+    )
     expected = free.state + step * np.array([0.0, braking[0], 0.0, braking[1]])
     np.testing.assert_allclose(explicit.state, expected, rtol=0, atol=1e-14)
-    np.testing.assert_array_equal(explicit.state[[0, 2]], (state + step * state[[1, 1, 3, 3]])[[0, 2]])
+    np.testing.assert_array_equal(
+        explicit.state[[0, 2]], (state + step * state[[1, 1, 3, 3]])[[0, 2]]
+    )
 
 
 def test_a_pattern_names_the_motors_that_are_drawn():
-    every, matched = ({path: Uniform(0.05, 0.2)} for path in ("motor.inductance", "slid.*:motor.inductance"))
+    every, matched = (
+        {path: Uniform(0.05, 0.2)} for path in ("motor.inductance", "slid.*:motor.inductance")
+    )
     everywhere, ours = (
-        ActuatedEnv("cartpole", randomize=one).reset(seed=3)[1]["randomization"] for one in (every, matched)
+        ActuatedEnv("cartpole", randomize=one).reset(seed=3)[1]["randomization"]
+        for one in (every, matched)
     )
     assert ours == {"slid.*": {"motor.inductance": everywhere["motor.inductance"]}, "rejected": 0}
     many = batched("cartpole", 2, randomize=matched)
@@ -242,7 +280,10 @@ def test_a_pattern_names_the_motors_that_are_drawn():
 
 
 def test_what_is_drawn_has_the_drawn_length():
-    nominal, ours = ActuatedEnv("cartpole"), ActuatedEnv("cartpole", randomize={"model.length.pole": Uniform(0.5, 2)})
+    nominal, ours = (
+        ActuatedEnv("cartpole"),
+        ActuatedEnv("cartpole", randomize={"model.length.pole": Uniform(0.5, 2)}),
+    )
     for _ in range(3):
         length = ours.reset()[1]["randomization"]["model.length.pole"]
         pole, was = ours.model.geom("pole"), nominal.model.geom("pole")
@@ -251,10 +292,14 @@ def test_what_is_drawn_has_the_drawn_length():
         )
         assert (pole.size[0], *pole.pos[:2]) == (was.size[0], *was.pos[:2])
         np.testing.assert_array_equal(ours.model.geom("cart").size, nominal.model.geom("cart").size)
-    many = batched("cartpole", 2, randomize={"model.length.pole": Uniform(0.5, 2)}, render_mode="rgb_array")
+    many = batched(
+        "cartpole", 2, randomize={"model.length.pole": Uniform(0.5, 2)}, render_mode="rgb_array"
+    )
     lengths = many.reset(seed=0)[1]["randomization"]["model.length.pole"]
     many.image()
-    np.testing.assert_allclose(many.unwrapped.physics.model.geom("pole").size[1], 0.5 * lengths[0], rtol=1e-15)
+    np.testing.assert_allclose(
+        many.unwrapped.physics.model.geom("pole").size[1], 0.5 * lengths[0], rtol=1e-15
+    )
     many.close()
 
 
@@ -276,7 +321,10 @@ def _recount(seed, episodes):
         rejected = 0
         while True:
             first, second = generator.random(2)
-            inductance, kp = 0.02 + (0.2 - 0.02) * first, math.exp(math.log(0.5) + math.log(60.0) * second)
+            inductance, kp = (
+                0.02 + (0.2 - 0.02) * first,
+                math.exp(math.log(0.5) + math.log(60.0) * second),
+            )
             if abs(1.0 - (1.0 + kp) * 0.02 / inductance) < 1.0:
                 break
             rejected += 1
@@ -298,13 +346,22 @@ def test_unstable_draws_are_rejected_whole_and_counted():
 
 def test_what_a_motors_fields_refuse_together_is_rejected_too():
     """Though each would do alone; in one simulation as in many."""
-    motor = {"max_temperature": 90.0, "thermal_resistance_winding": 5.0, "thermal_resistance_housing": 5.0}
+    motor = {
+        "max_temperature": 90.0,
+        "thermal_resistance_winding": 5.0,
+        "thermal_resistance_housing": 5.0,
+    }
     nominal = Drive(GearMotor(**motor))
     for several in (
         {f"motor.{name}": "choice(0.0, 5.0)" for name in list(motor)[1:]},
-        {"motor.ambient_temperature": "choice(25.0, -75.0)", "motor.resistance_coefficient": "choice(0.0, 0.02)"},
+        {
+            "motor.ambient_temperature": "choice(25.0, -75.0)",
+            "motor.resistance_coefficient": "choice(0.0, 0.02)",
+        },
     ):
-        many = batched("pendulum", 20, actuator=nominal, randomize=several).reset(seed=0)[1]["randomization"]
+        many = batched("pendulum", 20, actuator=nominal, randomize=several).reset(seed=0)[1][
+            "randomization"
+        ]
         assert any(many["rejected"])
         env = ActuatedEnv("pendulum", nominal, randomize=several)
         for row in range(20):
@@ -317,7 +374,10 @@ def test_a_winding_too_fast_for_its_supply_is_rejected():
     arguments = {"randomize": {"motor.inductance": Uniform(0.02, 0.2)}}
     for ohms, least in ((0.0, 0.02), (7.0, 0.08)):  # (R + 7) * 0.02 < 2 L
         env = batched(
-            "cartpole", 500, actuator=dataclasses.replace(nominal, supply=Supply(resistance=ohms)), **arguments
+            "cartpole",
+            500,
+            actuator=dataclasses.replace(nominal, supply=Supply(resistance=ohms)),
+            **arguments,
         )
         drawn = env.reset(seed=0)[1]["randomization"]
         assert least < drawn["motor.inductance"].min() < least + 0.005
@@ -328,9 +388,14 @@ def test_a_winding_too_fast_for_its_supply_is_rejected():
 def test_a_supply_is_drawn_over_that_of_the_controller(supply):
     """No supply is one without resistance at `max_voltage`: a supply's voltage limits the terminal's as that does."""
     nominal = dataclasses.replace(named_actuator("paper", "cartpole"), supply=supply)
-    limited = dataclasses.replace(nominal, controller=dataclasses.replace(nominal.controller, max_voltage=0.5))
+    limited = dataclasses.replace(
+        nominal, controller=dataclasses.replace(nominal.controller, max_voltage=0.5)
+    )
     choices = {"supply.voltage": Choice([0.5]), "supply.resistance": Choice([0.0])}
-    drawn, fixed = ActuatedEnv("cartpole", nominal, randomize=choices), ActuatedEnv("cartpole", limited)
+    drawn, fixed = (
+        ActuatedEnv("cartpole", nominal, randomize=choices),
+        ActuatedEnv("cartpole", limited),
+    )
     for env in (drawn, fixed):
         env.reset(seed=1)
     drawn.state = fixed.state
@@ -353,10 +418,14 @@ def test_unstable_draws_are_kept_on_request():
     assert not drawn["rejected"].any()
 
 
-@pytest.mark.parametrize("make", [lambda **a: ActuatedEnv("cartpole", **a), lambda **a: batched("cartpole", 3, **a)])
+@pytest.mark.parametrize(
+    "make", [lambda **a: ActuatedEnv("cartpole", **a), lambda **a: batched("cartpole", 3, **a)]
+)
 def test_bounds_without_a_stable_loop_are_an_error_at_the_reset(make):
     env = make(randomize={"controller.kp": Uniform(50.0, 60.0)})
-    with pytest.raises(ValueError, match=r"1000 draws in a row have an unstable current loop at a step of 0\.02 s"):
+    with pytest.raises(
+        ValueError, match=r"1000 draws in a row have an unstable current loop at a step of 0\.02 s"
+    ):
         env.reset(seed=0)
 
 
@@ -377,7 +446,10 @@ def test_the_radius_of_one_is_that_among_many():
     assert (radii < 1.0).any()
     assert (radii > 1.0).any()
     for size in (1, 2, 7, 100):
-        parts = [spectral_radii(Actuator, vectors[start : start + size], 0.05) for start in range(0, 300, size)]
+        parts = [
+            spectral_radii(Actuator, vectors[start : start + size], 0.05)
+            for start in range(0, 300, size)
+        ]
         np.testing.assert_array_equal(np.concatenate(parts), radii)
 
 
@@ -394,7 +466,12 @@ def test_the_quick_proof_of_stability_and_the_radius_agree():
     np.testing.assert_array_equal(radii < 1.0, quick < 1.0)
     assert 0.02 < (radii >= 1.0).mean() < 0.9
     assert np.isin(quick, (0.0, np.inf)).mean() > 0.8  # it is what saves the time
-    edge = np.array([Actuator(controller=CurrentLoop(kp=kp)).numbers for kp in 9.0 + np.linspace(-1e-9, 1e-9, 401)])
+    edge = np.array(
+        [
+            Actuator(controller=CurrentLoop(kp=kp)).numbers
+            for kp in 9.0 + np.linspace(-1e-9, 1e-9, 401)
+        ]
+    )
     np.testing.assert_array_equal(
         spectral_radii(Actuator, edge, 0.02) < 1.0, stability_radii(Actuator, edge, 0.02) < 1.0
     )

@@ -36,9 +36,18 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
         ({"task": "xyz"}, "unknown task 'xyz': Known: "),
         ({"actuator": "papr"}, "unknown actuator 'papr': did you mean 'paper'"),
         ({"actuator": 3.0}, "actuator = 3.0: must be a name"),
-        ({"actuator": {"motor": {"resistanze": 1}}}, "motor.resistanze; did you mean motor.resistance?"),
-        ({"actuator": {"motor": {"resistance": -1.0}}}, "Motor.resistance = -1.0: must be a finite number > 0"),
-        ({"actuator": IDEAL | {"controller": {"current_noise": 0.1}}}, "unknown actuator field controller"),
+        (
+            {"actuator": {"motor": {"resistanze": 1}}},
+            "motor.resistanze; did you mean motor.resistance?",
+        ),
+        (
+            {"actuator": {"motor": {"resistance": -1.0}}},
+            "Motor.resistance = -1.0: must be a finite number > 0",
+        ),
+        (
+            {"actuator": IDEAL | {"controller": {"current_noise": 0.1}}},
+            "unknown actuator field controller",
+        ),
         ({"actuator": IDEAL | {"supply": {"resistance": 1}}}, "unknown actuator field supply"),
         ({"physics": "bullet"}, "unknown physics 'bullet': Known: mujoco, analytic"),
         ({"integrator": "rk45"}, "integrator = 'rk45': cartpole has euler, semi-implicit"),
@@ -50,24 +59,43 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
             ({"timestep": bad}, f"timestep = {bad!r}: must be a finite number > 0")
             for bad in (0.0, -0.01, NAN, INF, "1")
         ),
-        ({"timestep": 0.015}, "timestep = 0.015 s does not divide cartpole's environment step of 0.02 s"),
-        ({"inner_steps": 2, "timestep": 0.01}, "inner_steps = 2 and timestep = 0.01: give one of them, not both"),
-        ({"centre_radius": 0.1}, "'centre_radius' of cartpole: did you mean 'center_radius'? it has center_radius, "),
+        (
+            {"timestep": 0.015},
+            "timestep = 0.015 s does not divide cartpole's environment step of 0.02 s",
+        ),
+        (
+            {"inner_steps": 2, "timestep": 0.01},
+            "inner_steps = 2 and timestep = 0.01: give one of them, not both",
+        ),
+        (
+            {"centre_radius": 0.1},
+            "'centre_radius' of cartpole: did you mean 'center_radius'? it has center_radius, ",
+        ),
         ({"center_radius": -0.1}, "center_radius = -0.1: must be a number > 0"),
         ({"center_radius": NAN}, "center_radius = nan: must be a number > 0"),
         ({"center_radius": "0.1"}, "center_radius = '0.1': must be a number > 0"),
         ({"center_radius": True}, "center_radius = True: must be a number > 0"),
         ({"action": "torque"}, "action = 'torque': must be one of force, current, voltage"),
         ({"levels": (0.0, 1.0)}, "only for action='current' and action='voltage'"),
-        ({**VOLTAGE, "task": "pendulum"}, "only for tasks with discrete actions; pendulum's are continuous"),
-        ({"action": "current", "actuator": "ideal"}, "the ideal actuator has no current to command"),
+        (
+            {**VOLTAGE, "task": "pendulum"},
+            "only for tasks with discrete actions; pendulum's are continuous",
+        ),
+        (
+            {"action": "current", "actuator": "ideal"},
+            "the ideal actuator has no current to command",
+        ),
         ({"action": "voltage", "actuator": None}, "the ideal actuator has no voltage to command"),
-        ({"observe_actuator": True, "actuator": "ideal"}, "observe_actuator=True: the ideal actuator has no current"),
+        (
+            {"observe_actuator": True, "actuator": "ideal"},
+            "observe_actuator=True: the ideal actuator has no current",
+        ),
         (
             {"action": "voltage", "actuator": {"controller": {"max_voltage": INF}}},
             "action = 'voltage': needs a finite controller.max_voltage, it is inf",
         ),
-        # |1 - (1 + 100) * 0.02 / 0.1| = 19.2; in inner steps of less than 2 L / (R + kp) = 0.00198 s it is stable
+        # |1 - (1 + 100) * 0.02 / 0.1| = 19.2; in inner steps of less than 2 L / (R + kp) = 0.00198
+        # s it is stable
         ({"actuator": UNSTABLE}, "unstable at a step of 0.02 s: spectral radius 19.2, must be < 1"),
         ({"actuator": UNSTABLE, "inner_steps": 10}, "unstable at a step of 0.002 s"),
         # |1 - R dt / L| = 2
@@ -80,11 +108,26 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
             {"render_mode": "rgb_array", "camera": "fixd"},
             "camera = 'fixd': did you mean 'fixed'? The model's cameras are fixed, close",
         ),
-        ({"render_mode": "rgb_array", "width": 0}, "width = 0: must be an integer from 1 to 3840 [px]"),
-        ({"render_mode": "rgb_array", "width": 3841}, "width = 3841: must be an integer from 1 to 3840 [px]"),
-        ({"render_mode": "rgb_array", "height": 2161}, "height = 2161: must be an integer from 1 to 2160 [px]"),
-        ({"render_mode": "rgb_array", "height": 100.5}, "height = 100.5: must be an integer from 1 to 2160 [px]"),
-        ({"render_mode": "rgb_array", "height": True}, "height = True: must be an integer from 1 to 2160 [px]"),
+        (
+            {"render_mode": "rgb_array", "width": 0},
+            "width = 0: must be an integer from 1 to 3840 [px]",
+        ),
+        (
+            {"render_mode": "rgb_array", "width": 3841},
+            "width = 3841: must be an integer from 1 to 3840 [px]",
+        ),
+        (
+            {"render_mode": "rgb_array", "height": 2161},
+            "height = 2161: must be an integer from 1 to 2160 [px]",
+        ),
+        (
+            {"render_mode": "rgb_array", "height": 100.5},
+            "height = 100.5: must be an integer from 1 to 2160 [px]",
+        ),
+        (
+            {"render_mode": "rgb_array", "height": True},
+            "height = True: must be an integer from 1 to 2160 [px]",
+        ),
         (
             {"render_mode": "rgb_array", "physics": "analytic", "camera": "fixd"},
             "camera = 'fixd': did you mean 'fixed'?",
@@ -121,7 +164,10 @@ def test_a_bad_argument_of_many_environments_is_refused(make, arguments, message
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"physics": "analytic"}, "one Gymnasium environment at a time: use vectorization_mode='sync' for it"),
+        (
+            {"physics": "analytic"},
+            "one Gymnasium environment at a time: use vectorization_mode='sync' for it",
+        ),
         ({"num_threads": -1}, "num_threads = -1: must be an integer >= 0"),
         ({"num_threads": "2"}, "num_threads = '2': must be an integer >= 0"),
         ({"autoreset_mode": "Sometimes"}, "'Sometimes' is not a valid AutoresetMode"),
@@ -129,12 +175,21 @@ def test_a_bad_argument_of_many_environments_is_refused(make, arguments, message
         ({"render_mode": "rgb_array", "camera": "far"}, "camera = 'far'"),
         ({"actuator": [STABLE, "ideal", STABLE]}, "actuator[1] = 'ideal': must be an Actuator"),
         ({"actuator": ["weak", None, "weak"]}, "actuator[1] = None: must be an Actuator"),
-        ({"actuator": ["weak", "weka", "weak"]}, "actuator[1]: unknown actuator 'weka': did you mean 'weak'?"),
+        (
+            {"actuator": ["weak", "weka", "weak"]},
+            "actuator[1]: unknown actuator 'weka': did you mean 'weak'?",
+        ),
         ({"actuator": ["weak", "weak", 3]}, "actuator[2]: actuator = 3: must be a name"),
         ({"actuator": ["weak", "lag", "weak"]}, "actuators of several families (Actuator, Lag)"),
         ({"actuator": WILD}, "unstable at a step of 0.05 s: spectral radius"),
-        ({"actuator": [STABLE, STABLE, WILD]}, "actuator[2]: actuator: the current loop is unstable at a step of 0.05"),
-        ({"actuator": [STABLE] * 3, "action": "voltage"}, "with an actuator for each environment only 'force'"),
+        (
+            {"actuator": [STABLE, STABLE, WILD]},
+            "actuator[2]: actuator: the current loop is unstable at a step of 0.05",
+        ),
+        (
+            {"actuator": [STABLE] * 3, "action": "voltage"},
+            "with an actuator for each environment only 'force'",
+        ),
     ],
 )
 def test_a_bad_argument_of_a_batch_is_refused(arguments, message):
@@ -146,7 +201,10 @@ def test_a_bad_argument_of_a_batch_is_refused(arguments, message):
 def test_an_unknown_render_mode_is_refused_when_it_is_rendered(physics):
     """Gymnasium warns of it when the environment is made, and its test suite wants no more."""
     env = ActuatedEnv("cartpole", physics=physics, render_mode="rgb_aray")
-    with pytest.raises(ValueError, match=re.escape("render_mode = 'rgb_aray': must be None, 'human' or 'rgb_array'")):
+    with pytest.raises(
+        ValueError,
+        match=re.escape("render_mode = 'rgb_aray': must be None, 'human' or 'rgb_array'"),
+    ):
         env.render()
 
 
@@ -154,7 +212,9 @@ def test_an_unstable_loop_is_stable_with_the_substeps_that_the_refusal_proposes_
     with pytest.raises(ValueError, match=r"controller\.substeps = \d+") as refused:
         ActuatedEnv("cartpole", actuator=UNSTABLE)
     mapping = UNSTABLE.as_mapping()
-    mapping["controller"]["substeps"] = int(re.search(r"controller\.substeps = (\d+)", str(refused.value)).group(1))
+    mapping["controller"]["substeps"] = int(
+        re.search(r"controller\.substeps = (\d+)", str(refused.value)).group(1)
+    )
     env = ActuatedEnv("cartpole", actuator=mapping)
     env.reset(seed=0)
     for _ in range(20):
@@ -175,61 +235,138 @@ DISTRIBUTION = "is no distribution: must be uniform(LOW, HIGH), "
 @pytest.mark.parametrize(
     ("randomize", "message"),
     [
-        ({}, "randomize = {}: must be one or more of FIELD=DISTRIBUTION, or a mapping of fields to these"),
-        ("a=uniform(0, 1)", "randomize = 'a=uniform(0, 1)': must be one or more of FIELD=DISTRIBUTION"),
+        (
+            {},
+            (
+                "randomize = {}: must be one or more of FIELD=DISTRIBUTION, or a mapping of fields"
+                " to these"
+            ),
+        ),
+        (
+            "a=uniform(0, 1)",
+            "randomize = 'a=uniform(0, 1)': must be one or more of FIELD=DISTRIBUTION",
+        ),
         (3, "randomize = 3: must be one or more of FIELD=DISTRIBUTION"),
-        (["motor.inductance"], "randomize: 'motor.inductance': must be FIELD=DISTRIBUTION, such as "),
+        (
+            ["motor.inductance"],
+            "randomize: 'motor.inductance': must be FIELD=DISTRIBUTION, such as ",
+        ),
         (["=uniform(0, 1)"], "randomize: '=uniform(0, 1)': must be FIELD=DISTRIBUTION, such as "),
         ([3], "randomize: 3: must be FIELD=DISTRIBUTION, such as "),
         (["a=uniform(0, 1)", "a=choice(1)"], "randomize: a is named twice"),
         ({"a": {"uniform": [0, 1]}}, f"randomize: a: {{'uniform': [0, 1]}} {DISTRIBUTION}"),
         ({"a": 0.3}, f"randomize: a: 0.3 {DISTRIBUTION}"),
         ({"controller.kp": (1.0, 2.0)}, f"randomize: controller.kp: (1.0, 2.0) {DISTRIBUTION}"),
-        (["a=gauss(0, 1)"], "randomize: a: 'gauss(0, 1)' is no distribution: it must be uniform(LOW, HIGH), "),
+        (
+            ["a=gauss(0, 1)"],
+            "randomize: a: 'gauss(0, 1)' is no distribution: it must be uniform(LOW, HIGH), ",
+        ),
         (["a=uniform(1)"], "randomize: a: 'uniform(1)' has 1 values: must be uniform(LOW, HIGH)"),
-        (["a=uniform(2, 1)"], "randomize: a: 'uniform(2, 1)': Uniform.high = 1: must be >= low = 2"),
+        (
+            ["a=uniform(2, 1)"],
+            "randomize: a: 'uniform(2, 1)': Uniform.high = 1: must be >= low = 2",
+        ),
         (["(:a=uniform(0, 1)"], "randomize: (:a: '(': must be a regular expression (missing ), "),
         (
             {"arm": {"model.gravity": "uniform(1, 2)"}},
-            "randomize: arm:model.gravity: model.gravity is the model's, not a motor's: leave 'arm' out",
+            (
+                "randomize: arm:model.gravity: model.gravity is the model's, not a motor's: leave"
+                " 'arm' out"
+            ),
         ),
         ({"hing.*:motor.inductance": Uniform(0.05, 0.2)}, "'hing.*': no actuator has such a name"),
-        ({"motor.inductanze": Uniform(1, 2)}, "unknown field 'motor.inductanze': did you mean 'motor.inductance'"),
-        ({"model.mass.bole": Uniform(1, 2)}, "unknown field 'model.mass.bole': did you mean 'model.mass.pole'"),
+        (
+            {"motor.inductanze": Uniform(1, 2)},
+            "unknown field 'motor.inductanze': did you mean 'motor.inductance'",
+        ),
+        (
+            {"model.mass.bole": Uniform(1, 2)},
+            "unknown field 'model.mass.bole': did you mean 'model.mass.pole'",
+        ),
         ({"model.length.cart": Uniform(1, 2)}, "unknown field 'model.length.cart'"),
         ({"model.friction.slider": Uniform(0, 1)}, "unknown field 'model.friction.slider'"),
-        ({"motor.inductance": Uniform(0.0, 0.2)}, "Motor.inductance = 0.0: must be a finite number > 0"),
-        ({"controller.kp": Uniform(-1.0, 0.2)}, "CurrentLoop.kp = -1.0: must be a finite number >= 0"),
-        ({"controller.kp": Choice([1.0, -2.0])}, "CurrentLoop.kp = -2.0: must be a finite number >= 0"),
-        ({"controller.kp": Choice([1.0, INF])}, "CurrentLoop.kp = inf: must be a finite number >= 0"),
+        (
+            {"motor.inductance": Uniform(0.0, 0.2)},
+            "Motor.inductance = 0.0: must be a finite number > 0",
+        ),
+        (
+            {"controller.kp": Uniform(-1.0, 0.2)},
+            "CurrentLoop.kp = -1.0: must be a finite number >= 0",
+        ),
+        (
+            {"controller.kp": Choice([1.0, -2.0])},
+            "CurrentLoop.kp = -2.0: must be a finite number >= 0",
+        ),
+        (
+            {"controller.kp": Choice([1.0, INF])},
+            "CurrentLoop.kp = inf: must be a finite number >= 0",
+        ),
         ({"controller.kp": Choice([True])}, "controller.kp must be a number"),
-        ({"controller.substeps": Uniform(1, 4)}, "controller.substeps must be drawn from a Choice of int"),
-        ({"controller.substeps": Choice([1.5])}, "controller.substeps must be drawn from a Choice of int"),
-        ({"controller.substeps": Choice([0, 1])}, "CurrentLoop.substeps = 0: must be an integer >= 1"),
+        (
+            {"controller.substeps": Uniform(1, 4)},
+            "controller.substeps must be drawn from a Choice of int",
+        ),
+        (
+            {"controller.substeps": Choice([1.5])},
+            "controller.substeps must be drawn from a Choice of int",
+        ),
+        (
+            {"controller.substeps": Choice([0, 1])},
+            "CurrentLoop.substeps = 0: must be an integer >= 1",
+        ),
         (
             {"controller.bemf_compensation": Choice([0, 1])},
             "controller.bemf_compensation must be drawn from a Choice of bool",
         ),
         ({"model.mass.pole": Uniform(0.0, 1.0)}, "mass.pole = 0: must be a finite number > 0"),
-        ({"model.damping.hinge": Uniform(-1.0, 1.0)}, "damping.hinge = -1: must be a finite number >= 0"),
+        (
+            {"model.damping.hinge": Uniform(-1.0, 1.0)},
+            "damping.hinge = -1: must be a finite number >= 0",
+        ),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(make, randomize, message):
-    with pytest.raises(ValueError, match=f"^randomize.*{re.escape(message.removeprefix('randomize'))}"):
+    with pytest.raises(
+        ValueError, match=f"^randomize.*{re.escape(message.removeprefix('randomize'))}"
+    ):
         make(randomize=randomize)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"actuator": "ideal", "randomize": {"motor.resistance": Uniform(1, 2)}}, "the ideal actuator has no motor"),
-        ({"actuator": "ideal", "randomize": {"controller.kp": Uniform(1, 2)}}, "the ideal actuator has no motor"),
-        ({"physics": "analytic", "randomize": {"model.gravity": Uniform(1, 2)}}, "cannot draw model.gravity"),
-        ({**CURRENT, "randomize": {"motor.arm_radius": Uniform(1, 2)}}, "it would change what an action means"),
-        ({**VOLTAGE, "randomize": {"controller.kp": Uniform(1, 2)}}, "the command goes past the controller"),
-        ({"actuator": GEARED, "randomize": {"motor.gear_ratio": Uniform(0, 1)}}, "GearMotor.gear_ratio = 0.0: must be"),
-        ({"actuator": GEARED, "randomize": {"motor.rotor_inertia": Uniform(-1, 1)}}, "GearMotor.rotor_inertia = -1.0"),
-        ({"actuator": GEARED, "randomize": {"motor.gear_efficiency": Uniform(0, 1)}}, "GearMotor.gear_efficiency = 0"),
+        (
+            {"actuator": "ideal", "randomize": {"motor.resistance": Uniform(1, 2)}},
+            "the ideal actuator has no motor",
+        ),
+        (
+            {"actuator": "ideal", "randomize": {"controller.kp": Uniform(1, 2)}},
+            "the ideal actuator has no motor",
+        ),
+        (
+            {"physics": "analytic", "randomize": {"model.gravity": Uniform(1, 2)}},
+            "cannot draw model.gravity",
+        ),
+        (
+            {**CURRENT, "randomize": {"motor.arm_radius": Uniform(1, 2)}},
+            "it would change what an action means",
+        ),
+        (
+            {**VOLTAGE, "randomize": {"controller.kp": Uniform(1, 2)}},
+            "the command goes past the controller",
+        ),
+        (
+            {"actuator": GEARED, "randomize": {"motor.gear_ratio": Uniform(0, 1)}},
+            "GearMotor.gear_ratio = 0.0: must be",
+        ),
+        (
+            {"actuator": GEARED, "randomize": {"motor.rotor_inertia": Uniform(-1, 1)}},
+            "GearMotor.rotor_inertia = -1.0",
+        ),
+        (
+            {"actuator": GEARED, "randomize": {"motor.gear_efficiency": Uniform(0, 1)}},
+            "GearMotor.gear_efficiency = 0",
+        ),
         # a model's draws leave the loop as it is
         ({"actuator": UNSTABLE, "randomize": {"model.gravity": Uniform(0.9, 1.1)}}, "unstable"),
     ],
@@ -259,8 +396,29 @@ def test_impossible_bounds_are_refused(distribution, arguments, message):
 
 # -- actions ------------------------------------------------------------------------------------------------
 
-NEITHER = [None, "1", "left", {}, np.nan, 0.5, 1.5, -1, 7, [0, 1], np.zeros(2), np.zeros(1, int), np.array([np.nan])]
-NO_BOX = [1, np.float32([np.nan]), np.array(0.5), np.zeros((1, 1)), np.array([True]), np.array(["1"])]
+NEITHER = [
+    None,
+    "1",
+    "left",
+    {},
+    np.nan,
+    0.5,
+    1.5,
+    -1,
+    7,
+    [0, 1],
+    np.zeros(2),
+    np.zeros(1, int),
+    np.array([np.nan]),
+]
+NO_BOX = [
+    1,
+    np.float32([np.nan]),
+    np.array(0.5),
+    np.zeros((1, 1)),
+    np.array([True]),
+    np.array(["1"]),
+]
 NO_CHOICE = [4, 1.0, np.array([0.0])]
 
 
@@ -271,7 +429,9 @@ def test_what_is_no_action_is_refused_and_changes_nothing(task, command):
     env.reset(seed=0)
     before = env.snapshot()
     for action in NEITHER + (NO_CHOICE if hasattr(env.action_space, "n") else NO_BOX):
-        with pytest.raises(ValueError, match=rf"^action = {re.escape(repr(action))}: not in (Box|Discrete)"):
+        with pytest.raises(
+            ValueError, match=rf"^action = {re.escape(repr(action))}: not in (Box|Discrete)"
+        ):
             env.step(action)
         assert_same(env.snapshot(), before)
 
@@ -279,12 +439,22 @@ def test_what_is_no_action_is_refused_and_changes_nothing(task, command):
 def _wrong_batches(env):
     """Batches of actions for four that are refused, with the index of the environment to be named, or None."""
     good = random_actions(env, np.random.default_rng(0))
-    wrong = [(good[:3], None), (np.concatenate([good, good]), None), (good[0], None), (None, None), ("left", None)]
+    wrong = [
+        (good[:3], None),
+        (np.concatenate([good, good]), None),
+        (good[0], None),
+        (None, None),
+        ("left", None),
+    ]
     if isinstance(env.single_action_space, gymnasium.spaces.Discrete):
         wrong += [(good.astype(float), None), (good[:, None], None), (good > 0, None)]
         values = [-1, env.single_action_space.n, np.iinfo(np.int64).max]
     else:
-        wrong += [(np.ones((4, 1), int), None), (good[:, 0], None), (np.ones((4, 2), np.float32), None)]
+        wrong += [
+            (np.ones((4, 1), int), None),
+            (good[:, 0], None),
+            (np.ones((4, 2), np.float32), None),
+        ]
         values = [np.nan]
     for row, value in zip((2, 0, 3), values * 3, strict=False):
         bad = good.copy()
@@ -302,7 +472,10 @@ def test_bad_batches_of_actions_are_refused_before_anything_is_stepped(task, mod
         one.reset(seed=0)
     before = env.unwrapped.snapshot()
     for actions, row in _wrong_batches(env):
-        with pytest.raises(ValueError, match="actions" if row is None else rf"actions\[{row}\] .*environment {row}\)"):
+        with pytest.raises(
+            ValueError,
+            match="actions" if row is None else rf"actions\[{row}\] .*environment {row}\)",
+        ):
             env.step(actions)
         assert_same(env.unwrapped.snapshot(), before)
     actions = random_actions(env, generator)
@@ -317,7 +490,10 @@ def test_bad_batches_of_actions_are_refused_before_anything_is_stepped(task, mod
     [
         ({"seed": [1, 2]}, "seed: 2 seeds for 3 environments"),
         ({"seed": [1, 2, 3, 4]}, "seed: 4 seeds for 3 environments"),
-        ({"options": {"reset_mask": np.ones(2, bool)}}, "must be a bool array of shape (3,) with a True in it"),
+        (
+            {"options": {"reset_mask": np.ones(2, bool)}},
+            "must be a bool array of shape (3,) with a True in it",
+        ),
         ({"options": {"reset_mask": np.ones(3)}}, "must be a bool array of shape (3,)"),
         ({"options": {"reset_mask": [True] * 3}}, "must be a bool array of shape (3,)"),
         ({"options": {"reset_mask": np.zeros(3, bool)}}, "with a True in it"),
@@ -339,7 +515,9 @@ def test_a_bad_reset_of_many_is_refused_and_changes_nothing(arguments, message):
 @pytest.mark.parametrize("value", [-1.0, NAN])
 @pytest.mark.parametrize("make", [ActuatedEnv, functools.partial(ActuatedVectorEnv, 2)])
 def test_reset_options_out_of_order_are_refused(make, value):
-    with pytest.raises(ValueError, match=re.escape(f"reset options = {{'x_init': {value}}}: ask for [")):
+    with pytest.raises(
+        ValueError, match=re.escape(f"reset options = {{'x_init': {value}}}: ask for [")
+    ):
         make("pendulum").reset(seed=0, options={"x_init": value})
 
 

@@ -61,7 +61,9 @@ def test_an_image_has_its_size_follows_the_state_and_stays_as_it_was(make, task,
 
 @every_rebuilt
 def test_both_physics_draw_the_same_picture_of_the_same_state(make, task):
-    np.testing.assert_array_equal(*(make(task, seed=3, physics=physics).render() for physics in PHYSICS))
+    np.testing.assert_array_equal(
+        *(make(task, seed=3, physics=physics).render() for physics in PHYSICS)
+    )
 
 
 @every_rebuilt
@@ -91,7 +93,9 @@ def test_environments_render_alternately_without_mixing_each_its_own_view(make):
 def test_every_step_of_the_human_mode_is_shown_in_a_window(make, monkeypatch, physics):
     window = unittest.mock.MagicMock()
     monkeypatch.setattr("codrl_mj.envs.single.Window", window)
-    ours, pictures = (make("pendulum", physics=physics, render_mode=mode) for mode in ("human", "rgb_array"))
+    ours, pictures = (
+        make("pendulum", physics=physics, render_mode=mode) for mode in ("human", "rgb_array")
+    )
     expected = [pictures.render()]
     for _ in range(3):
         ours.step(np.array([2.0], np.float32))
@@ -116,7 +120,9 @@ def test_a_window_shows_an_image_the_right_way_round(monkeypatch):
     window.show(image, 30.0)
     pygame.display.set_mode.assert_called_once_with((3, 2))
     (array,) = pygame.surfarray.make_surface.call_args.args
-    assert [array[x, y].tolist() for y in range(2) for x in range(3)] == image.reshape(6, 3).tolist()
+    assert [array[x, y].tolist() for y in range(2) for x in range(3)] == image.reshape(
+        6, 3
+    ).tolist()
     pygame.time.Clock().tick.assert_called_once_with(30.0)
     drawn = [name for name, *_ in pygame.mock_calls]
     assert drawn.index("display.set_mode().blit") < drawn.index("display.flip")
@@ -131,7 +137,9 @@ def test_pygame_shows_an_image(monkeypatch):
     window = Window(3, 2)
     image = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
     window.show(image, 1000.0)
-    np.testing.assert_array_equal(pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1), image)
+    np.testing.assert_array_equal(
+        pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1), image
+    )
     window.close()
     assert not pygame.display.get_init()
 
@@ -139,7 +147,9 @@ def test_pygame_shows_an_image(monkeypatch):
 def test_a_window_says_what_it_needs(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     env = gymnasium.make("codrl_mj/Pendulum-v0", render_mode="human", width=64, height=48)
-    with pytest.raises(DependencyNotInstalled, match=r"^render_mode = 'human' needs pygame: pip install pygame-ce$"):
+    with pytest.raises(
+        DependencyNotInstalled, match=r"^render_mode = 'human' needs pygame: pip install pygame-ce$"
+    ):
         env.reset(seed=0)
     env.close()
 

@@ -42,10 +42,14 @@ one, two = made(64), made(80)
 def _run(program, **environment):
     """What a program prints where there is no display."""
     kept = {
-        name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
     }
     line = [sys.executable, "-c", program]
-    done = subprocess.run(line, env=kept | environment, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        line, env=kept | environment, capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     assert not environment or not done.stderr

@@ -21,7 +21,9 @@ from tests.tasks.faces import REBUILT
 
 every_task = pytest.mark.parametrize("task", TASKS)
 WILD = Actuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=float("inf")))
-pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered", "ignore:invalid value encountered")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:overflow encountered", "ignore:invalid value encountered"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -45,7 +47,9 @@ def test_a_diverging_simulation_raises_with_task_and_entry_and_is_not_reset(task
     actuator, options = WILD, {"inner_steps": 1}
     if command == "voltage":  # a winding too fast for the step: |1 - R dt/L| = 1e4 dt - 1
         actuator = Actuator(Motor(inductance=1e-4), CurrentLoop(max_voltage=10.0))
-        options |= {"action": "voltage"} | ({"levels": (-1, 0, 1)} if hasattr(TASKS[task].action_space, "n") else {})
+        options |= {"action": "voltage"} | (
+            {"levels": (-1, 0, 1)} if hasattr(TASKS[task].action_space, "n") else {}
+        )
     env = ActuatedEnv(task, actuator=actuator, physics=physics, allow_unstable=True, **options)
     env.reset(seed=0)
     action, clocks = _constant_action(env), []
@@ -83,7 +87,9 @@ BEYOND = (np.inf, -np.inf, 1e11, 1e300)
     [
         *((task, "mujoco", value) for task in TASKS for value in (np.nan, *BEYOND)),
         *((task, "analytic", np.nan) for task in REBUILT),
-        *(("cartpole", "analytic", value) for value in BEYOND),  # others' equations, Gymnasium's, clip it
+        *(
+            ("cartpole", "analytic", value) for value in BEYOND
+        ),  # others' equations, Gymnasium's, clip it
     ],
 )
 def test_a_lost_state_is_reported_at_the_next_step_and_a_reset_helps(task, physics, value):
@@ -104,7 +110,9 @@ def test_a_lost_state_is_reported_at_the_next_step_and_a_reset_helps(task, physi
 @every_task
 @pytest.mark.parametrize("mode", MODES)
 def test_a_lost_environment_is_named_and_the_others_go_on_once_it_is_reset(task, mode):
-    limit = 3 if mode == "NextStep" else 6  # the others' episodes end in the step that is lost, or at last
+    limit = (
+        3 if mode == "NextStep" else 6
+    )  # the others' episodes end in the step that is lost, or at last
     env, control = (batched(task, 3, mode, max_episode_steps=limit).unwrapped for _ in range(2))
     actions = random_actions(env, np.random.default_rng(0))
     for one in (env, control):
@@ -114,7 +122,10 @@ def test_a_lost_environment_is_named_and_the_others_go_on_once_it_is_reset(task,
     lost["physics"][1] = np.nan
     env.restore(lost)
     for _ in range(2):  # until it is reset
-        with pytest.raises(SimulationDivergedError, match=rf"^{task}: 1 of 3 simulations diverged; environment 1 at t"):
+        with pytest.raises(
+            SimulationDivergedError,
+            match=rf"^{task}: 1 of 3 simulations diverged; environment 1 at t",
+        ):
             env.step(actions)
         control.step(actions)
     for one in (env, control):
@@ -164,7 +175,12 @@ _loops = st.builds(
 
 @pytest.mark.parametrize("task", but(["pendulum"], [*REBUILT]))
 @settings(max_examples=40)
-@given(motor=_motors, loop=_loops, seed=st.integers(0, 2**31), command=st.sampled_from(["force", "current", "voltage"]))
+@given(
+    motor=_motors,
+    loop=_loops,
+    seed=st.integers(0, 2**31),
+    command=st.sampled_from(["force", "current", "voltage"]),
+)
 def test_both_physics_agree_on_any_actuator_from_any_start(task, motor, loop, seed, command):
     """Fifty steps under random actions: states relative to their size within 1e-9, chaotic Acrobot's within 1e-6."""
     actuator, definition = Actuator(motor, loop), TASKS[task]
@@ -178,8 +194,12 @@ def test_both_physics_agree_on_any_actuator_from_any_start(task, motor, loop, se
     dt = definition.step_duration / definition.motor_inner_steps
     simulated = actuator
     if command == "voltage":
-        simulated = dataclasses.replace(actuator, controller=CurrentLoop(kp=0.0, substeps=loop.substeps))
-    assume(spectral_radius(simulated, dt) < 1.0)  # an unstable loop multiplies rounding errors without bound
+        simulated = dataclasses.replace(
+            actuator, controller=CurrentLoop(kp=0.0, substeps=loop.substeps)
+        )
+    assume(
+        spectral_radius(simulated, dt) < 1.0
+    )  # an unstable loop multiplies rounding errors without bound
     both = [ActuatedEnv(task, physics=physics, **options) for physics in PHYSICS]
     for env in both:
         env.reset(seed=seed)
@@ -187,11 +207,17 @@ def test_both_physics_agree_on_any_actuator_from_any_start(task, motor, loop, se
     generator, space = np.random.default_rng(seed), both[0].action_space
     tolerance = 1e-6 if task == "acrobot" else 1e-9
     for step in range(50):
-        action = generator.integers(space.n) if hasattr(space, "n") else generator.uniform(space.low, space.high)
+        action = (
+            generator.integers(space.n)
+            if hasattr(space, "n")
+            else generator.uniform(space.low, space.high)
+        )
         results = [env.step(action) for env in both]
         states = np.array([env.state for env in both])
         scale = max(1.0, np.abs(states).max())
         np.testing.assert_allclose(*states, rtol=0, atol=tolerance * scale, err_msg=f"step {step}")
         signals = np.array([list(map(float, result[-1].values()))[:5] for result in results])
         scale = max(1.0, np.abs(signals).max())
-        np.testing.assert_allclose(*signals, rtol=0, atol=10 * tolerance * scale, err_msg=f"step {step}")
+        np.testing.assert_allclose(
+            *signals, rtol=0, atol=10 * tolerance * scale, err_msg=f"step {step}"
+        )

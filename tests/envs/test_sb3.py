@@ -25,7 +25,9 @@ def batched(task, num_envs, **arguments):
 
 def looped(task, num_envs, **arguments):
     make = TASKS[task].env_id
-    return DummyVecEnv([lambda: Monitor(gymnasium.make(make, disable_env_checker=True, **arguments))] * num_envs)
+    return DummyVecEnv(
+        [lambda: Monitor(gymnasium.make(make, disable_env_checker=True, **arguments))] * num_envs
+    )
 
 
 def sampled(env, steps, seed=0):
@@ -33,7 +35,9 @@ def sampled(env, steps, seed=0):
     generator = np.random.default_rng(seed)
     batches = [random_actions(env.env, generator) for _ in range(steps)]
     space = env.action_space
-    return [batch if hasattr(space, "n") else np.clip(batch, space.low, space.high) for batch in batches]
+    return [
+        batch if hasattr(space, "n") else np.clip(batch, space.low, space.high) for batch in batches
+    ]
 
 
 @every_rebuilt
@@ -82,14 +86,18 @@ def test_ppo_has_the_same_weights_bit_for_bit(task):
 def test_the_wrappers_of_stable_baselines_work_on_it():
     runs = []
     for make in (batched, looped):
-        env = VecNormalize(VecMonitor(VecCheckNan(make("pendulum", 3, max_episode_steps=9), raise_exception=True)))
+        env = VecNormalize(
+            VecMonitor(VecCheckNan(make("pendulum", 3, max_episode_steps=9), raise_exception=True))
+        )
         env.seed(1)
         found = [env.reset()]
         returns = []
         for actions in sampled(batched("pendulum", 3), 40):
             observations, rewards, dones, infos = env.step(actions)
             found += [observations, rewards, dones.astype(float)]
-            returns += [(info["episode"]["r"], info["episode"]["l"]) for info in infos if "episode" in info]
+            returns += [
+                (info["episode"]["r"], info["episode"]["l"]) for info in infos if "episode" in info
+            ]
         runs.append((found, returns))
     for one, other in zip(runs[0][0], runs[1][0], strict=True):
         np.testing.assert_array_equal(one, other)

@@ -30,12 +30,17 @@ def test_it_is_gymnasiums_loop_and_on_mujoco_the_batched_environment(task, physi
 @every_rebuilt
 def test_signals_and_draws_are_those_of_the_batched_environment(task):
     given = arguments(task, "everything") | {"max_episode_steps": 7}
-    ours, theirs = SerialVectorEnv(3, task, **given), batched(task, 3, "SameStep", **given).unwrapped
+    ours, theirs = (
+        SerialVectorEnv(3, task, **given),
+        batched(task, 3, "SameStep", **given).unwrapped,
+    )
     assert ours.signals is None
     assert_same(ours.randomization, theirs.randomization)  # nothing yet: NaN
     ours.reset(seed=2)
     theirs.reset(seed=2)
-    for index, actions in enumerate(random_actions(ours, np.random.default_rng(index)) for index in range(20)):
+    for index, actions in enumerate(
+        random_actions(ours, np.random.default_rng(index)) for index in range(20)
+    ):
         if index == 5:  # afterwards not all episodes end in the same step
             mask = {"reset_mask": np.array([True, False, False])}
             assert_same(ours.reset(options=dict(mask)), theirs.reset(options=dict(mask)))
@@ -61,5 +66,7 @@ def test_each_can_have_an_actuator_of_its_own():
     assert len(set(resistances)) == 3
     for row, actuator in enumerate(actuators):
         single = ActuatedEnv("cartpole", actuator, "analytic", **drawn)
-        assert single.reset(seed=3 + row)[1]["randomization"]["motor.resistance"] == resistances[row]
+        assert (
+            single.reset(seed=3 + row)[1]["randomization"]["motor.resistance"] == resistances[row]
+        )
         assert single.step(1)[4]["current"] == env.signals["current"][row]

@@ -20,7 +20,11 @@ def _begun(face="one", task="cartpole", **given):
 
 @both_physics
 def test_a_snapshot_is_as_small_as_can_be_without_motor_draws_and_disturbances(physics):
-    assert _begun(actuator="ideal", physics=physics).snapshot().keys() == {"task", "physics", "generator"}
+    assert _begun(actuator="ideal", physics=physics).snapshot().keys() == {
+        "task",
+        "physics",
+        "generator",
+    }
 
 
 @both_physics
@@ -60,12 +64,28 @@ def test_the_model_is_restored_to_its_last_number(task):
 @pytest.mark.parametrize(
     ("face", "given", "message"),
     [
-        ("one", {"task": "acrobot"}, r"\['task'\] is of shape \(7,\) and type uint8: must be of shape \(8,\)"),
-        ("one", {"task": "pendulum"}, r"\['physics'\] is of shape \(\d+,\) and type float64: must be of shape \(\d+,"),
+        (
+            "one",
+            {"task": "acrobot"},
+            r"\['task'\] is of shape \(7,\) and type uint8: must be of shape \(8,\)",
+        ),
+        (
+            "one",
+            {"task": "pendulum"},
+            r"\['physics'\] is of shape \(\d+,\) and type float64: must be of shape \(\d+,",
+        ),
         ("one", {"actuator": "ideal"}, r"\['physics'\] is of shape "),
         ("one", {"physics": "analytic"}, r"\['physics'\] is of shape \(9,\) "),
-        ("one", {"disturbances": {"command_delay": 0.1}}, r"\['disturbances'\] is of shape .*: must be missing"),
-        ("one", {"randomize": {"motor.inductance": Uniform(0.1, 0.2)}}, r"\['drawn'\] is of shape \(1,\)"),
+        (
+            "one",
+            {"disturbances": {"command_delay": 0.1}},
+            r"\['disturbances'\] is of shape .*: must be missing",
+        ),
+        (
+            "one",
+            {"randomize": {"motor.inductance": Uniform(0.1, 0.2)}},
+            r"\['drawn'\] is of shape \(1,\)",
+        ),
         ("many, NextStep", {"task": "pendulum"}, r"\['physics'\] is of shape "),
     ],
 )
@@ -80,7 +100,12 @@ def test_a_snapshot_of_others_is_refused_and_nothing_changes(face, given, messag
 @pytest.mark.parametrize(
     ("face", "entry", "changed", "message"),
     [
-        ("one", "task", lambda _: np.frombuffer(b"pendulum", np.uint8), "of b'pendulum': must be of 'cartpole'"),
+        (
+            "one",
+            "task",
+            lambda _: np.frombuffer(b"pendulum", np.uint8),
+            "of b'pendulum': must be of 'cartpole'",
+        ),
         ("one", "physics", np.float32, "of shape .* and type float32"),
         ("one", "generator", None, r"missing: must be of shape \(6,\) and type uint64"),
         ("many, NextStep", "physics", lambda rows: rows[:2], r"of shape \(2, \d+\)"),
@@ -93,7 +118,9 @@ def test_a_snapshot_of_others_is_refused_and_nothing_changes(face, given, messag
         ("dm_control", "elapsed", None, "missing"),
     ],
 )
-def test_a_snapshot_with_a_wrong_entry_is_refused_and_nothing_changes(face, entry, changed, message):
+def test_a_snapshot_with_a_wrong_entry_is_refused_and_nothing_changes(
+    face, entry, changed, message
+):
     env = _begun(face)
     before = env.snapshot()
     wrong = {name: value for name, value in before.items() if name != entry}

@@ -14,7 +14,14 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed
 from tests.envs.faces import DRIVE, SETUPS, arguments, scales
-from tests.envs.vectors import MODES, assert_equal_episodes, assert_same, batched, looped, random_actions
+from tests.envs.vectors import (
+    MODES,
+    assert_equal_episodes,
+    assert_same,
+    batched,
+    looped,
+    random_actions,
+)
 from tests.matrix import but
 from tests.tasks.faces import REBUILT, every_rebuilt
 
@@ -22,9 +29,16 @@ every_task = pytest.mark.parametrize("task", TASKS)
 every_mode = pytest.mark.parametrize("mode", MODES)
 DIFFERENT = [
     changed(
-        FULL, inductance=inductance, resistance=resistance, arm_radius=arm, torque_constant=constant, max_voltage=top
+        FULL,
+        inductance=inductance,
+        resistance=resistance,
+        arm_radius=arm,
+        torque_constant=constant,
+        max_voltage=top,
     )
-    for inductance, resistance, arm, constant, top in np.random.default_rng(0).uniform(0.5, 1.0, (7, 5))
+    for inductance, resistance, arm, constant, top in np.random.default_rng(0).uniform(
+        0.5, 1.0, (7, 5)
+    )
     * (1, 1, 1, 1, 4)
 ]
 
@@ -61,7 +75,10 @@ SPREAD = [Actuator(controller=CurrentLoop(kp=kp, substeps=2)) for kp in (0.5, 1.
         ("cartpole", {"actuator": "ideal", "randomize": scales("cartpole")}),
         ("cartpole", {"randomize": {"controller.kp": LogUniform(0.5, 30.0)}}),
         ("cartpole", {**CURRENT, "randomize": {"motor.resistance": Uniform(0.5, 2.0)}}),
-        ("cartpole", {"integrator": "semi-implicit", "randomize": DAMPED, "observe_actuator": True}),
+        (
+            "cartpole",
+            {"integrator": "semi-implicit", "randomize": DAMPED, "observe_actuator": True},
+        ),
         ("cartpole", {"inner_steps": 4, "randomize": DAMPED}),
         ("pendulum", {"actuator": SPREAD, "randomize": {"motor.inductance": Uniform(0.05, 0.2)}}),
     ],
@@ -75,7 +92,9 @@ def test_so_are_those_of_every_option(task, given):
 def test_episodes_are_equal_over_the_registered_time_limit_and_end_both_ways(task):
     steps = min(TASKS[task].max_episode_steps + 20, 230)
     arguments = {"max_episode_steps": 60} if task == "acrobot" else {}
-    ends = assert_equal_episodes(batched(task, 3, **arguments), looped(task, 3, **arguments), steps, masks=False)
+    ends = assert_equal_episodes(
+        batched(task, 3, **arguments), looped(task, 3, **arguments), steps, masks=False
+    )
     if task == "cartpole":
         assert (ends[:, 0] > 1).all()
     elif task != "mountain_car_continuous":
@@ -83,7 +102,8 @@ def test_episodes_are_equal_over_the_registered_time_limit_and_end_both_ways(tas
 
 
 @pytest.mark.parametrize(
-    ("task", "options"), [("mountain_car", {"low": 0.4, "high": 0.49}), ("acrobot", {"low": -3.0, "high": 3.0})]
+    ("task", "options"),
+    [("mountain_car", {"low": 0.4, "high": 0.49}), ("acrobot", {"low": -3.0, "high": 3.0})],
 )
 def test_goals_are_reached_by_some_environments_before_others(task, options):
     """Starts near the goal, so that these tasks terminate too."""
@@ -97,7 +117,9 @@ def test_goals_are_reached_by_some_environments_before_others(task, options):
         assert_same(one, other, f"step {step}")
         terminated += one[2]
         if one[2].any():
-            assert not np.array_equal(one[4]["final_obs"][np.argmax(one[2])], one[0][np.argmax(one[2])])
+            assert not np.array_equal(
+                one[4]["final_obs"][np.argmax(one[2])], one[0][np.argmax(one[2])]
+            )
     assert 0 < terminated.sum() < 25 * 9
     assert len(np.unique(terminated)) > 1
 
@@ -118,9 +140,13 @@ def test_an_actuator_in_any_form_is_the_same_for_all_and_for_each(tmp_path):
     written = ["paper", file, {"name": "weaker", "motor": {"resistance": 2.0}}, str(file)]
     each = [EnvConfig("pendulum", one).actuator for one in written]
     assert len(set(each)) == 3
-    assert_equal_episodes(batched("pendulum", 4, actuator=written), looped("pendulum", 4, actuator=each), 20)
+    assert_equal_episodes(
+        batched("pendulum", 4, actuator=written), looped("pendulum", 4, actuator=each), 20
+    )
     for form, one in zip(written, each, strict=True):
-        assert_equal_episodes(batched("pendulum", 2, actuator=form), looped("pendulum", 2, actuator=[one] * 2), 3)
+        assert_equal_episodes(
+            batched("pendulum", 2, actuator=form), looped("pendulum", 2, actuator=[one] * 2), 3
+        )
     serial = make_sb3_vec_env("pendulum", 4, physics="analytic", actuator=written).env
     assert [one.unwrapped.actuator for one in serial.envs] == each
 
@@ -130,7 +156,9 @@ def test_an_actuator_in_any_form_is_the_same_for_all_and_for_each(tmp_path):
 def test_one_environment_is_a_batch_and_many_are_as_equal_as_few(task, num_envs):
     """Compiled array functions take other paths for long arrays than for single numbers."""
     given = {"actuator": "weaker", "max_episode_steps": 9}
-    assert_equal_episodes(batched(task, num_envs, num_threads=2, **given), looped(task, num_envs, **given), 12)
+    assert_equal_episodes(
+        batched(task, num_envs, num_threads=2, **given), looped(task, num_envs, **given), 12
+    )
 
 
 @pytest.mark.parametrize("task", ["pendulum", "mountain_car_continuous"])
@@ -166,7 +194,12 @@ def test_seeds_in_every_form(seed):
     ours, theirs = batched("cartpole", 4), looped("cartpole", 4)
     for env in (ours, theirs):
         env.reset(seed=[1, 2, 3, 4])
-    assert_same(*(env.reset(seed=int(seed) if isinstance(seed, np.integer) else seed) for env in (ours, theirs)))
+    assert_same(
+        *(
+            env.reset(seed=int(seed) if isinstance(seed, np.integer) else seed)
+            for env in (ours, theirs)
+        )
+    )
     for mine, his in zip(ours.np_random, theirs.np_random, strict=True):
         assert mine.bit_generator.state == his.bit_generator.state
     if isinstance(seed, np.integer):
@@ -180,7 +213,12 @@ def test_seeds_in_every_form(seed):
 def test_spaces_spec_and_metadata_are_those_of_gymnasiums_loop(task):
     ours, theirs = batched(task, 3), looped(task, 3)
     assert ours.num_envs == 3
-    for name in ("action_space", "observation_space", "single_action_space", "single_observation_space"):
+    for name in (
+        "action_space",
+        "observation_space",
+        "single_action_space",
+        "single_observation_space",
+    ):
         assert getattr(ours, name) == getattr(theirs, name), name
     assert ours.spec.id == theirs.spec.id == TASKS[task].env_id
     assert ours.spec.kwargs["vectorization_mode"] == "vector_entry_point"
@@ -188,14 +226,18 @@ def test_spaces_spec_and_metadata_are_those_of_gymnasiums_loop(task):
     assert ours.metadata == theirs.metadata | {"render_modes": modes}
     assert ours.unwrapped.max_episode_steps == TASKS[task].max_episode_steps
     assert gymnasium.make_vec(ours.spec).num_envs == 3
-    assert gymnasium.make_vec(TASKS[task].env_id, 2).unwrapped.num_envs == 2  # the default mode is ours
+    assert (
+        gymnasium.make_vec(TASKS[task].env_id, 2).unwrapped.num_envs == 2
+    )  # the default mode is ours
     assert ActuatedVectorEnv.metadata["render_modes"] == modes
 
 
 @every_mode
 def test_the_autoreset_mode_is_in_the_metadata_and_may_be_a_name_or_gymnasiums_own(mode):
     assert batched("pendulum", 2, mode).metadata["autoreset_mode"] is AutoresetMode(mode)
-    assert batched("pendulum", 2, AutoresetMode(mode)).metadata["autoreset_mode"] is AutoresetMode(mode)
+    assert batched("pendulum", 2, AutoresetMode(mode)).metadata["autoreset_mode"] is AutoresetMode(
+        mode
+    )
 
 
 def test_without_a_limit_no_episode_is_truncated():
@@ -259,5 +301,7 @@ def test_threads_of_a_shallow_copy_use_its_own_arrays():
         one.action_space.seed(0)
         other = copy.copy(one)
         other._kernels = None  # it makes its own, of what both share
-        taken.append([env.step(one.action_space.sample())[1] for _ in range(100) for env in (one, other)])
+        taken.append(
+            [env.step(one.action_space.sample())[1] for _ in range(100) for env in (one, other)]
+        )
     np.testing.assert_array_equal(*taken)

@@ -1,7 +1,7 @@
 """Every parameter of the actuator matters to the task: on/off pairs, each side against the chain by hand.
 
-The oracle is the reference motor (`tests.reference`) and Gymnasium's own step: a wire that is missing in the
-environment makes one side of its pair leave the oracle, and both sides alike.
+The oracle is the reference motor (`tests.reference`) and Gymnasium's own step: a wire that is
+missing in the environment makes one side of its pair leave the oracle, and both sides alike.
 """
 
 import functools
@@ -16,12 +16,38 @@ from tests.engine.models import FULL, changed
 from tests.reference import MotorSimulation
 from tests.tasks.faces import REBUILT, desired_force, every_rebuilt
 
-SPEED = {"pendulum": 1, "cartpole": 1, "acrobot": 3, "mountain_car": 1, "mountain_car_continuous": 1}
-STEPS = {"pendulum": 60, "cartpole": 40, "acrobot": 15, "mountain_car": 30, "mountain_car_continuous": 30}
-SUPPLY = {"pendulum": 4.0, "cartpole": 10.0, "acrobot": 2.0, "mountain_car": 0.6, "mountain_car_continuous": 0.6}
+SPEED = {
+    "pendulum": 1,
+    "cartpole": 1,
+    "acrobot": 3,
+    "mountain_car": 1,
+    "mountain_car_continuous": 1,
+}
+STEPS = {
+    "pendulum": 60,
+    "cartpole": 40,
+    "acrobot": 15,
+    "mountain_car": 30,
+    "mountain_car_continuous": 30,
+}
+SUPPLY = {
+    "pendulum": 4.0,
+    "cartpole": 10.0,
+    "acrobot": 2.0,
+    "mountain_car": 0.6,
+    "mountain_car_continuous": 0.6,
+}
 """A supply that saturates at times, by task [V]."""
 
-TRACE = ("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated", "speed")
+TRACE = (
+    "desired_force",
+    "actual_force",
+    "current",
+    "reference_current",
+    "voltage",
+    "saturated",
+    "speed",
+)
 
 OFF = {  # feature -> the change that takes it away, and what else both sides of the pair have
     "back_emf_constant": ({"back_emf_constant": 0.0}, {"bemf_compensation": False}),
@@ -32,7 +58,10 @@ OFF = {  # feature -> the change that takes it away, and what else both sides of
     "kd": ({"kd": 0.0}, {"kd": 0.02}),
     "kff": ({"kff": 0.0}, {}),
     "integral_leak": ({"integral_leak": 0.0}, {"integral_leak": 5.0}),
-    "derivative_time_constant": ({"derivative_time_constant": 0.0}, {"kd": 0.03, "derivative_time_constant": 0.05}),
+    "derivative_time_constant": (
+        {"derivative_time_constant": 0.0},
+        {"kd": 0.03, "derivative_time_constant": 0.05},
+    ),
     "substeps": ({"substeps": 1}, {}),
     "arm_radius": ({"arm_radius": 1.0}, {}),
     "torque_constant": ({"torque_constant": 1.0}, {}),
@@ -66,14 +95,20 @@ def _episode(task, physics, integrator, actuator):
     assert env.trace_names == TRACE
     rows, oracle = np.array(found), np.array(expected)
     np.testing.assert_array_equal(rows[:, 0], oracle[:, 0])
-    np.testing.assert_allclose(rows[:, 1] * constants.arm_radius, constants.torque_constant * rows[:, 2], rtol=1e-12)
+    np.testing.assert_allclose(
+        rows[:, 1] * constants.arm_radius, constants.torque_constant * rows[:, 2], rtol=1e-12
+    )
     return rows, oracle
 
 
-@pytest.mark.parametrize(("task", "integrator"), [(task, name) for task in REBUILT for name in TASKS[task].integrators])
+@pytest.mark.parametrize(
+    ("task", "integrator"), [(task, name) for task in REBUILT for name in TASKS[task].integrators]
+)
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("feature", OFF)
-def test_a_feature_matters_and_is_what_it_should_be_with_and_without(task, integrator, physics, feature):
+def test_a_feature_matters_and_is_what_it_should_be_with_and_without(
+    task, integrator, physics, feature
+):
     without, both = OFF[feature]
     with_it = changed(FULL, **{"inductance": 0.2, "max_voltage": SUPPLY[task], **both})
     runs = []

@@ -15,7 +15,9 @@ from codrl_mj.view.session import Session
 from tests.envs.rig import RIG, RigEnv
 
 NAME, MOTOR = "tests.envs.rig:RIG", "maxon-re65"
-QUICK = "--agent sac --total-steps 60 --agent.learning-starts 20 --num-envs 1 --evaluation-episodes 1"
+QUICK = (
+    "--agent sac --total-steps 60 --agent.learning-starts 20 --num-envs 1 --evaluation-episodes 1"
+)
 
 
 @pytest.fixture(scope="module")
@@ -52,12 +54,21 @@ class Nameless(World):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: EnvConfig(NAME, integrator="rk4"), "integrator = 'rk4': rig has none: leave it out"),
+        (
+            lambda: EnvConfig(NAME, integrator="rk4"),
+            "integrator = 'rk4': rig has none: leave it out",
+        ),
         (lambda: EnvConfig("tests.envs.rig:rk4_of_nobody"), "rk4_of_nobody"),
         (lambda: EnvConfig("tests.envs.rig:XML"), "must be a codrl_mj.Task or a codrl_mj.World"),
         (lambda: EnvConfig("tests.envs.rig:Rig"), r"^Rig: must be an instance of it: Rig\(...\)"),
-        (lambda: world_of(Nameless()), "Nameless: must have a `name`, a text, which messages call it by"),
-        (lambda: codrl_mj.make(RigEnv(), {".*": "lag"}), "must be an id, or a function or class that makes an env"),
+        (
+            lambda: world_of(Nameless()),
+            "Nameless: must have a `name`, a text, which messages call it by",
+        ),
+        (
+            lambda: codrl_mj.make(RigEnv(), {".*": "lag"}),
+            "must be an id, or a function or class that makes an env",
+        ),
     ],
 )
 def test_what_is_no_world_or_what_it_does_not_have_is_refused(call, message):
@@ -70,12 +81,16 @@ def test_a_world_that_makes_no_environment_is_refused(monkeypatch):
     named.name = "named"
     assert world_of(named) is named
     monkeypatch.setattr(type(RIG), "make", lambda *_, **__: 3)
-    with pytest.raises(ValueError, match=r"tests.envs.rig:RIG: its `make` returned 3: must be a gymnasium.Env"):
+    with pytest.raises(
+        ValueError, match=r"tests.envs.rig:RIG: its `make` returned 3: must be a gymnasium.Env"
+    ):
         EnvConfig(NAME).make()
 
 
 def test_an_evaluation_keeps_the_time_limit_of_a_world_without_one(monkeypatch):
-    config = TrainConfig.preset(NAME, "sac", env={"max_episode_steps": 9, "options": {"target": 0.5}})
+    config = TrainConfig.preset(
+        NAME, "sac", env={"max_episode_steps": 9, "options": {"target": 0.5}}
+    )
     assert config.evaluation_env.time_limit == RIG.time_limit
     monkeypatch.setattr(type(RIG), "time_limit", None)
     assert config.evaluation_env.time_limit == 9
@@ -84,7 +99,9 @@ def test_an_evaluation_keeps_the_time_limit_of_a_world_without_one(monkeypatch):
 def test_a_fault_of_an_environment_s_own_is_not_said_to_be_of_options_that_nobody_gave():
     gym.register("Broken-v0", lambda **_: len(5), max_episode_steps=5)
     try:
-        with pytest.raises(ValueError, match=r"^Broken-v0: object of type 'int' has no len") as refused:
+        with pytest.raises(
+            ValueError, match=r"^Broken-v0: object of type 'int' has no len"
+        ) as refused:
             EnvConfig("Broken-v0").make()
         assert isinstance(refused.value.__cause__, TypeError)
     finally:
@@ -129,16 +146,22 @@ def test_a_live_session_runs_it():
 
 
 def test_make_takes_of_a_world_or_task_by_its_place_what_it_says_it_takes():
-    with codrl_mj.make(NAME, "lag", render_mode="rgb_array", max_episode_steps=7, target=0.5) as env:
+    with codrl_mj.make(
+        NAME, "lag", render_mode="rgb_array", max_episode_steps=7, target=0.5
+    ) as env:
         assert (env.render_mode, env.unwrapped._target) == ("rgb_array", 0.5)
         env.reset(seed=0)
         assert [env.step(np.zeros(1))[3] for _ in range(7)] == [False] * 6 + [True]
-    with codrl_mj.make("codrl_mj.tasks.cartpole:TASK", "lag", center_radius=0.1, max_episode_steps=9) as env:
+    with codrl_mj.make(
+        "codrl_mj.tasks.cartpole:TASK", "lag", center_radius=0.1, max_episode_steps=9
+    ) as env:
         assert env.unwrapped.setup.config.options.center_radius == 0.1
         assert env.spec.max_episode_steps == 9
 
 
-@pytest.mark.parametrize("of", [lambda fields: fields, lambda fields: {"slider": fields}], ids=["all", "by name"])
+@pytest.mark.parametrize(
+    "of", [lambda fields: fields, lambda fields: {"slider": fields}], ids=["all", "by name"]
+)
 def test_make_takes_an_actuators_fields_for_an_environment_of_others(of):
     with codrl_mj.make("InvertedPendulum-v5", of({"family": "lag", "time_constant": 0.03})) as env:
         assert [one.time_constant for one in env.get_wrapper_attr("motors").values()] == [0.03]

@@ -13,7 +13,9 @@ MODES = tuple(mode.value for mode in AutoresetMode)
 
 def batched(task, num_envs, mode="NextStep", **arguments):
     """Ours, as a user makes it."""
-    return gymnasium.make_vec(TASKS[task].env_id, num_envs, "vector_entry_point", autoreset_mode=mode, **arguments)
+    return gymnasium.make_vec(
+        TASKS[task].env_id, num_envs, "vector_entry_point", autoreset_mode=mode, **arguments
+    )
 
 
 def looped(task, num_envs, mode="NextStep", **arguments):
@@ -21,9 +23,13 @@ def looped(task, num_envs, mode="NextStep", **arguments):
     actuators = arguments.pop("actuator", "default")
     if not isinstance(actuators, list):
         options = {"autoreset_mode": AutoresetMode(mode)}
-        return gymnasium.make_vec(TASKS[task].env_id, num_envs, "sync", options, actuator=actuators, **arguments)
+        return gymnasium.make_vec(
+            TASKS[task].env_id, num_envs, "sync", options, actuator=actuators, **arguments
+        )
     single = TASKS[task].env_id
-    makers = [lambda one=one: gymnasium.make(single, actuator=one, **arguments) for one in actuators]
+    makers = [
+        lambda one=one: gymnasium.make(single, actuator=one, **arguments) for one in actuators
+    ]
     return SyncVectorEnv(makers, autoreset_mode=mode)
 
 
@@ -55,7 +61,9 @@ def random_actions(env, generator):
     space = env.single_action_space
     if isinstance(space, gymnasium.spaces.Discrete):
         return generator.integers(space.n, size=env.num_envs)
-    return generator.uniform(1.5 * space.low, 1.5 * space.high, (env.num_envs, *space.shape)).astype(np.float32)
+    return generator.uniform(
+        1.5 * space.low, 1.5 * space.high, (env.num_envs, *space.shape)
+    ).astype(np.float32)
 
 
 def assert_equal_episodes(ours, theirs, steps, seed=0, masks=True):
@@ -74,12 +82,20 @@ def assert_equal_episodes(ours, theirs, steps, seed=0, masks=True):
         one, other = ours.step(actions), theirs.step(actions)
         assert_same(one, other, f"step {step}")
         ends += np.stack([one[2], one[3]], axis=-1)
-        mask = generator.random(ours.num_envs) < 0.1 if masks and step % 6 == 5 else np.zeros(ours.num_envs, dtype=bool)
+        mask = (
+            generator.random(ours.num_envs) < 0.1
+            if masks and step % 6 == 5
+            else np.zeros(ours.num_envs, dtype=bool)
+        )
         if mode == AutoresetMode.DISABLED:
             mask |= one[2] | one[3]
         if mask.any():
-            seeds = [None if generator.random() < 0.5 else int(generator.integers(1000)) for _ in mask]
+            seeds = [
+                None if generator.random() < 0.5 else int(generator.integers(1000)) for _ in mask
+            ]
             seeds = seeds if step % 4 == 1 else None
-            resets = [env.reset(seed=seeds, options={"reset_mask": mask.copy()}) for env in (ours, theirs)]
+            resets = [
+                env.reset(seed=seeds, options={"reset_mask": mask.copy()}) for env in (ours, theirs)
+            ]
             assert_same(*resets, f"reset after step {step}")
     return ends

@@ -26,7 +26,10 @@ def _nothing_is_left():
 
 
 def _families(model):
-    return {model.actuator(index).name: type(motor) for index, motor in codrl_mj.engine.motors(model).items()}
+    return {
+        model.actuator(index).name: type(motor)
+        for index, motor in codrl_mj.engine.motors(model).items()
+    }
 
 
 def test_models_from_files_text_and_environments_get_motors_inside_and_none_outside(tmp_path):
@@ -38,7 +41,9 @@ def test_models_from_files_text_and_environments_get_motors_inside_and_none_outs
         ball, env = mujoco.MjModel.from_xml_string(BALL), gym.make("HalfCheetah-v5")
     building = Building({"servo": Lag(0.1)})
     with building.motorising():  # as composer environments build theirs at every reset
-        assert [_families(mujoco.MjModel.from_xml_string(ARM)) for _ in range(3)] == [{"servo": Lag}] * 3
+        assert [_families(mujoco.MjModel.from_xml_string(ARM)) for _ in range(3)] == [
+            {"servo": Lag}
+        ] * 3
     assert len(building._met) == 1
     with pytest.raises(ZeroDivisionError), codrl_mj.motorised({"servo": "lag"}):
         raise ZeroDivisionError  # passes, and everything is as before
@@ -86,7 +91,10 @@ def test_threads_have_motors_of_their_own():
 @pytest.mark.parametrize(
     ("actuators", "text"),
     [
-        ({"wheel": "lag"}, r"'wheel': no actuator has such a name.*there are servo, shoulder, motor, elbow"),
+        (
+            {"wheel": "lag"},
+            r"'wheel': no actuator has such a name.*there are servo, shoulder, motor, elbow",
+        ),
         ("lag", "must be a mapping of patterns"),
         ({".*": {"family": "lag", "delay": 1.0}}, "must be <= 0.08 s"),
     ],

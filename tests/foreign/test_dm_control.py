@@ -11,7 +11,9 @@ from codrl_mj.catalogue import motor_entry
 from tests.matrix import but
 
 IDEAL = {".*": "ideal"}
-DOMAINS = sorted({domain: f"{domain}/{task}" for domain, task in reversed(suite.ALL_TASKS)}.values())
+DOMAINS = sorted(
+    {domain: f"{domain}/{task}" for domain, task in reversed(suite.ALL_TASKS)}.values()
+)
 """A task of each domain of the suite."""
 
 
@@ -24,11 +26,15 @@ def _inputs(env, steps):
 
 def _assert_same(ours, plain, steps):
     for index, action in enumerate([None, *_inputs(plain, steps)]):
-        found, expected = (env.reset() if action is None else env.step(action) for env in (ours, plain))
+        found, expected = (
+            env.reset() if action is None else env.step(action) for env in (ours, plain)
+        )
         assert found[:3] == expected[:3], index
         assert found.observation.keys() == expected.observation.keys()
         for name, value in expected.observation.items():
-            np.testing.assert_array_equal(found.observation[name], value, err_msg=f"{name}, step {index}")
+            np.testing.assert_array_equal(
+                found.observation[name], value, err_msg=f"{name}, step {index}"
+            )
     return expected
 
 
@@ -46,7 +52,9 @@ def test_ideal_motors_change_no_bit_of_whole_episodes(name):
 ANEW = {
     "reach": lambda: manipulation.load("reach_duplo_features", seed=1),
     "rodent": lambda: basic_rodent_2020.rodent_run_gaps(random_state=np.random.RandomState(1)),
-    "humanoid": lambda: basic_cmu_2019.cmu_humanoid_run_walls(random_state=np.random.RandomState(1)),
+    "humanoid": lambda: basic_cmu_2019.cmu_humanoid_run_walls(
+        random_state=np.random.RandomState(1)
+    ),
 }
 
 
@@ -75,7 +83,9 @@ def test_signals_are_those_of_the_forces_that_moved_it_last():
         upper, lower = (np.clip(1.5 * (sign - speed / 5.0), -1.0, 1.0) for sign in (1.0, -1.0))
         signals = env.signals()
         assert signals["desired_force"] == action[0]
-        assert signals["actual_force"] == pytest.approx(np.clip(action[0], lower, upper), rel=1e-12, abs=1e-13)
+        assert signals["actual_force"] == pytest.approx(
+            np.clip(action[0], lower, upper), rel=1e-12, abs=1e-13
+        )
         assert signals["saturated"] is bool(signals["actual_force"] != action[0])
         saturated.append(signals["saturated"])
     assert 10 < sum(saturated) < 140
@@ -88,7 +98,9 @@ def test_noise_differs_between_episodes_and_repeats_with_its_seed():
     )
     runs = []
     for seed in (1, 1, 2):
-        env = codrl_mj.make_dm_control("pendulum/swingup", {".*": noisy}, noise_seed=seed, task_kwargs={"random": 0})
+        env = codrl_mj.make_dm_control(
+            "pendulum/swingup", {".*": noisy}, noise_seed=seed, task_kwargs={"random": 0}
+        )
         runs.append([])
         for _ in range(2):
             env.reset()
@@ -102,14 +114,20 @@ MAXON = {".*": "maxon-ec45-flat-50w"}
 
 
 def test_currents_are_commanded_in_amperes():
-    motor = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced({"controller.max_current": 5.0})
-    env = codrl_mj.make_dm_control("cheetah/run", {".*": motor}, action="current", task_kwargs={"random": 0})
+    motor = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
+        {"controller.max_current": 5.0}
+    )
+    env = codrl_mj.make_dm_control(
+        "cheetah/run", {".*": motor}, action="current", task_kwargs={"random": 0}
+    )
     spec = env.action_spec()
     np.testing.assert_array_equal((spec.minimum, spec.maximum), ([-5.0] * 6, [5.0] * 6))
     env.reset()
     action = np.array([0.3, -0.2, 0.1, 5.0, 9.0, 0.0])
     env.step(action)
-    np.testing.assert_allclose(env.signals()["reference_current"], np.clip(action, -5.0, 5.0), rtol=1e-12)
+    np.testing.assert_allclose(
+        env.signals()["reference_current"], np.clip(action, -5.0, 5.0), rtol=1e-12
+    )
     with pytest.raises(ValueError, match=r"action has shape \(1,\): must be \(6,\)"):
         env.step(np.zeros(1))
     with pytest.raises(AttributeError, match="nothing"):
@@ -117,10 +135,15 @@ def test_currents_are_commanded_in_amperes():
 
 
 def test_motors_and_model_are_drawn_at_every_reset_and_initial_states_are_not_touched():
-    draws = {".*": {"motor.resistance": "uniform(0.6, 1.2)"}, "model.mass.torso": "uniform(0.5, 2.0)"}
+    draws = {
+        ".*": {"motor.resistance": "uniform(0.6, 1.2)"},
+        "model.mass.torso": "uniform(0.5, 2.0)",
+    }
     arguments = {"task_kwargs": {"random": 3}}
     env = codrl_mj.make_dm_control("cheetah/run", MAXON, randomize=draws, noise_seed=1, **arguments)
-    again = codrl_mj.make_dm_control("cheetah/run", MAXON, randomize=draws, noise_seed=1, **arguments)
+    again = codrl_mj.make_dm_control(
+        "cheetah/run", MAXON, randomize=draws, noise_seed=1, **arguments
+    )
     plain = codrl_mj.make_dm_control("cheetah/run", MAXON, **arguments)
     mass, factors = plain.mujoco[0].body("torso").mass[0], []
     for _ in range(3):
@@ -133,8 +156,12 @@ def test_motors_and_model_are_drawn_at_every_reset_and_initial_states_are_not_to
         assert {motor.motor.resistance for motor in env.motors.values()} == {resistance}
         assert one.observation["position"].shape == other.observation["position"].shape
     assert len(set(factors)) == 3
-    with pytest.raises(ValueError, match="randomize: Environment builds its model anew at every reset"):
-        codrl_mj.make_dm_control(ANEW["reach"], IDEAL, randomize={"model.gravity": "uniform(0.9, 1.1)"})
+    with pytest.raises(
+        ValueError, match="randomize: Environment builds its model anew at every reset"
+    ):
+        codrl_mj.make_dm_control(
+            ANEW["reach"], IDEAL, randomize={"model.gravity": "uniform(0.9, 1.1)"}
+        )
 
 
 def test_commands_are_delayed_by_whole_environment_steps():

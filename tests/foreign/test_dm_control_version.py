@@ -10,17 +10,26 @@ from codrl_mj.foreign import check_dm_control
 
 def installed(monkeypatch, mujoco_version, dm_control_version):
     monkeypatch.setattr(mujoco, "__version__", mujoco_version)
-    monkeypatch.setattr(importlib.metadata, "version", lambda name: {"dm-control": dm_control_version}[name])
+    monkeypatch.setattr(
+        importlib.metadata, "version", lambda name: {"dm-control": dm_control_version}[name]
+    )
 
 
-@pytest.mark.parametrize(("engine", "version"), [("4.0.0", "1.0.50"), ("4.1.0", "1.0.41"), ("5.0.0", "1.0.50")])
+@pytest.mark.parametrize(
+    ("engine", "version"), [("4.0.0", "1.0.50"), ("4.1.0", "1.0.41"), ("5.0.0", "1.0.50")]
+)
 def test_raises_and_names_both_versions_where_the_engine_is_too_new(monkeypatch, engine, version):
     installed(monkeypatch, engine, version)
-    with pytest.raises(RuntimeError, match=rf"dm_control {version} does not work with MuJoCo {engine}.*\[dm-control\]"):
+    with pytest.raises(
+        RuntimeError,
+        match=rf"dm_control {version} does not work with MuJoCo {engine}.*\[dm-control\]",
+    ):
         check_dm_control()
 
 
-@pytest.mark.parametrize(("engine", "version"), [("3.17.0", "1.0.50"), ("3.99.1", "1.0.41"), ("4.0.0", "1.0.51")])
+@pytest.mark.parametrize(
+    ("engine", "version"), [("3.17.0", "1.0.50"), ("3.99.1", "1.0.41"), ("4.0.0", "1.0.51")]
+)
 def test_accepts_versions_that_fit(monkeypatch, engine, version):
     installed(monkeypatch, engine, version)
     check_dm_control()

@@ -14,8 +14,12 @@ from codrl_mj.catalogue import motor_entry
 from tests.foreign.models import ARM, ArmEnv, actions, assert_same, run
 from tests.foreign.test_gymnasium import CHEETAH, IDEAL, MAXON, NOISY
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # deprecated attributes in other people's models
-DRAWS = {".*": {"motor.resistance": "uniform(0.6, 1.2)", "motor.rotor_inertia": "uniform(1e-5, 3e-5)"}}
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::UserWarning"
+)  # deprecated attributes in other people's models
+DRAWS = {
+    ".*": {"motor.resistance": "uniform(0.6, 1.2)", "motor.rotor_inertia": "uniform(1e-5, 3e-5)"}
+}
 
 
 def test_motors_are_drawn_at_every_reset_and_initial_states_are_not_touched():
@@ -28,7 +32,9 @@ def test_motors_are_drawn_at_every_reset_and_initial_states_are_not_touched():
         assert 0.6 <= drawn["motor.resistance"] <= 1.2
         assert 1e-5 <= drawn["motor.rotor_inertia"] <= 3e-5
         assert env.randomization == info["randomization"]
-        assert {motor.motor.resistance for motor in env.motors.values()} == {drawn["motor.resistance"]}
+        assert {motor.motor.resistance for motor in env.motors.values()} == {
+            drawn["motor.resistance"]
+        }
         found.append(drawn["motor.resistance"])
     assert found[0] == found[3]
     assert len(set(found)) == 3
@@ -36,45 +42,74 @@ def test_motors_are_drawn_at_every_reset_and_initial_states_are_not_touched():
 
 def test_a_drawn_motor_is_the_motor_that_it_would_be_from_the_first():
     fields = {"motor.rotor_inertia": 3e-5, "motor.coulomb_friction": 0.02, "motor.gear_ratio": 1.5}
-    made = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(fields | {"motor.resistance": 1.1})
+    made = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
+        fields | {"motor.resistance": 1.1}
+    )
     draws = {".*": {name: codrl_mj.Choice([value]) for name, value in fields.items()}}
     draws[".*"]["motor.resistance"] = "choice(1.1)"
-    drawn, first = codrl_mj.make("Hopper-v5", MAXON, randomize=draws), codrl_mj.make("Hopper-v5", {".*": made})
+    drawn, first = (
+        codrl_mj.make("Hopper-v5", MAXON, randomize=draws),
+        codrl_mj.make("Hopper-v5", {".*": made}),
+    )
     inputs = actions(first, 50)
     for ours, theirs in zip(run(drawn, inputs, seed=0), run(first, inputs, seed=0), strict=True):
         np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-9, atol=1e-9)
-    for field in ("actuator_armature", "dof_frictionloss", "actuator_user", "dof_invweight0", "dof_M0"):
+    for field in (
+        "actuator_armature",
+        "dof_frictionloss",
+        "actuator_user",
+        "dof_invweight0",
+        "dof_M0",
+    ):
         ours, theirs = (getattr(env.unwrapped.model, field) for env in (drawn, first))
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=0.0, err_msg=field)
 
 
 def test_motors_of_several_families_are_drawn_each_by_its_fields():
     actuators = {"b.*": MAXON[".*"], "f.*": "lag"}
-    draws = {"b.*": {"motor.resistance": "uniform(0.6, 1.2)"}, "f.*": {"time_constant": "uniform(0.01, 0.02)"}}
+    draws = {
+        "b.*": {"motor.resistance": "uniform(0.6, 1.2)"},
+        "f.*": {"time_constant": "uniform(0.01, 0.02)"},
+    }
     env = codrl_mj.make(CHEETAH, actuators, randomize=draws)
     drawn = env.reset(seed=0)[1]["randomization"]
     motors = list(env.motors.values())
     assert {one.motor.resistance for one in motors[:3]} == {*drawn["b.*"].values()}
     assert {one.time_constant for one in motors[3:]} == {*drawn["f.*"].values()}
     assert list(codrl_mj.engine.motors(env.unwrapped.model).values())[3:] == motors[3:]
-    with pytest.raises(ValueError, match=r"unknown field 'motor\.resistance'"):  # not of every motor
+    with pytest.raises(
+        ValueError, match=r"unknown field 'motor\.resistance'"
+    ):  # not of every motor
         codrl_mj.make(CHEETAH, actuators, randomize={"motor.resistance": "uniform(0.6, 1.2)"})
 
 
 def test_paths_draw_what_patterns_with_their_fields_do():
     fields = {"time_constant": "uniform(0.01, 0.02)"}
-    nested = codrl_mj.make("Hopper-v5", {".*": "lag"}, randomize={".*": fields, "model.gravity": "uniform(0.9, 1.1)"})
+    nested = codrl_mj.make(
+        "Hopper-v5", {".*": "lag"}, randomize={".*": fields, "model.gravity": "uniform(0.9, 1.1)"}
+    )
     flat = codrl_mj.make(
         "Hopper-v5",
         {".*": "lag"},
-        randomize={"time_constant": codrl_mj.Uniform(0.01, 0.02), "model.gravity": "uniform(0.9, 1.1)"},
+        randomize={
+            "time_constant": codrl_mj.Uniform(0.01, 0.02),
+            "model.gravity": "uniform(0.9, 1.1)",
+        },
     )
-    one = codrl_mj.make("Hopper-v5", {".*": "lag"}, randomize={f"thigh_joint:{name}": fields[name] for name in fields})
+    one = codrl_mj.make(
+        "Hopper-v5",
+        {".*": "lag"},
+        randomize={f"thigh_joint:{name}": fields[name] for name in fields},
+    )
     drawn, same, alone = (env.reset(seed=1)[1]["randomization"] for env in (nested, flat, one))
     assert drawn == {".*": {"time_constant": same.pop("time_constant")}, **same}
     assert alone["thigh_joint"] == drawn[".*"]
     assert list(flat.motors.values()) == list(nested.motors.values())
-    assert [motor.time_constant == Lag().time_constant for motor in one.motors.values()] == [False, True, True]
+    assert [motor.time_constant == Lag().time_constant for motor in one.motors.values()] == [
+        False,
+        True,
+        True,
+    ]
 
 
 def _of_the_model(mass, gravity, damping):
@@ -83,7 +118,10 @@ def _of_the_model(mass, gravity, damping):
 
 def test_a_model_that_is_drawn_as_it_is_is_as_before():
     draws = _of_the_model("choice(1.0)", "choice(1.0)", "choice(0.0)")
-    plain, ours = gym.make("InvertedPendulum-v5"), codrl_mj.make("InvertedPendulum-v5", IDEAL, randomize=draws)
+    plain, ours = (
+        gym.make("InvertedPendulum-v5"),
+        codrl_mj.make("InvertedPendulum-v5", IDEAL, randomize=draws),
+    )
     inputs = actions(plain, 100)
     assert_same(run(ours, inputs, seed=0), run(plain, inputs, seed=0))
 
@@ -102,7 +140,14 @@ def test_a_drawn_model_is_the_model_that_it_would_be_from_the_first():
         spec.joint("hinge").damping[0] += drawn["model.damping.hinge"]
         expected, found = spec.compile(), env.unwrapped.model
         np.testing.assert_allclose(found.opt.gravity, expected.opt.gravity, rtol=1e-12)
-        for field in ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_M0", "dof_damping"):
+        for field in (
+            "body_mass",
+            "body_inertia",
+            "body_subtreemass",
+            "body_invweight0",
+            "dof_M0",
+            "dof_damping",
+        ):
             ours, theirs = getattr(found, field), getattr(expected, field)
             np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-15, err_msg=field)
     assert env.reset(seed=1)[1]["randomization"]["model.gravity"] != drawn["model.gravity"]
@@ -137,7 +182,9 @@ def test_unstable_draws_are_drawn_again():
     for seed in range(20):
         info = env.reset(seed=seed)[1]["randomization"]
         rejected.append(info["rejected"])
-        stiff.replaced({"controller.kp": info[".*"]["controller.kp"]}).check(env.unwrapped.model.opt.timestep)
+        stiff.replaced({"controller.kp": info[".*"]["controller.kp"]}).check(
+            env.unwrapped.model.opt.timestep
+        )
     assert any(rejected)
 
 
@@ -152,7 +199,10 @@ def test_commands_are_delayed_by_whole_environment_steps():
 
 
 SERVO = Servo(
-    GearMotor(gear_ratio=20.0), SampledLoop(20e3), Supply(48.0), ServoLoop(servo_rate=100.0, velocity_gain=1.0)
+    GearMotor(gear_ratio=20.0),
+    SampledLoop(20e3),
+    Supply(48.0),
+    ServoLoop(servo_rate=100.0, velocity_gain=1.0),
 )
 WEAK = dataclasses.replace(SERVO, loop=ServoLoop(servo_rate=100.0, velocity_gain=0.05))
 
@@ -166,7 +216,9 @@ WEAK = dataclasses.replace(SERVO, loop=ServoLoop(servo_rate=100.0, velocity_gain
         ({"servo": SERVO, "motor": "ideal"}, "force"),
     ],
 )
-def test_late_positions_are_held_where_the_episode_starts_and_late_forces_are_zero(tmp_path, motors, action, face):
+def test_late_positions_are_held_where_the_episode_starts_and_late_forces_are_zero(
+    tmp_path, motors, action, face
+):
     """As in the environment without delay, whose first actions are the positions at which it starts."""
 
     class Stale(ArmEnv):
@@ -179,7 +231,9 @@ def test_late_positions_are_held_where_the_episode_starts_and_late_forces_are_ze
     path = tmp_path / "arm.xml"
     path.write_text(ARM)
     creator = functools.partial(Stale if face == "stale" else ArmEnv, path)
-    late = codrl_mj.make(creator, motors, action=action, disturbances={"command_delay": 0.02}, max_episode_steps=99)
+    late = codrl_mj.make(
+        creator, motors, action=action, disturbances={"command_delay": 0.02}, max_episode_steps=99
+    )
     plain = codrl_mj.make(creator, motors, action=action, max_episode_steps=99)
     for seed in (3, 4):
         observation = late.reset(seed=seed)[0]

@@ -24,7 +24,9 @@ from tests.foreign.models import ARM, V5, ArmEnv, BareEnv, actions, assert_same,
 from tests.matrix import but
 from tests.motorised.models import full_state
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # deprecated attributes in other people's models
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::UserWarning"
+)  # deprecated attributes in other people's models
 IDEAL, MAXON = {".*": "ideal"}, {".*": "maxon-ec45-flat-50w"}
 BACK, FRONT = ("bthigh", "bshin", "bfoot"), ("fthigh", "fshin", "ffoot")
 KEPT = ("HalfCheetah-v5", "InvertedPendulum-v5")  # several motors and RK4 with an early end: one
@@ -49,9 +51,17 @@ def _registered(tmp_path):
 
 @every_v5
 def test_ideal_motors_change_no_bit_of_whole_episodes_and_no_pixel(env_id):
-    plain, ours = gym.make(env_id, render_mode="rgb_array"), codrl_mj.make(env_id, IDEAL, render_mode="rgb_array")
-    assert (ours.observation_space, ours.action_space) == (plain.observation_space, plain.action_space)
-    inputs = actions(plain, plain.spec.max_episode_steps + 1)  # to the time limit, or over many episodes
+    plain, ours = (
+        gym.make(env_id, render_mode="rgb_array"),
+        codrl_mj.make(env_id, IDEAL, render_mode="rgb_array"),
+    )
+    assert (ours.observation_space, ours.action_space) == (
+        plain.observation_space,
+        plain.action_space,
+    )
+    inputs = actions(
+        plain, plain.spec.max_episode_steps + 1
+    )  # to the time limit, or over many episodes
     expected = run(plain, inputs, seed=3)
     assert any(row[2] or row[3] for row in expected)
     assert_same(run(ours, inputs, seed=3), expected)
@@ -65,14 +75,23 @@ def _complaints(check, env, **options):
         warnings.simplefilter("always")
         check(env, **options)
     said = {str(warning.message).split("\n")[0] for warning in caught}
-    return {text for text in said if "is different from the unwrapped version" not in text}  # names the wrappers
+    return {
+        text for text in said if "is different from the unwrapped version" not in text
+    }  # names the wrappers
 
 
 @every_v5
-@pytest.mark.parametrize("check", [check_env, check_env_sb3], ids=["gymnasium", "stable_baselines3"])
+@pytest.mark.parametrize(
+    "check", [check_env, check_env_sb3], ids=["gymnasium", "stable_baselines3"]
+)
 def test_the_checkers_say_no_more_than_of_the_environment_without_motors(env_id, check):
-    expected = _complaints(check, gym.make(env_id), skip_render_check=True)  # a window needs a display
-    for actuators, options in ((IDEAL, {}), ({".*": NOISY}, {"observe_actuator": True, "allow_unstable": True})):
+    expected = _complaints(
+        check, gym.make(env_id), skip_render_check=True
+    )  # a window needs a display
+    for actuators, options in (
+        (IDEAL, {}),
+        ({".*": NOISY}, {"observe_actuator": True, "allow_unstable": True}),
+    ):
         ours = codrl_mj.make(env_id, actuators, **options)
         assert _complaints(check, ours, skip_render_check=True) <= expected
 
@@ -103,7 +122,12 @@ PULSES = {"pulse_force": 0.5, "pulse_duration": 0.03, "pulse_interval": 0.1}
 
 def _everything(env_id):
     """An environment with all that a snapshot has to remember: noise, draws, delays, a limit of time."""
-    draws = {".*": {"motor.resistance": "uniform(0.5, 1.5)", "motor.back_emf_constant": codrl_mj.Uniform(0.0, 0.02)}}
+    draws = {
+        ".*": {
+            "motor.resistance": "uniform(0.5, 1.5)",
+            "motor.back_emf_constant": codrl_mj.Uniform(0.0, 0.02),
+        }
+    }
     draws["model.gravity"] = "uniform(0.8, 1.2)"
     return codrl_mj.make(
         env_id,
@@ -116,7 +140,9 @@ def _everything(env_id):
     )
 
 
-@pytest.mark.parametrize("env_id", but((*KEPT, "Ant-v5"), V5))  # Ant's rewards come from poses that lag a step
+@pytest.mark.parametrize(
+    "env_id", but((*KEPT, "Ant-v5"), V5)
+)  # Ant's rewards come from poses that lag a step
 def test_a_snapshot_continues_bit_for_bit_in_a_fresh_environment(env_id):
     env, other = _everything(env_id), _everything(env_id)
     inputs = actions(env, 120)
@@ -140,7 +166,9 @@ def test_a_snapshot_of_something_else_is_refused():
     with pytest.raises(ValueError, match=r"snapshot\['state'\].*must be"):
         other.restore(env.snapshot())
     with pytest.raises(ValueError, match="must be of 'HalfCheetah-v5'"):
-        env.restore(env.snapshot() | {"environment": np.frombuffer(b"HalfCheetah-v4", dtype=np.uint8)})
+        env.restore(
+            env.snapshot() | {"environment": np.frombuffer(b"HalfCheetah-v4", dtype=np.uint8)}
+        )
 
 
 def test_setting_the_state_brings_motors_to_rest():
@@ -153,10 +181,14 @@ def test_setting_the_state_brings_motors_to_rest():
     moved = [env.step(action)[4]["actual_force"] for action in inputs]
     fresh = codrl_mj.make(CHEETAH, {".*": "lag"}, reset_noise_scale=0.0)
     fresh.reset(seed=0)
-    np.testing.assert_array_equal(moved, [fresh.step(action)[4]["actual_force"] for action in inputs])
+    np.testing.assert_array_equal(
+        moved, [fresh.step(action)[4]["actual_force"] for action in inputs]
+    )
 
 
-@pytest.mark.parametrize(("env_id", "actuator"), [(CHEETAH, NOISY), (CHEETAH, "lag"), (BARE_ID, "lag")])
+@pytest.mark.parametrize(
+    ("env_id", "actuator"), [(CHEETAH, NOISY), (CHEETAH, "lag"), (BARE_ID, "lag")]
+)
 def test_resets_bring_motors_to_rest(env_id, actuator):
     """The engine's own state, motors included, is the same after the same seed, whatever came before."""
     env = codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True)
@@ -242,7 +274,9 @@ def test_observations_end_with_what_the_sensors_say():
     assert env.observation_space.dtype == space.dtype
     np.testing.assert_array_equal(env.observation_space.low, np.append(space.low, [-np.inf] * 12))
     np.testing.assert_array_equal(env.observation_space.high, np.append(space.high, [np.inf] * 12))
-    assert env.sensor_names == tuple(f"{motor}.{name}" for motor in BACK + FRONT for name in Drive.OBSERVED)
+    assert env.sensor_names == tuple(
+        f"{motor}.{name}" for motor in BACK + FRONT for name in Drive.OBSERVED
+    )
     assert not env.reset(seed=0)[0][17:].any()
     for action in actions(env, 5):
         observation, *_, info = env.step(action)
@@ -251,7 +285,13 @@ def test_observations_end_with_what_the_sensors_say():
 
 
 def test_currents_are_commanded_in_amperes_up_to_the_motors_limits():
-    drives = {"b.*": Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced({"controller.max_current": 5.0})}
+    drives = {
+        "b.*": (
+            Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
+                {"controller.max_current": 5.0}
+            )
+        )
+    }
     env = codrl_mj.make(CHEETAH, drives, action="current")
     np.testing.assert_array_equal(env.action_space.high, [5.0] * 3 + [1.0] * 3)
     np.testing.assert_array_equal(env.action_space.low, -env.action_space.high)
@@ -259,7 +299,9 @@ def test_currents_are_commanded_in_amperes_up_to_the_motors_limits():
     for scale in (1.0, 2.0):
         action = scale * np.array([5.0, -5.0, 2.0, 0.1, 0.2, -0.3], np.float32)
         *_, info = env.step(action)
-        np.testing.assert_allclose(info["reference_current"], np.clip(action[:3], -5.0, 5.0), rtol=1e-12)
+        np.testing.assert_allclose(
+            info["reference_current"], np.clip(action[:3], -5.0, 5.0), rtol=1e-12
+        )
         np.testing.assert_allclose(env.unwrapped.data.actuator_force[3:], action[3:], rtol=1e-7)
 
 
@@ -271,8 +313,12 @@ def test_a_current_is_one_whatever_gain_and_arm_stand_before_it_and_whatever_its
     env.reset(seed=0)
     *_, info = env.step(np.array([0.0, -0.4], np.float32))
     assert info["reference_current"] == pytest.approx(-0.4, rel=1e-6)
-    assert info["desired_force"] == pytest.approx(-0.4 * drive.motor.torque_constant * 3.0 / 0.5, rel=1e-6)
-    free = codrl_mj.make("InvertedPendulum-v5", {".*": NOISY}, action="current", allow_unstable=True)
+    assert info["desired_force"] == pytest.approx(
+        -0.4 * drive.motor.torque_constant * 3.0 / 0.5, rel=1e-6
+    )
+    free = codrl_mj.make(
+        "InvertedPendulum-v5", {".*": NOISY}, action="current", allow_unstable=True
+    )
     of_force = 3.0 * free.unwrapped.model.actuator_gainprm[0, 0] / NOISY.motor.torque_constant
     np.testing.assert_allclose(free.action_space.high, [of_force], rtol=1e-6)
 
@@ -289,7 +335,9 @@ def test_voltages_are_commanded_past_the_loop():
 
 
 def test_a_servo_of_ours_is_asked_for_positions():
-    env = codrl_mj.make("InvertedPendulum-v5", {".*": Servo()}, action="position", allow_unstable=True)
+    env = codrl_mj.make(
+        "InvertedPendulum-v5", {".*": Servo()}, action="position", allow_unstable=True
+    )
     np.testing.assert_allclose(env.action_space.high, [math.pi], rtol=1e-6)
     env.reset(seed=0)
     *_, info = env.step(np.array([0.5], np.float32))
@@ -299,14 +347,19 @@ def test_a_servo_of_ours_is_asked_for_positions():
 
 def test_forces_of_an_environment_are_no_motions_of_a_servo():
     """Else 1 N would be taken for 1 m."""
-    message = "action = 'force': '.*': the environment asks its actuators for forces, and a Servo .* must be position"
+    message = (
+        "action = 'force': '.*': the environment asks its actuators for forces, and a Servo .* must"
+        " be position"
+    )
     with pytest.raises(ValueError, match=message):
         codrl_mj.make("InvertedPendulum-v5", {".*": Servo()}, allow_unstable=True)
 
 
 def test_a_servo_of_the_models_stays_one():
     """What it asks for, kp*(target - q) - kv*w, is the desired torque."""
-    env = codrl_mj.make(ARM_ID, {"servo": TorqueSpeed(stall_torque=5.0, no_load_speed=10.0, max_torque=5.0)})
+    env = codrl_mj.make(
+        ARM_ID, {"servo": TorqueSpeed(stall_torque=5.0, no_load_speed=10.0, max_torque=5.0)}
+    )
     (q, _, w, _), _ = env.reset(seed=0)
     (*_,), *_, info = env.step(np.array([0.5, 0.0], np.float32))
     assert info["desired_force"] == pytest.approx(20.0 * (0.5 - q) - w, rel=1e-12)
@@ -338,7 +391,9 @@ def of_stable_baselines3(makers, context):
 @pytest.mark.parametrize("context", ["fork", pytest.param("spawn", marks=pytest.mark.matrix)])
 @pytest.mark.parametrize("face", [of_gymnasium, of_stable_baselines3])
 def test_environments_in_processes_are_those_of_one(face, context):
-    make = functools.partial(codrl_mj.make, CHEETAH, {"b.*": NOISY, "f.*": "lag"}, allow_unstable=True)
+    make = functools.partial(
+        codrl_mj.make, CHEETAH, {"b.*": NOISY, "f.*": "lag"}, allow_unstable=True
+    )
     inputs = np.random.default_rng(0).uniform(-1, 1, (30, 2, 6)).astype(np.float32)
     singles, steps = [make(), make()], face([make] * 2, context)
     for seed, single in zip((3, 4), singles, strict=True):
@@ -347,7 +402,9 @@ def test_environments_in_processes_are_those_of_one(face, context):
     found = [steps.send(inputs), *steps]
     assert len(found) == len(inputs)
     for (observations, currents), pair in zip(found, inputs, strict=True):
-        for single, action, observation, current in zip(singles, pair, observations, currents, strict=True):
+        for single, action, observation, current in zip(
+            singles, pair, observations, currents, strict=True
+        ):
             expected, *_, info = single.step(action)
             np.testing.assert_array_equal(observation, expected)
             np.testing.assert_array_equal(current, info["current"])
@@ -364,41 +421,82 @@ MOTOR = {"motor": MAXON[".*"]}
             {"action": "voltage"},
             r"action = 'voltage': must be one of force, which the lag actuator of '\.\*' takes; or",
         ),
-        ({"observe_actuator": True}, "the lag actuator has no current to observe, and nothing else; choose another"),
+        (
+            {"observe_actuator": True},
+            "the lag actuator has no current to observe, and nothing else; choose another",
+        ),
         ({"randomize": {"knee": {}}}, "randomize: knee: {} is no distribution"),
         ({"randomize": ["time_constant"]}, "must be FIELD=DISTRIBUTION"),
-        ({"randomize": {"knee:time_constant": "uniform(0, 1)"}}, "'knee': no actuator has such a name"),
+        (
+            {"randomize": {"knee:time_constant": "uniform(0, 1)"}},
+            "'knee': no actuator has such a name",
+        ),
         (
             {"randomize": {"time_constant": "uniform(0, 1)", "bfoot:time_constant": "choice(1)"}},
             "drawn by another pattern, too",
         ),
         ({"randomize": {".*": {"time_constnt": "uniform(0, 1)"}}}, "did you mean .*time_constant"),
-        ({"randomize": {".*": {"time_constant": "uniform(-1, 1)"}}}, r"'\.\*'\]\['time_constant'\].*must be.*>= 0"),
-        ({"randomize": {"model.mass.trso": "uniform(0.5, 2)"}}, "did you mean 'model.mass.torso'"),
-        ({"randomize": {"model.mass.torso": "uniform(0, 2)"}}, r"mass.torso'\] = uniform\(0.*= 0: must be .* > 0"),
-        ({"randomize": {"model.length.torso": "uniform(0.5, 2)"}}, "unknown field 'model.length.torso'"),
         (
-            {"actuator": {".*": NOISY}, "randomize": {".*": {"controller.substeps": "uniform(1, 4)"}}},
+            {"randomize": {".*": {"time_constant": "uniform(-1, 1)"}}},
+            r"'\.\*'\]\['time_constant'\].*must be.*>= 0",
+        ),
+        ({"randomize": {"model.mass.trso": "uniform(0.5, 2)"}}, "did you mean 'model.mass.torso'"),
+        (
+            {"randomize": {"model.mass.torso": "uniform(0, 2)"}},
+            r"mass.torso'\] = uniform\(0.*= 0: must be .* > 0",
+        ),
+        (
+            {"randomize": {"model.length.torso": "uniform(0.5, 2)"}},
+            "unknown field 'model.length.torso'",
+        ),
+        (
+            {
+                "actuator": {".*": NOISY},
+                "randomize": {".*": {"controller.substeps": "uniform(1, 4)"}},
+            },
             "controller.substeps must be drawn from a Choice of int values",
         ),
         (
-            {"actuator": MAXON, "action": "current", "randomize": {"motor.torque_constant": "uniform(0.01, 0.02)"}},
-            "with action='current' it would change what an action means; draw it with action='force'",
+            {
+                "actuator": MAXON,
+                "action": "current",
+                "randomize": {"motor.torque_constant": "uniform(0.01, 0.02)"},
+            },
+            (
+                "with action='current' it would change what an action means; draw it with"
+                " action='force'"
+            ),
         ),
-        ({"randomize": {"model.gravity": "uniform(0)"}}, "randomize: model.gravity: .* has 1 values"),
+        (
+            {"randomize": {"model.gravity": "uniform(0)"}},
+            "randomize: model.gravity: .* has 1 values",
+        ),
         ({"disturbances": {"comand_delay": 1}}, "did you mean disturbances.command_delay"),
         ({"env": BARE_ID, "disturbances": {"command_rate": 1.0}}, "has no dt"),
-        ({"env": ARM_ID, "actuator": MAXON, "action": "current"}, r"servo: is no plain motor.*action='force'"),
-        ({"env": ARM_ID, "actuator": MOTOR, "action": "current"}, r"motor: a command \[A\] needs a limit"),
-        ({"env": "CartPole-v1"}, "has no MuJoCo model built from XML, and so no motors: take 'cartpole'"),
+        (
+            {"env": ARM_ID, "actuator": MAXON, "action": "current"},
+            r"servo: is no plain motor.*action='force'",
+        ),
+        (
+            {"env": ARM_ID, "actuator": MOTOR, "action": "current"},
+            r"motor: a command \[A\] needs a limit",
+        ),
+        (
+            {"env": "CartPole-v1"},
+            "has no MuJoCo model built from XML, and so no motors: take 'cartpole'",
+        ),
     ],
 )
 def test_what_is_wrong_is_said(arguments, text):
     with pytest.raises(ValueError, match=text):
-        codrl_mj.make(**{"env": CHEETAH, "actuator": {".*": "lag"}, "allow_unstable": True, **arguments})
+        codrl_mj.make(
+            **{"env": CHEETAH, "actuator": {".*": "lag"}, "allow_unstable": True, **arguments}
+        )
 
 
-@pytest.mark.parametrize("options", [{"action": "current"}, {"disturbances": {"command_delay": 0.05}}])
+@pytest.mark.parametrize(
+    "options", [{"action": "current"}, {"disturbances": {"command_delay": 0.05}}]
+)
 def test_an_action_of_another_shape_is_refused(options):
     env = codrl_mj.make(CHEETAH, MAXON, **options)
     env.reset()
@@ -408,5 +506,7 @@ def test_an_action_of_another_shape_is_refused(options):
 
 def test_a_family_s_class_stands_for_its_defaults():
     for given in ({".*": TorqueSpeed}, TorqueSpeed):
-        assert EnvConfig("InvertedPendulum-v5", given) == EnvConfig("InvertedPendulum-v5", {".*": TorqueSpeed()})
+        assert EnvConfig("InvertedPendulum-v5", given) == EnvConfig(
+            "InvertedPendulum-v5", {".*": TorqueSpeed()}
+        )
         codrl_mj.make("InvertedPendulum-v5", given).close()

@@ -14,7 +14,9 @@ from tests.foreign.models import actions, assert_same, run
 from tests.matrix import but
 from tests.motorised.models import MENAGERIE
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # deprecated attributes in other people's models
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::UserWarning"
+)  # deprecated attributes in other people's models
 IDEAL = {".*": "ideal"}
 
 
@@ -99,7 +101,11 @@ NONE = "<mujoco><worldbody><body><joint name='a'/><geom size='1'/></body></world
     [
         ("ForeignRobot-v0", IDEAL, "the model has no actuators"),
         ("HalfChetah-v5", IDEAL, "Did you mean: `HalfCheetah`"),
-        ("HalfCheetah-v5", {".*": STIFF}, r"'\.\*': actuator: .* unstable at a step of 0.01 s.*allow_unstable"),
+        (
+            "HalfCheetah-v5",
+            {".*": STIFF},
+            r"'\.\*': actuator: .* unstable at a step of 0.01 s.*allow_unstable",
+        ),
     ],
 )
 def test_what_is_wrong_is_said(robot, tmp_path, env_id, actuators, message):

@@ -27,15 +27,22 @@ from tests.foreign.models import BareEnv
 from tests.matrix import but
 from tests.training.interruptions import TERMINATE, crash, differing, interrupt, outcome, resume
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # deprecated attributes in other people's models
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::UserWarning"
+)  # deprecated attributes in other people's models
 MAXON = {".*": "maxon-ec45-flat-50w"}
-QUICK = "--agent.hidden 8 --agent.batch-size 16 --agent.learning-starts 40 --evaluation-episodes 1 --no-tensorboard"
+QUICK = (
+    "--agent.hidden 8 --agent.batch-size 16 --agent.learning-starts 40 --evaluation-episodes 1"
+    " --no-tensorboard"
+)
 EVERYTHING = {
     "observe_actuator": True,
     "disturbances": {"command_delay": 0.12},
     "randomize": {".*": {"motor.resistance": "uniform(0.9, 1.1)"}},
 }
-SMALL = SACConfig(learning_starts=40, batch_size=16, buffer_size=150, hidden=(8,), train_every=4, gradient_steps=1)
+SMALL = SACConfig(
+    learning_starts=40, batch_size=16, buffer_size=150, hidden=(8,), train_every=4, gradient_steps=1
+)
 
 
 def config(env, num_envs=1):
@@ -45,7 +52,9 @@ def config(env, num_envs=1):
 
 CASES = {
     "cheetah": config(EnvConfig("HalfCheetah-v5", MAXON, max_episode_steps=25, **EVERYTHING), 2),
-    "reacher by currents": config(EnvConfig("Reacher-v5", {"joint.*": "maxon-re65"}, action="current")),
+    "reacher by currents": config(
+        EnvConfig("Reacher-v5", {"joint.*": "maxon-re65"}, action="current")
+    ),
 }
 
 
@@ -67,7 +76,13 @@ class _WithDictionaries(BareEnv):
         return {"all": observation}, info
 
 
-IDS = {"Bare": BareEnv, "Endless": BareEnv, "Dict": _WithDictionaries, "One": _FromOne, "Switched": _Switched}
+IDS = {
+    "Bare": BareEnv,
+    "Endless": BareEnv,
+    "Dict": _WithDictionaries,
+    "One": _FromOne,
+    "Switched": _Switched,
+}
 
 
 @pytest.fixture(autouse=True)
@@ -76,7 +91,9 @@ def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
     for name, creator in IDS.items():
-        gym.register(f"Foreign{name}-v0", creator, max_episode_steps=None if name == "Endless" else 50)
+        gym.register(
+            f"Foreign{name}-v0", creator, max_episode_steps=None if name == "Endless" else 50
+        )
     yield
     for name in IDS:
         gym.registry.pop(f"Foreign{name}-v0")
@@ -86,7 +103,10 @@ def elsewhere(tmp_path, monkeypatch):
 def reacher(tmp_path_factory):
     """A tiny run of two motors on ideal actuators."""
     out = tmp_path_factory.mktemp("trained") / "reacher"
-    assert main(["train", "Reacher-v5", "--total-steps", "150", *QUICK.split(), "--out", str(out)]) == 0
+    assert (
+        main(["train", "Reacher-v5", "--total-steps", "150", *QUICK.split(), "--out", str(out)])
+        == 0
+    )
     return out
 
 
@@ -97,16 +117,28 @@ def reacher(tmp_path_factory):
 def test_a_configuration_survives_json(name):
     whole = json.loads(json.dumps(CASES[name].as_mapping()))
     assert TrainConfig.from_mapping(whole, whole=True) == CASES[name]
-    assert TrainConfig.from_mapping({"task": "codrl_mj/Pendulum-v0"}).env.task == "pendulum"  # an id of ours
+    assert (
+        TrainConfig.from_mapping({"task": "codrl_mj/Pendulum-v0"}).env.task == "pendulum"
+    )  # an id of ours
 
 
 def test_a_file_says_what_is_behind_what(tmp_path):
-    text = "env: {task: HalfCheetah-v5, actuator: {b.*: maxon-ec45-flat-50w, f.*: lag}, options: {frame_skip: 2}}\n"
+    text = (
+        "env: {task: HalfCheetah-v5, actuator: {b.*: maxon-ec45-flat-50w, f.*: lag}, options:"
+        " {frame_skip: 2}}\n"
+    )
     (tmp_path / "train.yaml").write_text(text + "agent: {name: sac, gamma: 0.98}\n")
     found = read_config(tmp_path / "train.yaml")
-    assert found.env.driven == {"b.*": Drive.of(motor_entry("maxon-ec45-flat-50w").numbers), "f.*": Lag()}
+    assert found.env.driven == {
+        "b.*": Drive.of(motor_entry("maxon-ec45-flat-50w").numbers),
+        "f.*": Lag(),
+    }
     assert found.env.make().unwrapped.frame_skip == 2
-    assert (found.agent.gamma, found.agent.hidden, found.num_envs) == (0.98, (256, 256), 1)  # the others as always
+    assert (found.agent.gamma, found.agent.hidden, found.num_envs) == (
+        0.98,
+        (256, 256),
+        1,
+    )  # the others as always
 
 
 @pytest.mark.parametrize(
@@ -114,8 +146,14 @@ def test_a_file_says_what_is_behind_what(tmp_path):
     [
         ({"task": "HalfCheetah-v5", "actuator": {}}, "actuator = {}: must be one for all"),
         ({"task": "HalfCheetah-v5", "actuator": {"(": "lag"}}, "must be a regular expression"),
-        ({"task": "HalfCheetah-v5", "actuator": {".*": "maxon-ec45-flat"}}, "or 'maxon-ec45-flat-50w'?"),
-        ({"task": "HalfCheetah-v5", "actuator": "paper"}, "of which the environment HalfCheetah-v5 has none"),
+        (
+            {"task": "HalfCheetah-v5", "actuator": {".*": "maxon-ec45-flat"}},
+            "or 'maxon-ec45-flat-50w'?",
+        ),
+        (
+            {"task": "HalfCheetah-v5", "actuator": "paper"},
+            "of which the environment HalfCheetah-v5 has none",
+        ),
         ({"task": "HalfCheetah-v5", "max_episode_steps": 0}, "must be an integer >= 1"),
         ({"task": "HalfCheetah-v5", "options": {"frame_skip": {1, 2}}}, "that JSON can hold"),
         ({"task": "HalfCheetah-v5", "levels": [1.0]}, "HalfCheetah-v5 has none"),
@@ -128,7 +166,11 @@ def test_bad_descriptions_are_refused(fields, message):
 
 def test_a_module_of_somebodys_is_not_imported_from_a_run_folder_unasked(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps({"train": CASES["cheetah"].as_mapping()}))
-    text = (tmp_path / "config.json").read_text().replace("HalfCheetah-v5", "tests.foreign.nobody:Robot-v0")
+    text = (
+        (tmp_path / "config.json")
+        .read_text()
+        .replace("HalfCheetah-v5", "tests.foreign.nobody:Robot-v0")
+    )
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match="Pass --trust"):
         load_config(tmp_path)
@@ -141,7 +183,9 @@ def test_a_module_of_somebodys_is_not_imported_from_a_run_folder_unasked(tmp_pat
 def test_an_interrupted_training_comes_to_the_same_result(tmp_path, name):
     interrupt(CASES[name], tmp_path / "run", 70, TERMINATE)
     interrupt(CASES[name], tmp_path / "run", 70, crash)
-    ours, theirs = (outcome(resume(CASES[name], tmp_path / run)) for run in ("run", "uninterrupted"))
+    ours, theirs = (
+        outcome(resume(CASES[name], tmp_path / run)) for run in ("run", "uninterrupted")
+    )
     assert differing(theirs, ours) == []
 
 
@@ -169,11 +213,33 @@ def test_spaces_that_nobody_learns_in_are_refused(env_id, agent, message):
 def test_the_options_of_an_environment_decide_who_can_act_in_it():
     chosen, options = "ForeignSwitched-v0", {"discrete": True}
     posed = {"task": chosen, "env": {"options": options}}
-    assert [TrainConfig.from_mapping(posed | one).agent.name for one in ({}, {"agent": "dqn"})] == ["ppo", "dqn"]
-    assert TrainConfig.from_mapping({"task": chosen, "env": {"options": {"discrete": False}}}).agent.name == "sac"
+    assert [TrainConfig.from_mapping(posed | one).agent.name for one in ({}, {"agent": "dqn"})] == [
+        "ppo",
+        "dqn",
+    ]
+    assert (
+        TrainConfig.from_mapping(
+            {"task": chosen, "env": {"options": {"discrete": False}}}
+        ).agent.name
+        == "sac"
+    )
     assert TrainConfig.preset(chosen, "dqn", env={"options": options}).env.options == options
-    line = ["train", chosen, "--env.options", "discrete=true", "--agent", "dqn", "--total-steps", "8"]
-    assert main([*line, "--num-envs", "1", "--agent.learning-starts", "4", "--evaluation-episodes", "1"]) == 0
+    line = [
+        "train",
+        chosen,
+        "--env.options",
+        "discrete=true",
+        "--agent",
+        "dqn",
+        "--total-steps",
+        "8",
+    ]
+    assert (
+        main(
+            [*line, "--num-envs", "1", "--agent.learning-starts", "4", "--evaluation-episodes", "1"]
+        )
+        == 0
+    )
 
 
 # -- measuring ------------------------------------------------------------------------------------------------
@@ -188,13 +254,20 @@ def test_every_integration_step_is_looked_at_nothing_changes_by_it_and_a_file_ke
     env.reset(seed=4)
     model, data = env.unwrapped.model, env.unwrapped.data
     work = np.zeros(6)
-    for action, inside in zip(episode.action, episode.trace["actual_force"].reshape(10, 5, 6), strict=True):
+    for action, inside in zip(
+        episode.action, episode.trace["actual_force"].reshape(10, 5, 6), strict=True
+    ):
         data.ctrl[:] = action
         for force in inside:
             before = model.actuator_gear[:, 0] * data.qvel[3:]
             mujoco.mj_step(model, data)
             np.testing.assert_array_equal(force, data.actuator_force)
-            work += force * (before + model.actuator_gear[:, 0] * data.qvel[3:]) / 2 * model.opt.timestep
+            work += (
+                force
+                * (before + model.actuator_gear[:, 0] * data.qvel[3:])
+                / 2
+                * model.opt.timestep
+            )
     np.testing.assert_array_equal(episode.state[-1], np.concatenate([data.qpos, data.qvel]))
     found = codrl_mj.evaluation.summarize(known.task, [episode]).motors
     assert list(found) == ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]
@@ -230,7 +303,10 @@ def test_motors_that_are_not_named_stay_what_they_were():
 
 def test_draws_of_the_model_survive_files_and_flags():
     env = EnvConfig("Reacher-v5", {".*": "lag"}, randomize={"model.gravity": "uniform(0.9, 1.1)"})
-    assert TrainConfig.from_mapping(json.loads(json.dumps(config(env).as_mapping())), whole=True).env == env
+    assert (
+        TrainConfig.from_mapping(json.loads(json.dumps(config(env).as_mapping())), whole=True).env
+        == env
+    )
     both = ["model.gravity=uniform(0.9, 1.1)", ".*:time_constant=uniform(0.01, 0.02)"]
     other = EnvConfig("Reacher-v5", {".*": "lag"}, randomize=both)
     assert other.randomize == tuple(both)
@@ -258,14 +334,20 @@ def test_a_policy_of_stable_baselines_is_evaluated_by_the_id(capsys):
     from stable_baselines3 import PPO
 
     PPO("MlpPolicy", "Reacher-v5", n_steps=8, batch_size=8).save("policy.zip")
-    line = "evaluate policy.zip --task Reacher-v5 --agent ppo --trust --actuator maxon-re65 --episodes 1"
+    line = (
+        "evaluate policy.zip --task Reacher-v5 --agent ppo --trust --actuator maxon-re65"
+        " --episodes 1"
+    )
     assert main(line.split()) == 0
     assert "policy.zip on maxon-re65" in capsys.readouterr().out
 
 
 def test_a_run_is_evaluated_on_other_motors(reacher, capsys):
     assert load_config(reacher).env.driven == {".*": IDEAL}
-    line = f"evaluate {reacher} --actuators joint0=maxon-re65 joint1=lag --episodes 2 --out result.json"
+    line = (
+        f"evaluate {reacher} --actuators joint0=maxon-re65 joint1=lag --episodes 2 --out"
+        " result.json"
+    )
     assert main(line.split()) == 0
     shown = capsys.readouterr().out
     assert "motors of reacher" in shown
@@ -279,7 +361,9 @@ def test_a_run_is_evaluated_on_other_motors(reacher, capsys):
 
 
 def test_motors_are_chosen_for_what_a_policy_asked_and_do_it(reacher, capsys):
-    assert main(["motor", "choose", str(reacher), "--out", "chosen"]) == 1  # none has all that is asked for in print
+    assert (
+        main(["motor", "choose", str(reacher), "--out", "chosen"]) == 1
+    )  # none has all that is asked for in print
     assert "joint1" in capsys.readouterr().out
     chosen = yaml.safe_load(Path("chosen/actuators.yaml").read_text())
     assert list(chosen) == ["joint0", "joint1"]
@@ -297,7 +381,10 @@ def test_motors_are_chosen_for_what_a_policy_asked_and_do_it(reacher, capsys):
 
 
 def test_an_episode_is_filmed_with_the_strip_of_a_motor(reacher, capsys):
-    line = f"render {reacher} --motor joint1 --out film.gif --width 160 --height 120 --trajectory episode.npz"
+    line = (
+        f"render {reacher} --motor joint1 --out film.gif --width 160 --height 120 --trajectory"
+        " episode.npz"
+    )
     assert main(line.split()) == 0
     frames = imageio.mimread("film.gif")
     assert len(frames) == 26  # 50 steps of 20 ms, at half the rate, and the end
@@ -313,7 +400,10 @@ def test_an_episode_is_filmed_with_the_strip_of_a_motor(reacher, capsys):
     ("line", "message"),
     [
         ("train HalfCheetah-v5 --actuators thigh=lag", "'thigh': no actuator has such a name"),
-        ("train Reacher-v5 --env.options nope=3", "options = .*nope.*Reacher-v5 does not take them"),
+        (
+            "train Reacher-v5 --env.options nope=3",
+            "options = .*nope.*Reacher-v5 does not take them",
+        ),
         ("train Reacher-v5 --env.options action=1", "'action' is no argument of the environment's"),
         ("train Reacher-v5 --env.randomize motor.resistance", "must be FIELD=DISTRIBUTION"),
         ("train HalfCheetah-v5 --actuators bthigh", "must be PATTERN=NAME"),
@@ -321,7 +411,10 @@ def test_an_episode_is_filmed_with_the_strip_of_a_motor(reacher, capsys):
         ("train HalfCheetah-v5 --agent dqn", "cannot act in the Box actions of HalfCheetah-v5"),
         (
             "train CartPole-v1",
-            "CartPole-v1: the environment has no MuJoCo model .*: take 'cartpole', our task of it that has",
+            (
+                "CartPole-v1: the environment has no MuJoCo model .*: take 'cartpole', our task of"
+                " it that has"
+            ),
         ),
         ("motor choose Reacher-v5", "no scripted controller for it; train it"),
     ],

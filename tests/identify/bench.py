@@ -28,7 +28,9 @@ def prbs(time, random, clock=2e-3):
     return bits[(time / clock + 1e-9).astype(int)]
 
 
-def motor_log(kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0, mean=True, clock=2e-3):
+def motor_log(
+    kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0, mean=True, clock=2e-3
+):
     """A free or locked DC motor with viscous friction under a voltage that changes at 20 kHz; exact: x' = A x + B u.
 
     Args:
@@ -52,7 +54,9 @@ def motor_log(kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0
     exact = expm(system / LOOP)
     poles, modes = np.linalg.eig(exact[:3, :3])
     gains = np.linalg.solve(modes, exact[:3, 3])
-    each = [lfilter([0.0, gain], [1.0, -pole], volts) for gain, pole in zip(gains, poles, strict=True)]
+    each = [
+        lfilter([0.0, gain], [1.0, -pole], volts) for gain, pole in zip(gains, poles, strict=True)
+    ]
     states = np.real(modes @ each).T
     every = round(LOOP / rate)
     current, position = states[::every, 0], states[::every, 2]
@@ -61,7 +65,11 @@ def motor_log(kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0
         position = np.round(position / step) * step
     told = volts.reshape(-1, every).mean(axis=1) if mean else volts[::every]
     return Log(
-        kind, time[::every], {"voltage": told, "current": current, "position": position}, {"position": step}, mean
+        kind,
+        time[::every],
+        {"voltage": told, "current": current, "position": position},
+        {"position": step},
+        mean,
     )
 
 
@@ -69,14 +77,27 @@ def geared_pendulum(efficiency, seed=0):
     """A pendulum of 0.19 kg*m^2 and 3.6 N*m behind a gear of an efficiency, at 2 ms, and an encoder of 3 mrad."""
     time = np.linspace(0.0, 6.0, 12001)
     torque = np.sum(
-        [1.5 * np.sin(2.0 * np.pi * rate * time + (1 + seed) * rate) for rate in (0.25, 0.6, 0.95, 1.4)], axis=0
+        [
+            1.5 * np.sin(2.0 * np.pi * rate * time + (1 + seed) * rate)
+            for rate in (0.25, 0.6, 0.95, 1.4)
+        ],
+        axis=0,
     )
     moved = Moved(0.19, 3.6, 0.0, 0.05, 0.01, efficiency, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
-    position = np.round(moving(time, torque, np.zeros(12001), 0.0, 0.0, moved)[0][::4] / 3e-3) * 3e-3
-    return Log(f"geared{seed}", time[::4], {"position": position, "torque": torque[::4]}, {"position": 3e-3})
+    position = (
+        np.round(moving(time, torque, np.zeros(12001), 0.0, 0.0, moved)[0][::4] / 3e-3) * 3e-3
+    )
+    return Log(
+        f"geared{seed}",
+        time[::4],
+        {"position": position, "torque": torque[::4]},
+        {"position": 3e-3},
+    )
 
 
-def mujoco_pendulum(seed=0, duration=8.0, coulomb=0.15, viscous=0.01, step=3e-3, every=10, effort="torque"):
+def mujoco_pendulum(
+    seed=0, duration=8.0, coulomb=0.15, viscous=0.01, step=3e-3, every=10, effort="torque"
+):
     """A pendulum of 0.19 kg*m^2 and 3.6 N*m with friction, pushed about by smooth torques; MuJoCo's, at 0.2 ms.
 
     Args:
@@ -96,7 +117,10 @@ def mujoco_pendulum(seed=0, duration=8.0, coulomb=0.15, viscous=0.01, step=3e-3,
     )
     data = mujoco.MjData(model)
     random = np.random.default_rng(seed)
-    phases, rates = random.uniform(0.0, 2.0 * np.pi, 4), np.array([0.25, 0.6, 0.95, 1.4]) * random.uniform(0.9, 1.1, 4)
+    phases, rates = (
+        random.uniform(0.0, 2.0 * np.pi, 4),
+        np.array([0.25, 0.6, 0.95, 1.4]) * random.uniform(0.9, 1.1, 4),
+    )
     count = round(duration / 2e-4)
     time = np.arange(count) * 2e-4
     torque = np.sum(0.9 * np.sin(2.0 * np.pi * np.outer(time, rates) + phases), axis=1)
@@ -107,4 +131,6 @@ def mujoco_pendulum(seed=0, duration=8.0, coulomb=0.15, viscous=0.01, step=3e-3,
         mujoco.mj_step(model, data)
     rows = slice(None, None, every)
     seen = np.round(position[rows] / step) * step
-    return Log(f"swing{seed}", time[rows], {"position": seen, effort: torque[rows]}, {"position": step})
+    return Log(
+        f"swing{seed}", time[rows], {"position": seen, effort: torque[rows]}, {"position": step}
+    )

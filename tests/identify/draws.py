@@ -1,6 +1,7 @@
 """Motors of ours that are known, identified from logs with and without faults: how often, how well, and what is said.
 
-`python -m tests.identify.draws --draws 100` prints a table of excitations, with `--faults` one of faults of a PRBS log.
+`python -m tests.identify.draws --draws 100` prints a table of excitations, with `--faults` one of
+faults of a PRBS log.
 """
 
 import argparse
@@ -25,20 +26,35 @@ NAMES = {
     "viscous": "viscous_friction",
     "friction": "friction_torque",
 }
-GOALS = {"R": 0.02, "L": 0.1, "kE": 0.02, "J": 0.05, "Coulomb": 0.05, "viscous": 0.05, "friction": 0.05}
+GOALS = {
+    "R": 0.02,
+    "L": 0.1,
+    "kE": 0.02,
+    "J": 0.05,
+    "Coulomb": 0.05,
+    "viscous": 0.05,
+    "friction": 0.05,
+}
 """Relative errors within which what is identified is asked to be."""
 KINDS = ("prbs", "locked_prbs", "chirp", "square", "slow_sine")
 SLOW = {"rate": 1000.0}
 ROWS = {
     **{f"{kind} 5 kHz": {"kind": kind} for kind in KINDS},
     **{f"{kind} 1 kHz": {"kind": kind, **SLOW} for kind in KINDS},
-    **{f"{kind} 5 kHz, instantaneous": {"kind": kind, "voltage": "instantaneous"} for kind in KINDS},
-    **{f"{kind} 1 kHz, together": {"kind": kind, "voltage": "together", **SLOW} for kind in KINDS[:2]},
+    **{
+        f"{kind} 5 kHz, instantaneous": {"kind": kind, "voltage": "instantaneous"} for kind in KINDS
+    },
+    **{
+        f"{kind} 1 kHz, together": {"kind": kind, "voltage": "together", **SLOW}
+        for kind in KINDS[:2]
+    },
     "prbs 5 kHz, jitter 10 %": {"jitter": 0.1},
     "prbs 5 kHz, encoder of 512 steps": {"encoder": 512},
 }
-"""Name -> arguments of `logged`. The voltage of a row: the mean to the next one; what it is at the time, while it
-changes by a clock of its own; or what holds until the next one, changing together with the rows."""
+"""Name -> arguments of `logged`. The voltage of a row: the mean to the next one; what it is at the
+time, while it changes by a clock of its own; or what holds until the next one, changing together
+with the rows.
+"""
 
 
 def motor_of(draw: int) -> GearMotor:
@@ -61,20 +77,36 @@ def motor_of(draw: int) -> GearMotor:
     )
 
 
-def logged(draw, kind="prbs", rate=5000.0, voltage="mean", jitter=0.0, dropped=0.0, encoder=4096, sag=0.0, **sensors):
+def logged(
+    draw,
+    kind="prbs",
+    rate=5000.0,
+    voltage="mean",
+    jitter=0.0,
+    dropped=0.0,
+    encoder=4096,
+    sag=0.0,
+    **sensors,
+):
     """The motor of a draw, its log of 3 s through 1 % of noise on the current and an encoder."""
     motor = motor_of(draw)
     drive = Drive(motor, SampledLoop(), Supply(VOLTS, sag * motor.resistance))
     clock = 4.0 * motor.electrical_time_constant
     if voltage == "together":
         clock = 2 * max(round(0.5 * clock * rate), 1) / rate
-    excitation = Excitation(kind, 0.5 * VOLTS, 3.0, frequency=2.0 if kind == "square" else 0.5, clock=clock)
+    excitation = Excitation(
+        kind, 0.5 * VOLTS, 3.0, frequency=2.0 if kind == "square" else 0.5, clock=clock
+    )
     peak = float(np.abs(run(drive, excitation).signals["current"]).max())
     seen = {"current": Sensor(0.01 * peak), "position": Sensor(resolution=2.0 * math.pi / encoder)}
     for name, changes in sensors.items():
         seen[name] = dataclasses.replace(seen.get(name, Sensor()), **changes)
     log = simulate(
-        drive, excitation, sensors=seen, sampler=Sampler(rate, jitter, dropped, voltage == "mean"), seed=draw
+        drive,
+        excitation,
+        sensors=seen,
+        sampler=Sampler(rate, jitter, dropped, voltage == "mean"),
+        seed=draw,
     )
     return only(log, "voltage", "current", *(() if kind == "locked_prbs" else ("position",)))
 
@@ -91,7 +123,9 @@ def scaled(log, **factors):
 
 def late(log, rows):
     """The voltage some rows before it is in force."""
-    return dataclasses.replace(log, signals={**log.signals, "voltage": np.roll(log.signals["voltage"], -rows)})
+    return dataclasses.replace(
+        log, signals={**log.signals, "voltage": np.roll(log.signals["voltage"], -rows)}
+    )
 
 
 def uniform(log):
@@ -120,7 +154,9 @@ FAULTS = {
     "voltage 6 rows early": lambda draw: late(logged(draw), 6),
     "supply sags by 0.15 R": lambda draw: logged(draw, sag=0.15),
     "current 10 % too large": lambda draw: scaled(logged(draw), current=1.1),
-    "current offset by 2 % of its largest": lambda draw: logged(draw, current={"bias": 0.02 * largest(draw)}),
+    "current offset by 2 % of its largest": lambda draw: logged(
+        draw, current={"bias": 0.02 * largest(draw)}
+    ),
     "5 % of the rows missing": lambda draw: logged(draw, dropped=0.05),
     "missing rows, taken for uniform": lambda draw: uniform(logged(draw, dropped=0.05)),
     "stamps jitter by 10 %": lambda draw: logged(draw, jitter=0.1),
@@ -135,7 +171,9 @@ FAULTS = {
     "mA for A": lambda draw: scaled(logged(draw), current=1e3),
     "degrees for radians": lambda draw: scaled(logged(draw), position=180.0 / math.pi),
     "time in ms": lambda draw: dataclasses.replace(logged(draw), time=1e3 * logged(draw).time),
-    "a voltage of the rows' times, called mean": lambda draw: called(logged(draw, voltage="instantaneous"), True),
+    "a voltage of the rows' times, called mean": lambda draw: called(
+        logged(draw, voltage="instantaneous"), True
+    ),
     "a mean, called the voltage of the row": lambda draw: called(logged(draw), False),
 }
 
@@ -161,7 +199,10 @@ def tried(make, draw):
 def _truth(motor, named, name):
     if name == "friction_torque":  # at the speed at which the sum of both was taken
         coulomb, viscous = named["coulomb_friction"].value, named["viscous_friction"].value
-        return motor.coulomb_friction + motor.viscous_friction * (named[name].value - coulomb) / viscous
+        return (
+            motor.coulomb_friction
+            + motor.viscous_friction * (named[name].value - coulomb) / viscous
+        )
     return motor.rotor_inertia if name == "inertia" else getattr(motor, name)
 
 
@@ -177,21 +218,35 @@ def cell(several):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--draws", type=int, default=100)
     parser.add_argument("--faults", action="store_true")
     parser.add_argument("--only", nargs="*", help="rows, by their whole names")
     options = parser.parse_args()
-    rows = FAULTS if options.faults else {name: lambda draw, row=row: logged(draw, **row) for name, row in ROWS.items()}
-    print(f"of {options.draws} draws: identified, of these within the interval, largest error; rough: the same")
-    print(f"| | {' | '.join(NAMES)} | beyond the goal | said |\n| --- | {'--- | ' * (len(NAMES) + 1)}--- |")
+    rows = (
+        FAULTS
+        if options.faults
+        else {name: lambda draw, row=row: logged(draw, **row) for name, row in ROWS.items()}
+    )
+    print(
+        f"of {options.draws} draws: identified, of these within the interval, largest error; rough:"
+        " the same"
+    )
+    print(
+        f"| | {' | '.join(NAMES)} | beyond the goal | said |\n| --- |"
+        f" {'--- | ' * (len(NAMES) + 1)}--- |"
+    )
     for name in options.only or rows:
         found = [tried(rows[name], draw) for draw in range(options.draws)]
         cells, off = [], {}
         for short in NAMES:
             several = [numbers[short] for numbers, _ in found if short in numbers]
             cells.append(cell(several))
-            if count := sum(one == "identified" and abs(error) > GOALS[short] for one, error, _ in several):
+            if count := sum(
+                one == "identified" and abs(error) > GOALS[short] for one, error, _ in several
+            ):
                 off[short] = count
         said = dict(collections.Counter(text for _, texts in found for text in texts))
         print(f"| {name} | {' | '.join(cells)} | {off or ''} | {said} |", flush=True)

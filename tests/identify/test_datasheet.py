@@ -35,7 +35,10 @@ def swung(drive, volts, name="swing"):
 
 def voltages(seed, duration=3.0):
     """A slow sine and random steps [V]."""
-    random, time = np.random.default_rng(seed), np.arange(round(duration / STEP / ROWS)) * STEP * ROWS
+    random, time = (
+        np.random.default_rng(seed),
+        np.arange(round(duration / STEP / ROWS)) * STEP * ROWS,
+    )
     steps = np.repeat(random.uniform(-4.0, 4.0, 1 + len(time) // 50), 50)[: len(time)]
     return 3.0 * np.sin(2.0 * np.pi * 0.7 * time + seed) + steps
 

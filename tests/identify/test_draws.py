@@ -26,7 +26,9 @@ SILENT = {
 def test_what_is_identified_is_within_its_interval(row):
     for draw in range(DRAWS):
         numbers, _ = draws.tried(lambda draw: draws.logged(draw, **draws.ROWS[row]), draw)
-        identified = {name: inside for name, (status, _, inside) in numbers.items() if status == "identified"}
+        identified = {
+            name: inside for name, (status, _, inside) in numbers.items() if status == "identified"
+        }
         assert all(identified.values()), numbers
         assert not identified.keys() & set(SILENT[row])
         assert "R" in SILENT[row] or "R" in identified
@@ -43,7 +45,9 @@ def test_a_column_or_a_log_more_turns_no_narrower_interval_into_a_refusal(draw):
     motor, known = draws.motor_of(draw), {"resistance": draws.motor_of(draw).resistance}
     whole = [draws.logged(draw, kind, encoder=64) for kind in ("prbs", "square")]
     fewer = [draws.only(log, "voltage", "position") for log in whole]
-    found = [identify(logs, "free", known, seed=draw) for logs in (fewer[:1], fewer, whole[:1], whole)]
+    found = [
+        identify(logs, "free", known, seed=draw) for logs in (fewer[:1], fewer, whole[:1], whole)
+    ]
     for less, more in itertools.combinations(found, 2):
         if (less, more) == (found[1], found[2]):
             continue  # a log less and a column more
@@ -54,14 +58,20 @@ def test_a_column_or_a_log_more_turns_no_narrower_interval_into_a_refusal(draw):
         named = {number.name: number for number in one.estimates}
         for name in ("back_emf_constant", "inertia", "friction_torque"):
             if named[name].status in USABLE:
-                assert named[name].low <= draws._truth(motor, named, name) <= named[name].high, named[name]
+                assert named[name].low <= draws._truth(motor, named, name) <= named[name].high, (
+                    named[name]
+                )
 
 
 @pytest.mark.matrix
 def test_a_current_does_not_take_away_what_the_voltage_alone_tells():
     """At 1 kHz, 2 to 3 rows in L/R, the current tells no back-EMF constant: it was refused with all that follows."""
     motor, log = draws.motor_of(0), draws.logged(0, rate=1000.0, encoder=64)
-    known = {"resistance": motor.resistance, "viscous_friction": motor.viscous_friction, "load_inertia": 0.0}
+    known = {
+        "resistance": motor.resistance,
+        "viscous_friction": motor.viscous_friction,
+        "load_inertia": 0.0,
+    }
     fewer = identify([draws.only(log, "voltage", "position")], "free", known)
     more = identify([log], "free", known)
     for name in ("back_emf_constant", "torque_constant", "rotor_inertia", "coulomb_friction"):

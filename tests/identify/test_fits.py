@@ -43,7 +43,9 @@ def test_a_motor_is_identified_from_voltage_current_and_position(motor):
 
 def test_friction_is_known_as_a_whole_where_its_parts_are_rough_and_can_be_trained_with(motor):
     """All of it is viscous, and 2 s of one log do not tell it from Coulomb friction."""
-    coulomb, viscous, whole = (motor[name] for name in ("coulomb_friction", "viscous_friction", "friction_torque"))
+    coulomb, viscous, whole = (
+        motor[name] for name in ("coulomb_friction", "viscous_friction", "friction_torque")
+    )
     assert whole.status == "identified"
     speed = (whole.value - coulomb.value) / viscous.value
     assert whole.low <= bench.VISCOUS * speed <= whole.high < 1.1 * whole.value
@@ -74,7 +76,9 @@ def test_a_slow_sine_tells_no_inductance():
 def test_a_late_voltage_is_found_late(rows):
     """And half the rate is that of the voltage in time: no cause of doubt."""
     log = bench.motor_log("locked", duration=2.5)
-    late = np.append(log.signals["voltage"][rows:], np.zeros(rows))  # the log's voltage comes some rows early
+    late = np.append(
+        log.signals["voltage"][rows:], np.zeros(rows)
+    )  # the log's voltage comes some rows early
     found = identify([replaced(log, "voltage", late)])
     assert found.delays["winding"] == rows
     assert statuses(found, WINDING) == {"identified"}
@@ -112,7 +116,9 @@ def test_outliers_and_dropped_rows_do_no_harm():
     signals = {**log.signals, "current": log.signals["current"].copy()}
     signals["current"][random.choice(len(log.time), 35, replace=False)] += 40.0
     kept = np.sort(random.choice(len(log.time), round(0.95 * len(log.time)), replace=False))
-    found = identify([Log("spoilt", log.time[kept], {name: one[kept] for name, one in signals.items()})])
+    found = identify(
+        [Log("spoilt", log.time[kept], {name: one[kept] for name, one in signals.items()})]
+    )
     assert found["resistance"].value == pytest.approx(bench.RESISTANCE, rel=0.02)
     assert found["inductance"].value == pytest.approx(bench.INDUCTANCE, rel=0.1)
 
@@ -145,24 +151,37 @@ def test_the_friction_that_predicts_best_is_chosen_and_is_said():
     logs = [bench.geared_pendulum(0.67, seed) for seed in range(3)]
     found = identify(logs, "pendulum", friction="auto")
     assert found.friction == "load"
-    assert found.friction_reason.startswith("friction: load, by the mean errors on the logs left out [rad]: coulomb")
+    assert found.friction_reason.startswith(
+        "friction: load, by the mean errors on the logs left out [rad]: coulomb"
+    )
     near(found, {"gear_efficiency": 0.67}, 0.1)
-    plain = identify([bench.mujoco_pendulum(seed, 3.0) for seed in range(3)], "pendulum", friction="auto")
+    plain = identify(
+        [bench.mujoco_pendulum(seed, 3.0) for seed in range(3)], "pendulum", friction="auto"
+    )
     assert plain.friction == "coulomb"
     assert "load" in plain.friction_reason
 
 
 @pytest.mark.parametrize(
     ("fitted", "held_out", "left"),
-    [("aba", "", ("ab", "")), ("abc", "c", ("ab", "c")), ("ab", "cc", ("ab", "c")), ("ab", "c", ("ab", "c"))],
+    [
+        ("aba", "", ("ab", "")),
+        ("abc", "c", ("ab", "c")),
+        ("ab", "cc", ("ab", "c")),
+        ("ab", "c", ("ab", "c")),
+    ],
 )
 def test_each_measurement_counts_once_whatever_its_name(fitted, held_out, left):
     """Copies have other names, and a copy's time may begin elsewhere; one log more or less is another measurement."""
     time = np.arange(50) * 1e-2
-    values = {name: np.random.default_rng(place).normal(size=50) for place, name in enumerate("abc")}
+    values = {
+        name: np.random.default_rng(place).normal(size=50) for place, name in enumerate("abc")
+    }
 
     def logs(names):
-        return [Log(f"{name}{k}", time + k, {"current": values[name]}) for k, name in enumerate(names)]
+        return [
+            Log(f"{name}{k}", time + k, {"current": values[name]}) for k, name in enumerate(names)
+        ]
 
     kept, predicted, said = distinct(logs(fitted), logs(held_out))
     assert tuple("".join(log.name[0] for log in several) for several in (kept, predicted)) == left
@@ -178,7 +197,12 @@ def test_a_free_swing_of_a_known_weight_tells_its_inertia():
     """Without any torque, by scipy: mgl/J is 64.1 1/s^2, and the damping 0.3 1/s of J."""
     time = np.arange(0.0, 3.0, 2e-3)
     swing = solve_ivp(
-        lambda _, y: (y[1], -64.1 * np.sin(y[0]) - 0.3 * y[1]), (0.0, 3.0), (1.0, 0.0), "RK45", time, rtol=1e-9
+        lambda _, y: (y[1], -64.1 * np.sin(y[0]) - 0.3 * y[1]),
+        (0.0, 3.0),
+        (1.0, 0.0),
+        "RK45",
+        time,
+        rtol=1e-9,
     )
     signals = {"position": np.round(swing.y[0] / 1e-3) * 1e-3, "torque": np.zeros(len(time))}
     found = identify([Log("free", time, signals, {"position": 1e-3})], "pendulum", {"mgl": 3.6})
@@ -197,7 +221,10 @@ def test_without_a_known_mass_a_torques_gain_is_not_told_apart(swings):
 def test_with_a_known_mass_a_torques_gain_is_found(swings):
     gain, log = 1.25, swings[0]
     told = identify(
-        [replaced(log, "torque", log.signals["torque"] / gain)], "pendulum", {"mgl": 3.6}, estimated=["torque_gain"]
+        [replaced(log, "torque", log.signals["torque"] / gain)],
+        "pendulum",
+        {"mgl": 3.6},
+        estimated=["torque_gain"],
     )
     assert told["torque_gain"].status == "identified"
     assert told["torque_gain"].value == pytest.approx(gain, rel=0.02)
@@ -208,7 +235,9 @@ def test_a_velocity_alone_is_enough():
     """Of a log that begins where the pendulum hangs; steps of 0.02 rad/s."""
     log = bench.mujoco_pendulum(1, 6.0, step=1e-9)
     velocity = np.round(np.gradient(log.signals["position"], log.time) / 0.02) * 0.02
-    found = identify([Log("b", log.time, {"velocity": velocity, "torque": log.signals["torque"]})], "pendulum")
+    found = identify(
+        [Log("b", log.time, {"velocity": velocity, "torque": log.signals["torque"]})], "pendulum"
+    )
     assert statuses(found) <= {"identified", "rough"}
     near(found, SWUNG, 0.02)
 
@@ -216,7 +245,9 @@ def test_a_velocity_alone_is_enough():
 def test_noise_of_a_velocity_is_no_motion(swings):
     time, random = swings[0].time, np.random.default_rng(0)
     assert not moves(Log("held", time, {"velocity": np.round(random.standard_normal(len(time)))}))
-    assert moves(Log("turned", time, {"velocity": np.gradient(swings[0].signals["position"], time)}))
+    assert moves(
+        Log("turned", time, {"velocity": np.gradient(swings[0].signals["position"], time)})
+    )
     assert not moves(Log("nothing", time, {"torque": swings[0].signals["torque"]}))
 
 
@@ -257,7 +288,9 @@ def test_a_resistance_that_a_voltage_changing_within_the_rows_spoils_is_not_beli
     assert found.value > 1.02 * truth
     assert found.low < truth < found.high
     share = found.high / found.value - 1.0
-    assert found.status == ("identified" if share <= 0.05 else "rough" if share <= 0.3 else "refused")
+    assert found.status == (
+        "identified" if share <= 0.05 else "rough" if share <= 0.3 else "refused"
+    )
 
 
 def test_a_back_emf_constant_can_be_asked_of_a_shaft_under_a_voltage():
@@ -276,7 +309,15 @@ def test_what_is_known_worst_is_not_lost_beside_what_is_known_best():
     jacobian[:rows, 0], jacobian[rows:, 1] = 1e6 / np.sqrt(rows), 20.0 / np.sqrt(rows)
     residuals = random.standard_normal(2 * rows)
     segment = SimpleNamespace(block=0, log=0)
-    fit = Fit(SimpleNamespace(names=("a", "b")), (segment,), np.ones(2), 1e9, (residuals,), (jacobian,), (np.zeros(1),))
+    fit = Fit(
+        SimpleNamespace(names=("a", "b")),
+        (segment,),
+        np.ones(2),
+        1e9,
+        (residuals,),
+        (jacobian,),
+        (np.zeros(1),),
+    )
     found = trust.half_widths(fit, np.ones(2), np.eye(2), 0)["curvature"]
     np.testing.assert_allclose(found, [1.96e-6, 1.96 * 0.05], rtol=0.05)
 
@@ -289,7 +330,9 @@ def test_a_voltage_alone_tells_the_constants_only_together(swings):
     driven = Log(log.name, log.time, signals, log.resolution)
     found = identify([driven], "pendulum", {"mgl": 3.6})
     assert statuses(found, {"torque_constant", "resistance"}) <= {"ratio", "refused"}
-    assert found["torque_constant"].value / found["resistance"].value == pytest.approx(1.0, rel=0.05)
+    assert found["torque_constant"].value / found["resistance"].value == pytest.approx(
+        1.0, rel=0.05
+    )
 
 
 @pytest.mark.parametrize(
@@ -299,8 +342,14 @@ def test_a_voltage_alone_tells_the_constants_only_together(swings):
         ({"known": {"mgl": -1.0}}, r"mgl = -1.0: must be from 0"),
         ({"rig": "pendulum", "known": {"inertja": 1.0}}, r"did you mean known\.inertia"),
         ({"rig": "pendulum", "known": {"friction_torque": 1.0}}, r"known\.friction_torque"),
-        ({"rig": "pendulum", "estimated": ["rotor_inertia"]}, r"shaft under a torque estimated\.rotor_inertia"),
-        ({"rig": "pendulum", "known": {"mgl": 3.6}, "estimated": ["mgl"]}, "mgl: both known and estimated"),
+        (
+            {"rig": "pendulum", "estimated": ["rotor_inertia"]},
+            r"shaft under a torque estimated\.rotor_inertia",
+        ),
+        (
+            {"rig": "pendulum", "known": {"mgl": 3.6}, "estimated": ["mgl"]},
+            "mgl: both known and estimated",
+        ),
         ({"rig": "pendulum", "segment": 0.0}, r"segment = 0.0: must be >= 0.05"),
         ({"logs": [], "rig": "free"}, "none was given"),
         ({"logs": ["still"], "rig": "free"}, "nothing can be identified"),
@@ -341,4 +390,8 @@ def test_friction_is_found_within_five_percent_whatever_it_is():
     for seed in range(3):
         coulomb, viscous = random.uniform(0.05, 0.3), random.uniform(0.01, 0.05)
         logs = [bench.mujoco_pendulum(2 * seed + place, 6.0, coulomb, viscous) for place in (0, 1)]
-        near(identify(logs, "pendulum"), {"coulomb_friction": coulomb, "viscous_friction": viscous}, 0.05)
+        near(
+            identify(logs, "pendulum"),
+            {"coulomb_friction": coulomb, "viscous_friction": viscous},
+            0.05,
+        )

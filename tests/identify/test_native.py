@@ -21,7 +21,9 @@ def played(log, found, duration=1.0, **changes):
         solreffriction="0.0001 1" armature="{number["inertia"] - 1e-9}"/>
         <inertial mass="1e-6" pos="0 0 0" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody></mujoco>"""
     )
-    decay = -math.expm1(-STEP * number["resistance"] / number["inductance"])  # MuJoCo's step is Euler's
+    decay = -math.expm1(
+        -STEP * number["resistance"] / number["inductance"]
+    )  # MuJoCo's step is Euler's
     spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target="hinge").set_to_dcmotor(
         motorconst=[number["torque_constant"], number["back_emf_constant"]],
         resistance=number["resistance"],

@@ -7,7 +7,12 @@ from codrl_mj.identify import identify, read_log
 from tests.identify import bench
 from tests.published import folder_of
 
-PUBLISHED = {"inertia": 0.0626, "mgl": 1.003, "viscous_friction": 0.0471, "coulomb_friction": 0.1839}
+PUBLISHED = {
+    "inertia": 0.0626,
+    "mgl": 1.003,
+    "viscous_friction": 0.0471,
+    "coulomb_friction": 0.1839,
+}
 """Of the pendulum, by its authors."""
 
 
@@ -39,16 +44,24 @@ def test_the_pendulum_is_identified_and_foretells_what_it_was_not_fitted_to():
     assert found["inertia"].status == found["mgl"].status == "identified"
     assert 0.17 < found["inertia"].value < 0.21
     assert 3.5 < found["mgl"].value < 3.8
-    assert found["coulomb_friction"].low < PUBLISHED["coulomb_friction"] < found["coulomb_friction"].high
+    assert (
+        found["coulomb_friction"].low
+        < PUBLISHED["coulomb_friction"]
+        < found["coulomb_friction"].high
+    )
     assert max(one.open_loop for one in (*found.fitted, *found.held_out)) < 0.07
 
 
 @pytest.mark.matrix
 def test_a_servo_without_a_current_sensor_tells_ratios_and_friction_that_depends_on_the_load():
-    logs = [servo_log(time) for time in ("10h28m10", "10h28m24", "10h29m47", "10h30m02")]  # gains of 100 and 800
+    logs = [
+        servo_log(time) for time in ("10h28m10", "10h28m24", "10h29m47", "10h30m02")
+    ]  # gains of 100 and 800
     held_out = [servo_log(time) for time in ("10h28m42", "10h28m57")]  # 200
     known = {"mgl": 0.49 * 9.81 * 0.1}
-    plain, loaded = (identify(logs, "pendulum", known, kind, held_out) for kind in ("coulomb", "load"))
+    plain, loaded = (
+        identify(logs, "pendulum", known, kind, held_out) for kind in ("coulomb", "load")
+    )
     errors = [np.mean([one.closed_loop for one in found.held_out]) for found in (plain, loaded)]
     assert errors[1] < 0.7 * errors[0]
     assert errors[1] < 0.06

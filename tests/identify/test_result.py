@@ -41,7 +41,11 @@ def test_the_file_is_the_actuator_and_randomize_draws_within_the_intervals(tmp_p
     written = motor().write(tmp_path)
     drive = resolve(str(written[0]), None, "a test")
     assert isinstance(drive, Drive)
-    assert (drive.motor.resistance, drive.motor.inductance, drive.motor.coulomb_friction) == (1.2, 1e-3, 1e-3)
+    assert (drive.motor.resistance, drive.motor.inductance, drive.motor.coulomb_friction) == (
+        1.2,
+        1e-3,
+        1e-3,
+    )
     assert identified_ranges(written[0]) == {
         "motor.resistance": "loguniform(1.1, 1.3)",
         **{f"motor.{side}_constant": "loguniform(0.049, 0.051)" for side in ("back_emf", "torque")},
@@ -53,15 +57,22 @@ def test_the_file_is_the_actuator_and_randomize_draws_within_the_intervals(tmp_p
 @pytest.mark.parametrize("status", ["ratio", "unidentifiable", "refused"])
 def test_a_number_that_was_not_identified_is_refused_until_it_is_given(tmp_path, status):
     found = motor(resistance=Estimate("resistance", 1.2, 0.1, 9.0, status, "its interval is wide"))
-    with pytest.raises(ValueError, match=f"resistance is {status}: its interval is wide. Give it with --known"):
+    with pytest.raises(
+        ValueError, match=f"resistance is {status}: its interval is wide. Give it with --known"
+    ):
         found.actuator()
     motor().write(tmp_path)
     assert found.write(tmp_path) == [tmp_path / "result.json"]
     assert [one.name for one in tmp_path.iterdir()] == ["result.json"]  # none of the fit before
-    assert f"resistance is {status}" in json.loads((tmp_path / "result.json").read_text())["problem"]
+    assert (
+        f"resistance is {status}" in json.loads((tmp_path / "result.json").read_text())["problem"]
+    )
     with pytest.raises(FileNotFoundError):
         resolve(str(tmp_path / "actuator.yaml"), None, "a test")
-    assert motor(resistance=Estimate("resistance", 1.2, 1.2, 1.2, "given")).actuator().motor.resistance == 1.2
+    assert (
+        motor(resistance=Estimate("resistance", 1.2, 1.2, 1.2, "given")).actuator().motor.resistance
+        == 1.2
+    )
 
 
 def test_what_the_logs_do_not_tell_is_asked_for_or_taken_from_a_motor():
@@ -72,7 +83,9 @@ def test_what_the_logs_do_not_tell_is_asked_for_or_taken_from_a_motor():
     assert whole == Drive().replaced({"motor.coulomb_friction": 1e-3})
 
 
-@pytest.mark.parametrize("known", [pytest.param({}, marks=pytest.mark.matrix), {"gear_ratio": 20.0}])
+@pytest.mark.parametrize(
+    "known", [pytest.param({}, marks=pytest.mark.matrix), {"gear_ratio": 20.0}]
+)
 def test_a_motor_with_a_gear_is_identified_at_its_rotor(known):
     """A log of the output: kE of 1 V*s/rad there is 0.05 at the rotor of a gear of 20; of a wrong gear it is none."""
     base = Drive().replaced({"motor.gear_ratio": 20.0 if not known else 1.0}).as_mapping()
@@ -85,7 +98,10 @@ def test_a_motor_with_a_gear_is_identified_at_its_rotor(known):
 
 
 def test_all_that_is_refused_and_all_that_is_missing_is_named_at_once():
-    bad = {name: Estimate(name, 1.0, 0.1, 9.0, "refused", "wide") for name in ("resistance", "coulomb_friction")}
+    bad = {
+        name: Estimate(name, 1.0, 0.1, 9.0, "refused", "wide")
+        for name in ("resistance", "coulomb_friction")
+    }
     problem = motor(**bad).problem()
     assert problem.endswith("Give them with --known resistance=VALUE coulomb_friction=VALUE")
     for whole in (motor(**bad), motor()):  # also where every single number looks good
@@ -93,7 +109,10 @@ def test_all_that_is_refused_and_all_that_is_missing_is_named_at_once():
         assert "leaves 89% of what moves" in lost
         assert "--known" not in lost
     none = identified(Estimate("resistance", 1.0, 0.9, 1.1, "identified")).problem()
-    assert "inductance, torque_constant, back_emf_constant, rotor_inertia: these logs say nothing of them" in none
+    assert (
+        "inductance, torque_constant, back_emf_constant, rotor_inertia: these logs say nothing of"
+        " them" in none
+    )
     assert "load_inertia=VALUE, 0 for a motor alone" in none
 
 
@@ -108,7 +127,8 @@ def test_a_rotor_inertia_that_the_datasheet_does_not_know_is_not_taken_for_zero(
     assert identified(*numbers, given, base=bare).actuator().motor.rotor_inertia == 0.0
     whole = identified(*numbers, base=Drive().as_mapping())
     assert (
-        whole.base_text == "not from these logs but the motor's, by --motor: rotor_inertia = 4e-06 kg*m^2, "
+        whole.base_text
+        == "not from these logs but the motor's, by --motor: rotor_inertia = 4e-06 kg*m^2, "
         "viscous_friction = 0 N*m*s/rad"
     )
     winding = identified(numbers[0], base=bare)
@@ -125,11 +145,17 @@ def test_the_supply_is_that_of_the_logs_and_is_said(tmp_path):
 
 def test_a_rig_that_is_not_said_and_what_will_be_missing_are_told_before_the_fit():
     log = bench.motor_log("sine", duration=0.5)
-    with pytest.raises(ValueError, match=r"--rig on the command line, rig= in Python.*pendulum, free or load"):
+    with pytest.raises(
+        ValueError, match=r"--rig on the command line, rig= in Python.*pendulum, free or load"
+    ):
         checked([log])
     assert "rotor_inertia" in foreseen([log], {}, None)
     assert "0 for a motor alone" in foreseen([log], {}, None)
-    assert foreseen([log], {"load_inertia": 0.0}, None) is foreseen([log], {}, Drive().as_mapping()) is None
+    assert (
+        foreseen([log], {"load_inertia": 0.0}, None)
+        is foreseen([log], {}, Drive().as_mapping())
+        is None
+    )
 
 
 def test_only_files_of_identified_actuators_have_ranges(tmp_path):
@@ -164,7 +190,14 @@ def test_the_command_line_identifies_and_draws_within_the_intervals(tmp_path, ca
     fields = yaml.safe_load((out / "actuator.yaml").read_text())
     low, high = fields["identified"]["intervals"]["motor.resistance"]
     assert low < bench.RESISTANCE < high
-    words = ["pendulum", "--actuator", actuator, "--env.randomize", "identified", "motor.inductance=uniform(1e-4,1e-3)"]
+    words = [
+        "pendulum",
+        "--actuator",
+        actuator,
+        "--env.randomize",
+        "identified",
+        "motor.inductance=uniform(1e-4,1e-3)",
+    ]
     verb = tyro.cli(train_verb(words), args=words)
     config = environment(verb, "pendulum", verb.actuator_name, EnvConfig("pendulum"))
     assert config.randomize[0] == "motor.inductance=uniform(0.0001, 0.001)"

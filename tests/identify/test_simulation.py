@@ -15,7 +15,12 @@ STILL = Moved(0.2, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
 
 def simulate(moved, times, inputs, position=0.0, speed=0.0):
     return moving(
-        times, np.broadcast_to(inputs, times.shape).astype(float), np.zeros(len(times)), position, speed, moved
+        times,
+        np.broadcast_to(inputs, times.shape).astype(float),
+        np.zeros(len(times)),
+        position,
+        speed,
+        moved,
     )
 
 
@@ -66,9 +71,16 @@ def test_a_supply_limits_what_a_servo_commands_only_where_that_is_a_voltage():
     times = np.linspace(0.0, 20.0, 4001)
     targets, moved = 20.0 * np.sign(np.sin(times)), STILL._replace(viscous=1.0)
     position = served(times, targets, np.full(4001, 100.0), 4.0, 0.0, 0.0, moved)
-    signals = {"command": targets, "position": position, "torque": np.clip(4.0 * (targets - position), -100.0, 100.0)}
+    signals = {
+        "command": targets,
+        "position": position,
+        "torque": np.clip(4.0 * (targets - position), -100.0, 100.0),
+    }
     model = types.SimpleNamespace(driven_by="torque", output="position", moved=lambda _: moved)
-    logs = Log("plain", times, signals), Log("of a bus", times, signals | {"bus": np.full(4001, 12.0)})
+    logs = (
+        Log("plain", times, signals),
+        Log("of a bus", times, signals | {"bus": np.full(4001, 12.0)}),
+    )
     errors = [closed_loop_error(types.SimpleNamespace(model=model, values=()), log) for log in logs]
     assert errors[0] == errors[1]
     assert errors[0] < 0.01

@@ -18,9 +18,13 @@ from tests.identify.draws import scaled
 from tests.matrix import but
 
 MOTORS = {
-    "small": GearMotor(0.94, 3.6e-4, 0.036, 0.036, 1.35e-5, coulomb_friction=5e-3, viscous_friction=1e-6),
+    "small": GearMotor(
+        0.94, 3.6e-4, 0.036, 0.036, 1.35e-5, coulomb_friction=5e-3, viscous_friction=1e-6
+    ),
     "geared": GearMotor(2.2, 1.3e-3, 0.014, 0.014, 2e-6, gear_ratio=30.0, coulomb_friction=1e-3),
-    "fast": GearMotor(8.4, 1.16e-3, 0.042, 0.042, 4e-6, coulomb_friction=1e-3, viscous_friction=3e-6),
+    "fast": GearMotor(
+        8.4, 1.16e-3, 0.042, 0.042, 4e-6, coulomb_friction=1e-3, viscous_friction=3e-6
+    ),
 }
 RATE = 5000.0
 STEP = 2.0 * math.pi / 4096
@@ -32,7 +36,9 @@ def drive_of(motor, sag=0.0):
 
 def excitation_of(motor, kind):
     clock = 4.0 * MOTORS[motor].electrical_time_constant
-    return Excitation(kind, 6.0, 1.0, frequency=2.0 if kind == "square" else 1.0, highest=150.0, clock=clock)
+    return Excitation(
+        kind, 6.0, 1.0, frequency=2.0 if kind == "square" else 1.0, highest=150.0, clock=clock
+    )
 
 
 @functools.cache
@@ -41,7 +47,10 @@ def logged(motor="small", kind="prbs", sag=0.0, jitter=0.0, dropped=0.0, seed=0,
     one, drive = MOTORS[motor], drive_of(motor, sag)
     load = Load(3.0 * one.rotor_inertia * one.gear_ratio**2 + 1e-4)
     course = run(drive, excitation_of(motor, kind), load)
-    peak, fastest = np.abs(course.signals["current"]).max(), np.abs(course.signals["velocity"]).max()
+    peak, fastest = (
+        np.abs(course.signals["current"]).max(),
+        np.abs(course.signals["velocity"]).max(),
+    )
     sensors = {
         "current": Sensor(0.01 * peak),
         "torque": Sensor(0.01 * peak * one.torque_constant * one.gear_ratio),
@@ -55,7 +64,9 @@ def logged(motor="small", kind="prbs", sag=0.0, jitter=0.0, dropped=0.0, seed=0,
 
 
 def without(log, *names):
-    return dataclasses.replace(log, signals={name: one for name, one in log.signals.items() if name not in names})
+    return dataclasses.replace(
+        log, signals={name: one for name, one in log.signals.items() if name not in names}
+    )
 
 
 def replaced(log, **signals):
@@ -91,14 +102,20 @@ SIGNS = {
 }
 UNITS = {
     "position in degrees": lambda log: scaled(log, position=180.0 / math.pi),
-    "position in degrees, alone": lambda log: without(scaled(log, position=180.0 / math.pi), "velocity"),
-    "motion in degrees": lambda log: scaled(log, position=180.0 / math.pi, velocity=180.0 / math.pi),
+    "position in degrees, alone": lambda log: without(
+        scaled(log, position=180.0 / math.pi), "velocity"
+    ),
+    "motion in degrees": lambda log: scaled(
+        log, position=180.0 / math.pi, velocity=180.0 / math.pi
+    ),
     "velocity in rpm": lambda log: scaled(log, velocity=30.0 / math.pi),
     "velocity in rpm, alone": lambda log: without(scaled(log, velocity=30.0 / math.pi), "position"),
     "current in mA": lambda log: scaled(log, current=1000.0),
     "torque in mN*m": lambda log: scaled(log, torque=1000.0),
     "duty for voltage": lambda log: replaced(log, voltage=log.signals["duty"]),
-    "time in ms": lambda log: dataclasses.replace(log, time=1000.0 * log.time + 0.3 * np.arange(len(log.time))),
+    "time in ms": lambda log: dataclasses.replace(
+        log, time=1000.0 * log.time + 0.3 * np.arange(len(log.time))
+    ),
 }
 
 
@@ -115,7 +132,9 @@ def test_wrong_signs_and_units_are_found_by_every_excitation(motor, kind):
 def hanging(amplitude=6.0, **sensors):
     """A pendulum, swung slowly."""
     excitation = Excitation("slow_sine", amplitude, 4.0)
-    return simulate(drive_of("geared"), excitation, Load(2e-2, gravity=0.8), sensors, Sampler(500.0))
+    return simulate(
+        drive_of("geared"), excitation, Load(2e-2, gravity=0.8), sensors, Sampler(500.0)
+    )
 
 
 @pytest.mark.parametrize("amplitude", [6.0, 2.0])
@@ -123,7 +142,11 @@ def hanging(amplitude=6.0, **sensors):
 def test_degrees_for_radians_are_an_error_by_gravity(amplitude, signal):
     clean = without(hanging(amplitude), "velocity", *{"torque", "current", "voltage"} - {signal})
     (one,) = found(scaled(clean, position=180.0 / math.pi), "unit")
-    assert (one.severity, "gravity" in one.message, one.remedy) == ("error", True, "write position=column:deg")
+    assert (one.severity, "gravity" in one.message, one.remedy) == (
+        "error",
+        True,
+        "write position=column:deg",
+    )
     assert found(clean, "unit") == []
 
 
@@ -133,13 +156,19 @@ def test_degrees_for_radians_are_an_error_by_the_encoder():
     assert (one.severity, "1/4096 of 360" in one.message) == ("error", True)
     rounded = replaced(encoder, position=np.round(encoder.signals["position"], 2))
     rounded = dataclasses.replace(rounded, resolution={**rounded.resolution, "position": 0.01})
-    assert [one.severity for one in found(rounded, "unit")] == ["warning"]  # decimals of a file may be of radians too
+    assert [one.severity for one in found(rounded, "unit")] == [
+        "warning"
+    ]  # decimals of a file may be of radians too
 
 
 @pytest.mark.parametrize(
     ("make", "says", "severity"),
     [
-        (lambda log: scaled(log, current=1000.0, voltage=3.0), "the resistance would be 0.00", "error"),
+        (
+            lambda log: scaled(log, current=1000.0, voltage=3.0),
+            "the resistance would be 0.00",
+            "error",
+        ),
         (lambda log: scaled(log, current=1000.0), "the current is up to ", "error"),
         (lambda log: scaled(log, voltage=1000.0), "the voltage is up to ", "error"),
         (lambda log: scaled(log, current=1e-5), "outside 0.005 to 1e4 ohm", "error"),
@@ -176,7 +205,11 @@ def test_factors_have_names(ratio, name):
 @pytest.mark.parametrize(
     ("kind", "signal", "delay", "told", "near"),
     [
-        *((kind, "current", rows / RATE, rows, 0.3) for kind in ("chirp", "prbs") for rows in (1.0, 2.0, 3.5)),
+        *(
+            (kind, "current", rows / RATE, rows, 0.3)
+            for kind in ("chirp", "prbs")
+            for rows in (1.0, 2.0, 3.5)
+        ),
         *(("slow_sine", "velocity", seconds, 1e3 * seconds, 0.2) for seconds in (0.003, 0.02)),
     ],
 )
@@ -212,27 +245,39 @@ def test_a_supply_taken_for_the_motors_voltage_is_found(signals):
     log = without(logged(kind="slow_sine"), *{*logged().signals} - {*signals, "voltage"})
     assert "error" not in {one.severity for one in found(log, "voltage")}
     supply = 24.0 + 0.05 * np.sin(log.time)
-    (one,) = [one for one in found(replaced(log, voltage=supply), "voltage") if one.severity == "error"]
+    (one,) = [
+        one for one in found(replaced(log, voltage=supply), "voltage") if one.severity == "error"
+    ]
     assert one.remedy.startswith("write bus=column:V")
-    held = replaced(log, voltage=supply, **{name: np.cumsum(np.abs(log.signals[name])) for name in signals})
-    assert "error" not in {one.severity for one in found(held, "voltage")}  # it may be a step that is held
+    held = replaced(
+        log, voltage=supply, **{name: np.cumsum(np.abs(log.signals[name])) for name in signals}
+    )
+    assert "error" not in {
+        one.severity for one in found(held, "voltage")
+    }  # it may be a step that is held
 
 
 def test_rows_that_repeat_old_values_are_found():
     """A position that is read 500 times a second into rows of 5 kHz; one of a coarse encoder is left in peace."""
     log = logged(kind="slow_sine")
-    (one,) = found(replaced(log, position=np.repeat(log.signals["position"][::10], 10)[:-9]), "repeated")
+    (one,) = found(
+        replaced(log, position=np.repeat(log.signals["position"][::10], 10)[:-9]), "repeated"
+    )
     assert (one.severity, "every 10th row" in one.message) == ("warning", True)
     coarse = logged(kind="slow_sine", changes=(("position", "resolution", 0.05),))
     assert found(coarse, "repeated") == found(log, "repeated") == []
 
 
-@pytest.mark.parametrize("signals", [("velocity",), ("position", "velocity"), ("voltage",), ("position", "voltage")])
+@pytest.mark.parametrize(
+    "signals", [("velocity",), ("position", "velocity"), ("voltage",), ("position", "voltage")]
+)
 @pytest.mark.parametrize("every", [1, 300])
 def test_what_a_fit_refuses_is_an_error_of_the_check(signals, every):
     """Rows over 50 ms apart, and too few signals, are refused by both, in the same words."""
     log = logged(kind="slow_sine")
-    part = Log("part", 10.0 * log.time[::every], {name: log.signals[name][::every] for name in signals})
+    part = Log(
+        "part", 10.0 * log.time[::every], {name: log.signals[name][::every] for name in signals}
+    )
     told = [one for one in check(part) if one.check in ("signals", "rows")]
     assert bool(told) == (signals != ("position", "voltage") or every == 300)
     if told:
@@ -264,7 +309,10 @@ def test_outliers_are_found_where_they_are(kind):
     (one,) = found(replaced(clean, current=spoiled), "outliers")
     listed = [int(word) for word in one.message.partition("(")[2].rstrip(")").split(",")]
     assert one.row == listed[0]
-    assert set(listed) <= {*rows, *(rows + 1)}  # or the row before, where that leaves its neighbours too
+    assert set(listed) <= {
+        *rows,
+        *(rows + 1),
+    }  # or the row before, where that leaves its neighbours too
     assert one.severity == "info"
     assert found(clean, "outliers") == []
 
@@ -273,12 +321,17 @@ def test_a_clipped_current_is_found():
     current = logged().signals["current"]
     limit = 0.6 * np.abs(current).max()
     clipped = found(replaced(logged(), current=np.clip(current, -limit, limit)), "saturation")
-    assert {one.row for one in clipped} == {1 + int(np.argmax(side >= limit)) for side in (current, -current)}
+    assert {one.row for one in clipped} == {
+        1 + int(np.argmax(side >= limit)) for side in (current, -current)
+    }
 
 
 def test_coarse_sensors_are_found():
     coarse = logged(changes=(("position", "resolution", 1.0), ("current", "resolution", 2.0)))
-    assert {one.message.split()[0] for one in found(coarse, "resolution")} == {"current", "position"}
+    assert {one.message.split()[0] for one in found(coarse, "resolution")} == {
+        "current",
+        "position",
+    }
     assert found(logged(), "resolution") == []
 
 
@@ -286,7 +339,9 @@ def test_coarse_sensors_are_found():
 def test_a_supply_that_sags_unseen_is_found_where_the_duty_varies(motor):
     (one,) = found(logged(motor, "chirp", sag=0.25), "sag")
     # at half of the duty: d^2*R/4
-    assert float(one.message.split()[5]) == pytest.approx(0.0625 * MOTORS[motor].resistance, rel=0.3)
+    assert float(one.message.split()[5]) == pytest.approx(
+        0.0625 * MOTORS[motor].resistance, rel=0.3
+    )
     assert found(logged(motor, "chirp"), "sag") == []
 
 
@@ -295,7 +350,10 @@ def test_a_wrapped_position_and_too_much_voltage_are_found():
     wrapped = found(replaced(log, position=log.signals["position"] % (2.0 * math.pi)), "wrapped")
     turns = np.flatnonzero(np.diff(np.floor(log.signals["position"] / (2.0 * math.pi))) != 0.0)
     assert [one.row for one in wrapped] == [turns[0] + 2]
-    assert "times that of the supply" in found(replaced(log, bus=0.4 * log.signals["bus"]), "unit")[0].message
+    assert (
+        "times that of the supply"
+        in found(replaced(log, bus=0.4 * log.signals["bus"]), "unit")[0].message
+    )
 
 
 def test_gravity_tells_a_zero_that_is_not_where_it_hangs():
@@ -304,7 +362,9 @@ def test_gravity_tells_a_zero_that_is_not_where_it_hangs():
     turned = replaced(log, position=log.signals["position"] + math.pi)
     assert "at the top" in found(turned, "zero")[0].message
     (tilted,) = found(replaced(log, position=log.signals["position"] + 0.1), "zero")
-    assert float(tilted.remedy.removeprefix("write position=column").partition(":")[0]) == pytest.approx(-0.1, abs=0.02)
+    assert float(
+        tilted.remedy.removeprefix("write position=column").partition(":")[0]
+    ) == pytest.approx(-0.1, abs=0.02)
 
 
 def test_a_torque_that_does_not_move_it_is_found():
@@ -319,7 +379,11 @@ PUSHED = {  # J, m*g*l, Coulomb and viscous friction; torque of time; logged bes
     "with friction": ((0.02, 1.3, 0.05, 0.2), lambda t: 0.5 * np.sin(np.pi * t), ["velocity"]),
     "jerked": ((1e-3, 0.9, 0.2, 0.18), lambda t: np.where(t % 1.0 < 0.5, 1.0, -1.0), ["velocity"]),
     "held nearly still": ((4e-4, 13.0, 0.03, 2e-3), lambda t: 0.25 * t, ["position", "velocity"]),
-    "held by a step": ((6e-4, 14.0, 0.3, 0.09), lambda t: np.ones(len(t)), ["position", "velocity"]),
+    "held by a step": (
+        (6e-4, 14.0, 0.3, 0.09),
+        lambda t: np.ones(len(t)),
+        ["position", "velocity"],
+    ),
 }
 
 
@@ -329,9 +393,14 @@ def pushed(name, seed=0):
     time, random = np.arange(0.0, 4.0, 1e-3), np.random.default_rng(seed)
     moved = Moved(inertia, mgl, 0.0, coulomb, viscous, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
     position, velocity = moving(time, torque(time), 0.0 * time, 0.0, 0.0, moved)
-    noisy = {"position": STEP * np.round(position / STEP), "velocity": velocity + 0.02 * random.standard_normal(4000)}
+    noisy = {
+        "position": STEP * np.round(position / STEP),
+        "velocity": velocity + 0.02 * random.standard_normal(4000),
+    }
     given = torque(time) + 0.005 * random.standard_normal(4000)
-    return Log(name, time, {"torque": given, **{one: noisy[one] for one in signals}}, {"position": STEP})
+    return Log(
+        name, time, {"torque": given, **{one: noisy[one] for one in signals}}, {"position": STEP}
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -345,21 +414,34 @@ def test_the_rig_tells_a_sign_that_gravity_would_explain_too():
     log = without(logged(kind="slow_sine"), "voltage", "current", "velocity")
     (one,) = [one for one in check(scaled(log, torque=-1.0), rig="free") if one.check == "sign"]
     assert "with a minus" in one.message
-    assert "zero" not in {one.check for one in check(replaced(log, position=log.signals["position"] + 1.0), rig="free")}
+    assert "zero" not in {
+        one.check
+        for one in check(replaced(log, position=log.signals["position"] + 1.0), rig="free")
+    }
 
 
 def test_a_motor_that_holds_a_pendulum_is_not_said_to_have_two_constants():
-    motor = GearMotor(0.17, 1e-4, 0.09, 0.09, 6e-5, gear_ratio=6.0, coulomb_friction=0.02, viscous_friction=1e-4)
+    motor = GearMotor(
+        0.17, 1e-4, 0.09, 0.09, 6e-5, gear_ratio=6.0, coulomb_friction=0.02, viscous_friction=1e-4
+    )
     drive = Drive(motor, SampledLoop(), Supply(24.0))
     volts = np.where(np.arange(1, 20 * 4000 + 2) > 10_000, 0.6, 0.0)
-    log = simulate(drive, volts, Load(0.146, gravity=9.53), {"position": Sensor(resolution=STEP)}, Sampler(RATE))
+    log = simulate(
+        drive,
+        volts,
+        Load(0.146, gravity=9.53),
+        {"position": Sensor(resolution=STEP)},
+        Sampler(RATE),
+    )
     assert found(without(log, "velocity"), "unit") == []
 
 
 def test_what_an_excitation_does_not_show_is_told():
     assert "inductance" in found(logged(kind="slow_sine"), "excitation")[0].message
     assert found(logged(kind="prbs"), "excitation") == []
-    held = simulate(drive_of("small"), Excitation("locked_prbs", 6.0, 1.0), Load(), {"current": Sensor(0.05)})
+    held = simulate(
+        drive_of("small"), Excitation("locked_prbs", 6.0, 1.0), Load(), {"current": Sensor(0.05)}
+    )
     assert "stands still" in found(held, "excitation")[0].message
     assert all(one.severity == "info" for one in check(held))
     one_way = simulate(drive_of("small"), Excitation("square", 6.0, 0.4, frequency=1.0), Load(1e-4))

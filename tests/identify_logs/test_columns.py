@@ -9,7 +9,12 @@ import pytest
 from codrl_mj.identify import propose_columns, read_log
 from codrl_mj.identify.columns import parse_columns, sign_magnitude, twos_complement
 
-TABLE = {"t": np.array([0.0, 1.0]), "a": np.array([2.0, -3.0]), "b": np.array([5.0, 7.0]), "motor current": np.ones(2)}
+TABLE = {
+    "t": np.array([0.0, 1.0]),
+    "a": np.array([2.0, -3.0]),
+    "b": np.array([5.0, 7.0]),
+    "motor current": np.ones(2),
+}
 TABLE |= {"lists[0]": np.array([1.0, 3.0]), "lists[1]": np.array([2.0, 4.0])}
 
 
@@ -47,11 +52,17 @@ def test_formulas_and_units(entry, expected):
 
 def test_registers_are_cast_angles_unwrapped_and_voltages_declared_means():
     numbers = np.arange(0, 65536, 7)
-    np.testing.assert_array_equal(twos_complement(numbers, 16), numbers.astype(np.uint16).astype(np.int16))
+    np.testing.assert_array_equal(
+        twos_complement(numbers, 16), numbers.astype(np.uint16).astype(np.int16)
+    )
     angle = np.linspace(0.0, 2000.0, 101)
-    found = parse_columns("time=t:s,position=unwrap(q, 360):deg")["position"].value({"t": angle, "q": angle % 360.0})
+    found = parse_columns("time=t:s,position=unwrap(q, 360):deg")["position"].value(
+        {"t": angle, "q": angle % 360.0}
+    )
     np.testing.assert_allclose(found, np.deg2rad(angle), atol=1e-12)
-    means = [parse_columns(f"time=t:s,voltage={text}:V")["voltage"].mean for text in ("mean(a*b)", "a*b")]
+    means = [
+        parse_columns(f"time=t:s,voltage={text}:V")["voltage"].mean for text in ("mean(a*b)", "a*b")
+    ]
     assert means == [True, False]
 
 
@@ -64,7 +75,9 @@ def test_a_sign_in_the_highest_bit_is_read(bits):
 
 
 def test_mappings_are_as_good_as_text():
-    assert parse_columns({"time": "t:s", "current": "a:A"}) == parse_columns("time=t:s, current=a:A")
+    assert parse_columns({"time": "t:s", "current": "a:A"}) == parse_columns(
+        "time=t:s, current=a:A"
+    )
 
 
 @pytest.mark.parametrize(
@@ -88,8 +101,14 @@ def test_mappings_are_as_good_as_text():
         ("time=t:s,current=a[-1]:A", "not allowed"),
         ("time=t:s,current=a[0:1]:A", "not allowed"),
         ("time=t:s,current=a[0]", "current=a[0]:A"),
-        ("time=t:s,current=lists:A", "lists holds lists of 2 numbers; write the one you want, such as lists[0]"),
-        ("time=t:s,position=a:UNIT", "the unit is not filled in; write the column's own, such as rad, deg or turn"),
+        (
+            "time=t:s,current=lists:A",
+            "lists holds lists of 2 numbers; write the one you want, such as lists[0]",
+        ),
+        (
+            "time=t:s,position=a:UNIT",
+            "the unit is not filled in; write the column's own, such as rad, deg or turn",
+        ),
         ("time=t:s,current=a.real:A", "not allowed"),
         ("time=t:s,current=[a for a in b]:A", "not allowed"),
         ("time=t:s,current=open('x'):A", "unknown function open"),
@@ -109,11 +128,15 @@ PROPOSED = {
     "t [s],u [V],current(mA),pos_deg\n0,1,2,3\n1,2,3,4": (
         'time="t [s]":s,voltage="u [V]":V,current="current(mA)":mA,position=pos_deg:deg'
     ),
-    "time;speed;current\nms;rpm;A\n0;1;2,5\n1;2;3,5": "time=time:ms,velocity=speed:rpm,current=current:A",
+    "time;speed;current\nms;rpm;A\n0;1;2,5\n1;2;3,5": (
+        "time=time:ms,velocity=speed:rpm,current=current:A"
+    ),
     "t,u,i,q,spare\n0,1,2,3,9\n0.01,2,3,4,9": (
         "time=t:s,voltage=u:UNIT,current=i:UNIT,position=q:UNIT | spare: not known"
     ),
-    "t,voltage,i\n0,1.5,2\n0.1,2,3": "time=t:UNIT,voltage=voltage:V,current=i:UNIT | replace UNIT by s or ms",
+    "t,voltage,i\n0,1.5,2\n0.1,2,3": (
+        "time=t:UNIT,voltage=voltage:V,current=i:UNIT | replace UNIT by s or ms"
+    ),
     "t,iMotor,angle\n0,900,0\n2,-800,90\n4,1,45": (
         "time=t:ms,current=iMotor:UNIT,position=angle:UNIT | replace UNIT by A or mA"
     ),
@@ -121,21 +144,28 @@ PROPOSED = {
         "time=t_s:s,command=commanded_deg_s:deg/s,position=angle_deg:deg,velocity=feedback_deg_s:deg/s,"
         "torque=torque_N_m:N*m"
     ),
-    "t_s,duty,vbus\n0,0.5,12\n0.1,-0.5,12": "time=t_s:s,duty=duty:1,bus=vbus:V,voltage=duty*vbus:V | share of the bus",
+    "t_s,duty,vbus\n0,0.5,12\n0.1,-0.5,12": (
+        "time=t_s:s,duty=duty:1,bus=vbus:V,voltage=duty*vbus:V | share of the bus"
+    ),
     "t_s,duty,voltage\n0,0.5,12\n0.1,-0.5,12.1": (
-        "time=t_s:s,duty=duty:1,bus=voltage:V,voltage=duty*voltage:V | voltage: hardly changes, taken as the supply's"
+        "time=t_s:s,duty=duty:1,bus=voltage:V,voltage=duty*voltage:V | voltage: hardly changes,"
+        " taken as the supply's"
     ),
     "t_s,current_mA,bus_mV,duty_percent,pos_mrad,größe\n0,1,2,3,4,5\n1,2,3,4,5,6": (
-        "time=t_s:s,current=current_mA:mA,bus=bus_mV:mV,duty=duty_percent:percent,position=pos_mrad:mrad,"
-        "voltage=duty_percent/100*bus_mV:mV | größe: not known"
+        "time=t_s:s,current=current_mA:mA,bus=bus_mV:mV,duty=duty_percent:percent,position=pos_mrad:mrad,voltage=duty_percent/100*bus_mV:mV"
+        " | größe: not known"
     ),
     "T_S,VOLTAGE_KV,I_UA,Größe der Position\n0,1,2,3\n1,2,3,4": (
-        'time=T_S:s,voltage=VOLTAGE_KV:kV,current=I_UA:uA,position="Größe der Position":UNIT | rad, deg or turn'
+        'time=T_S:s,voltage=VOLTAGE_KV:kV,current=I_UA:uA,position="Größe der Position":UNIT | rad,'
+        " deg or turn"
     ),
-    "t_s,enable,i_A\n0,on,1\n1,off,2": "time=t_s:s,current=i_A:A | enable: holds no numbers, left out",
+    "t_s,enable,i_A\n0,on,1\n1,off,2": (
+        "time=t_s:s,current=i_A:A | enable: holds no numbers, left out"
+    ),
     "t,i,,\n0,1,,\n0.01,2,,\n": "time=t:s,current=i:UNIT | : not known",
     "t_ms,i_A,bus_current_A,current_limit,goal_current_A,goal_position\n0,1,2,3,4,5\n1,2,3,4,5,6": (
-        "time=t_ms:ms,current=i_A:A,command=goal_current_A:A | bus_current_A: by its name the supply's current"
+        "time=t_ms:ms,current=i_A:A,command=goal_current_A:A | bus_current_A: by its name the"
+        " supply's current"
     ),
 }
 """A file -> the columns that are proposed | what is to be checked of them."""
@@ -159,7 +189,15 @@ def filled(columns):
     return re.sub(r"(\w+)=([^,]*):UNIT", lambda one: f"{one[1]}={one[2]}:{SI[one[1]]}", columns)
 
 
-SI = {"time": "s", "voltage": "V", "bus": "V", "current": "A", "position": "rad", "velocity": "rad/s", "torque": "N*m"}
+SI = {
+    "time": "s",
+    "voltage": "V",
+    "bus": "V",
+    "current": "A",
+    "position": "rad",
+    "velocity": "rad/s",
+    "torque": "N*m",
+}
 SI |= {"duty": "1", "command": "rad", "temperature": "degC"}
 
 

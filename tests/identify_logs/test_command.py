@@ -24,8 +24,8 @@ def said(capsys, line, status=0):
 def test_a_simulated_log_is_checked_by_the_columns_that_are_printed(capsys, tmp_path):
     told = said(
         capsys,
-        "simulate maxon-ec45-flat-50w --out log.csv.gz --inertia 1e-4 --duration 1 --dropped 0.05 --mean-voltage "
-        "--sensor current:noise=0.1,delay=4e-4 position:resolution=0.00153398",
+        "simulate maxon-ec45-flat-50w --out log.csv.gz --inertia 1e-4 --duration 1 --dropped 0.05"
+        " --mean-voltage --sensor current:noise=0.1,delay=4e-4 position:resolution=0.00153398",
     )
     columns = told.partition("--columns ")[2].strip()
     log = read_log(tmp_path / "log.csv.gz", columns.strip("'"))
@@ -71,7 +71,9 @@ def test_columns_are_proposed_with_the_line_to_type_next(capsys):
     columns = json.loads(said(capsys, "columns log.csv --json"))["columns"]
     assert columns.startswith("time=time:s,current=current:UNIT")
     columns = "time=time:s,current=current:A,voltage=voltage:V,position=position:rad"
-    assert "rig is not given (--rig on the command line" in said(capsys, f"log.csv --columns {columns}", 2)
+    assert "rig is not given (--rig on the command line" in said(
+        capsys, f"log.csv --columns {columns}", 2
+    )
 
 
 def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path, monkeypatch):

@@ -40,7 +40,9 @@ def test_the_best_reaches_its_goals_with_the_margin_at_the_lowest_rate(planned):
     assert planned.missed == planned.unknown == []
     assert set(best.errors) == set(GOALS)
     assert all(best.errors[name] <= goal / MARGIN for name, goal in GOALS.items())
-    assert not [one for one in planned.options if one.rate < best.rate and one.worst <= 1.0 / MARGIN]
+    assert not [
+        one for one in planned.options if one.rate < best.rate and one.worst <= 1.0 / MARGIN
+    ]
 
 
 def test_currents_stay_within_their_limits(planned):
@@ -58,7 +60,11 @@ def test_what_a_slow_sine_and_a_held_shaft_do_not_show(planned):
 
 def test_voltages_that_change_between_rows_cost_most_of_the_inductance():
     errors = {
-        how: at_rates(5e3, kinds=["locked_prbs"], sensing=Sensing(voltage=how), duration=1.0).best.errors["inductance"]
+        how: (
+            at_rates(
+                5e3, kinds=["locked_prbs"], sensing=Sensing(voltage=how), duration=1.0
+            ).best.errors["inductance"]
+        )
         for how in ("together", "mean", "instantaneous")
     }
     assert 10.0 * errors["together"] < errors["mean"] < errors["instantaneous"]
@@ -81,7 +87,9 @@ def test_errors_expected_are_those_of_fits(planned):
         def error(scales, voltage=voltage, speed=speed, log=log):
             resistance, inductance, back_emf = scales[:3] * [0.94, 3.6e-4, 0.036]
             decay = math.exp(-resistance / inductance / 20e3)
-            current = lfilter([0.0, (1.0 - decay) / resistance], [1.0, -decay], voltage - back_emf * speed)
+            current = lfilter(
+                [0.0, (1.0 - decay) / resistance], [1.0, -decay], voltage - back_emf * speed
+            )
             return (current[::2] - log.signals["current"]) / noise
 
         found.append(least_squares(error, [1.02, 0.9, 0.98]).x)
@@ -102,7 +110,9 @@ def test_what_is_written_is_what_was_planned(planned, tmp_path):
 def test_a_long_plan_is_written_row_by_row(planned, tmp_path):
     """Hours of it: no two rows have the same time."""
     excitation = dataclasses.replace(planned.best.excitation, kind="square", duration=7200.0)
-    write_excitation(tmp_path / "long.csv", planned.best._replace(excitation=excitation, rate=100.0))
+    write_excitation(
+        tmp_path / "long.csv", planned.best._replace(excitation=excitation, rate=100.0)
+    )
     time = np.loadtxt(tmp_path / "long.csv", delimiter=",", skiprows=1, usecols=0)
     np.testing.assert_allclose(np.diff(time), 0.01, rtol=1e-6)
 
@@ -121,7 +131,9 @@ def test_a_gear_is_planned_as_the_motor_that_it_is_at_its_output():
         viscous_friction=ratio**2 * one.viscous_friction,
     )  # fmt: skip
     errors = [
-        at_rates(1e3, kinds=["prbs"], drive=dataclasses.replace(DRIVE, motor=motor), duration=1.0).best.errors
+        at_rates(
+            1e3, kinds=["prbs"], drive=dataclasses.replace(DRIVE, motor=motor), duration=1.0
+        ).best.errors
         for motor in (dataclasses.replace(one, gear_ratio=ratio), direct)
     ]
     assert errors[0] == pytest.approx(errors[1], rel=0.01)
@@ -129,7 +141,9 @@ def test_a_gear_is_planned_as_the_motor_that_it_is_at_its_output():
 
 
 def test_what_the_datasheet_leaves_at_zero_is_named():
-    bare = dataclasses.replace(DRIVE, motor=dataclasses.replace(MOTOR, viscous_friction=0.0, coulomb_friction=0.0))
+    bare = dataclasses.replace(
+        DRIVE, motor=dataclasses.replace(MOTOR, viscous_friction=0.0, coulomb_friction=0.0)
+    )
     found = at_rates(2e3, kinds=["prbs"], drive=bare, duration=1.0)
     assert found.unknown == ["coulomb_friction", "viscous_friction"]
     assert not {*found.unknown} & {*found.best.errors}

@@ -28,49 +28,96 @@ EPOCH = 1_700_000_000
 
 SLOPPY = {
     "Dynamixel Wizard": (
-        {"Time(ms)": 10 * ROWS, "Present Position": COUNTS, "Present Current": LOAD, "Present PWM": LOAD}
+        {
+            "Time(ms)": 10 * ROWS,
+            "Present Position": COUNTS,
+            "Present Current": LOAD,
+            "Present PWM": LOAD,
+        }
         | {"Present Input Voltage": ZERO + 120},
-        'time="Time(ms)":ms,position="Present Position":UNIT,current="Present Current":UNIT,duty="Present PWM":UNIT,'
-        'bus="Present Input Voltage":UNIT',
+        (
+            'time="Time(ms)":ms,position="Present Position":UNIT,current="Present'
+            ' Current":UNIT,duty="Present PWM":UNIT,bus="Present Input Voltage":UNIT'
+        ),
     ),
     "Feetech debugger": (
-        {"Time": 10 * ROWS, "Position": COUNTS, "Goal": COUNTS, "Load": LOAD, "Current": LOAD} | {"Voltage": ZERO + 74},
+        {"Time": 10 * ROWS, "Position": COUNTS, "Goal": COUNTS, "Load": LOAD, "Current": LOAD}
+        | {"Voltage": ZERO + 74},
         "time=Time:ms,position=Position:UNIT,command=Goal:UNIT,duty=Load:UNIT,current=Current:UNIT,bus=Voltage:UNIT",
     ),
     "LeRobot's registers": (
-        {"timestamp": TIME, "Goal_Position": COUNTS, "Present_Position": COUNTS, "Present_Current": LOAD},
+        {
+            "timestamp": TIME,
+            "Goal_Position": COUNTS,
+            "Present_Position": COUNTS,
+            "Present_Current": LOAD,
+        },
         "time=timestamp:s,command=Goal_Position:UNIT,position=Present_Position:UNIT,current=Present_Current:UNIT",
     ),
     "ODrive": (
-        {"timestamp": EPOCH + TIME, "pos_estimate": ANGLE, "vel_estimate": SPEED, "Iq_measured": CURRENT}
+        {
+            "timestamp": EPOCH + TIME,
+            "pos_estimate": ANGLE,
+            "vel_estimate": SPEED,
+            "Iq_measured": CURRENT,
+        }
         | {"vbus_voltage": SUPPLY, "Vq": VOLTS, "pos_setpoint": ANGLE, "current_state": ZERO},
-        "time=timestamp:s,position=pos_estimate:UNIT,velocity=vel_estimate:UNIT,current=Iq_measured:UNIT,"
-        "bus=vbus_voltage:V,voltage=Vq:V,command=pos_setpoint:UNIT",
+        (
+            "time=timestamp:s,position=pos_estimate:UNIT,velocity=vel_estimate:UNIT,current=Iq_measured:UNIT,"
+            "bus=vbus_voltage:V,voltage=Vq:V,command=pos_setpoint:UNIT"
+        ),
     ),
     "moteus": (
         {"timestamp": TIME, "MODE": ZERO, "POSITION": ANGLE, "VELOCITY": SPEED, "TORQUE": CURRENT}
         | {"Q_CURRENT": CURRENT, "D_CURRENT": 0.1 * CURRENT, "VOLTAGE": SUPPLY, "FAULT": ZERO},
-        "time=timestamp:s,position=POSITION:UNIT,velocity=VELOCITY:UNIT,torque=TORQUE:UNIT,current=Q_CURRENT:UNIT,"
-        "bus=VOLTAGE:V",
+        (
+            "time=timestamp:s,position=POSITION:UNIT,velocity=VELOCITY:UNIT,torque=TORQUE:UNIT,current=Q_CURRENT:UNIT,"
+            "bus=VOLTAGE:V"
+        ),
     ),
     "VESC Tool": (
-        {"ms_today": 36_000_000 + 20 * ROWS, "input_voltage": SUPPLY, "current_motor": CURRENT, "current_in": CURRENT}
-        | {"d_axis_current": CURRENT, "q_axis_current": CURRENT, "erpm": SPEED, "duty_cycle": VOLTS / 24.0}
+        {
+            "ms_today": 36_000_000 + 20 * ROWS,
+            "input_voltage": SUPPLY,
+            "current_motor": CURRENT,
+            "current_in": CURRENT,
+        }
+        | {
+            "d_axis_current": CURRENT,
+            "q_axis_current": CURRENT,
+            "erpm": SPEED,
+            "duty_cycle": VOLTS / 24.0,
+        }
         | {"encoder_position": ANGLE, "d_axis_voltage": VOLTS},
-        "time=ms_today:ms,bus=input_voltage:V,current=current_motor:UNIT,duty=duty_cycle:1,"
-        "position=encoder_position:UNIT,voltage=duty_cycle*input_voltage:V",
+        (
+            "time=ms_today:ms,bus=input_voltage:V,current=current_motor:UNIT,duty=duty_cycle:1,"
+            "position=encoder_position:UNIT,voltage=duty_cycle*input_voltage:V"
+        ),
     ),
     "ROS 1": (
-        {"%time": 10_000_000 * ROWS, "field.header.seq": ROWS, "field.position0": ANGLE, "field.effort0": CURRENT},
+        {
+            "%time": 10_000_000 * ROWS,
+            "field.header.seq": ROWS,
+            "field.position0": ANGLE,
+            "field.effort0": CURRENT,
+        },
         'time="%time":ns,position="field.position0":UNIT,torque="field.effort0":UNIT',
     ),
     "ROS 2": (
-        {"header.stamp.sec": EPOCH + ROWS // 100, "header.stamp.nanosec": ROWS % 100 * 10_000_000, "position": ANGLE}
+        {
+            "header.stamp.sec": EPOCH + ROWS // 100,
+            "header.stamp.nanosec": ROWS % 100 * 10_000_000,
+            "position": ANGLE,
+        }
         | {"effort": CURRENT},
         'time="header.stamp.sec"+"header.stamp.nanosec"/1e9:s,position=position:UNIT,torque=effort:UNIT',
     ),
     "PlotJuggler": (
-        {"__time": EPOCH + TIME, "/joint_states/j0/position": ANGLE, "/joint_states/j0/effort": CURRENT},
+        {
+            "__time": EPOCH + TIME,
+            "/joint_states/j0/position": ANGLE,
+            "/joint_states/j0/effort": CURRENT,
+        },
         'time=__time:s,position="/joint_states/j0/position":UNIT,torque="/joint_states/j0/effort":UNIT',
     ),
     "Arduino": (
@@ -86,10 +133,17 @@ SLOPPY = {
         'time="Time [s]":s,voltage="CH1 voltage [mV]":mV,current="CH2 current [A]":A',
     ),
     "a table of degrees": (
-        {"time_s": TIME, "commanded_deg_s": SPEED, "angle_deg": (200.0 * ANGLE) % 360.0, "feedback_deg_s": SPEED}
+        {
+            "time_s": TIME,
+            "commanded_deg_s": SPEED,
+            "angle_deg": (200.0 * ANGLE) % 360.0,
+            "feedback_deg_s": SPEED,
+        }
         | {"torque_N_m": CURRENT},
-        "time=time_s:s,command=commanded_deg_s:deg/s,position=unwrap(angle_deg,360):deg,velocity=feedback_deg_s:deg/s,"
-        "torque=torque_N_m:N*m",
+        (
+            "time=time_s:s,command=commanded_deg_s:deg/s,position=unwrap(angle_deg,360):deg,velocity=feedback_deg_s:deg/s,"
+            "torque=torque_N_m:N*m"
+        ),
     ),
     "turns that wrap": (
         {"t_s": TIME, "pos": (2.0 * ANGLE) % 1.0, "u_V": VOLTS},
@@ -105,9 +159,16 @@ SLOPPY = {
     ),
     "names of others": (
         {"time": TIME, "goal_position": ANGLE, "goal_current": CURRENT, "current_position": ANGLE}
-        | {"current_velocity": SPEED, "current_limit": ZERO, "bus_current": CURRENT, "present_current": CURRENT},
-        "time=time:s,command=goal_position:UNIT,position=current_position:UNIT,velocity=current_velocity:UNIT,"
-        "current=present_current:UNIT",
+        | {
+            "current_velocity": SPEED,
+            "current_limit": ZERO,
+            "bus_current": CURRENT,
+            "present_current": CURRENT,
+        },
+        (
+            "time=time:s,command=goal_position:UNIT,position=current_position:UNIT,velocity=current_velocity:UNIT,"
+            "current=present_current:UNIT"
+        ),
     ),
     "one letter each": (
         {"t": TIME, "q": ANGLE, "w": SPEED, "u": CURRENT, "i": CURRENT},
@@ -129,19 +190,28 @@ SLOPPY = {
     ),
 }
 """Whose log -> its columns, what is to be proposed."""
-SI = {"duty": "1", "command": "1", "time": "s"} | {name: unit for name, unit in SIGNALS.items() if unit}
+SI = {"duty": "1", "command": "1", "time": "s"} | {
+    name: unit for name, unit in SIGNALS.items() if unit
+}
 
 
 def written(folder, columns, name="log.csv"):
     table = np.column_stack([*columns.values()])
-    lines = [",".join(f'"{one}"' for one in columns), *(",".join(f"{value:.17g}" for value in row) for row in table)]
+    lines = [
+        ",".join(f'"{one}"' for one in columns),
+        *(",".join(f"{value:.17g}" for value in row) for row in table),
+    ]
     (folder / name).write_text("\n".join(lines))
     return folder / name
 
 
 def filled(columns, time="s"):
     """Return columns with a unit for each that is left open."""
-    return re.sub(r"(\w+)=([^,]*):UNIT", lambda one: f"{one[1]}={one[2]}:{(SI | {'time': time})[one[1]]}", columns)
+    return re.sub(
+        r"(\w+)=([^,]*):UNIT",
+        lambda one: f"{one[1]}={one[2]}:{(SI | {'time': time})[one[1]]}",
+        columns,
+    )
 
 
 @pytest.mark.parametrize("whose", SLOPPY)
@@ -151,7 +221,9 @@ def test_a_log_of_somebody_is_proposed_and_taken_once_its_units_are_filled_in(tm
     assert found.columns == expected
     assert found.problem is None
     if "UNIT" in expected:
-        with pytest.raises(ValueError, match="the unit is not filled in; write the column's own, such as"):
+        with pytest.raises(
+            ValueError, match="the unit is not filled in; write the column's own, such as"
+        ):
             read_log(tmp_path / "log.csv", expected)
     log = read_log(tmp_path / "log.csv", filled(expected, "ms"))
     assert {one.check for one in check(log)}.isdisjoint({"signals", "rows", "wrapped"})
@@ -163,13 +235,20 @@ EFFORTS = {"torque_Nm": CURRENT, "current_A": CURRENT, "voltage_V": VOLTS}
 
 
 @pytest.mark.parametrize("motion", [(), ("position_rad",), ("velocity_rad_s",), tuple(MOTION)])
-@pytest.mark.parametrize("effort", [(), ("torque_Nm",), ("current_A",), ("voltage_V",), ("voltage_V", "current_A")])
+@pytest.mark.parametrize(
+    "effort", [(), ("torque_Nm",), ("current_A",), ("voltage_V",), ("voltage_V", "current_A")]
+)
 @pytest.mark.parametrize(("step", "count"), [(0.01, 600), (0.1, 600), (0.01, 12)])
-def test_what_is_proposed_and_passed_by_the_check_is_what_the_fit_takes(tmp_path, motion, effort, step, count):
+def test_what_is_proposed_and_passed_by_the_check_is_what_the_fit_takes(
+    tmp_path, motion, effort, step, count
+):
     """By docs/identify.md: voltage and current, or an effort with a motion; rows within 50 ms; enough rows."""
     if not motion + effort:
         return
-    columns = {"t_s": step * ROWS, **{name: (MOTION | EFFORTS)[name] for name in (*motion, *effort)}}
+    columns = {
+        "t_s": step * ROWS,
+        **{name: (MOTION | EFFORTS)[name] for name in (*motion, *effort)},
+    }
     path = written(tmp_path, {name: values[:count] for name, values in columns.items()})
     told = len(effort) == 2 or (motion and effort)
     possible = told and (step <= 0.05 or not motion) and count > 20
@@ -180,7 +259,9 @@ def test_what_is_proposed_and_passed_by_the_check_is_what_the_fit_takes(tmp_path
     if possible:
         checked([log], "free", {"load_inertia": 0.0})
         return
-    with pytest.raises(ValueError, match=r"nothing can be identified|a row every 0.1 s, must be at most|12 rows in"):
+    with pytest.raises(
+        ValueError, match=r"nothing can be identified|a row every 0.1 s, must be at most|12 rows in"
+    ):
         checked([log], "free", {"load_inertia": 0.0})
 
 
@@ -206,23 +287,35 @@ def test_a_line_to_type_next_is_taken_as_it_is_or_there_is_none(tmp_path, capsys
     status, out, _ = said(capsys, *shlex.split(line)[2:])
     assert status == 1
     assert "sign" in out
-    status, out, _ = said(capsys, "columns", written(tmp_path, {"t_s": TIME, "goal_deg": ANGLE, "present_deg": ANGLE}))
+    status, out, _ = said(
+        capsys, "columns", written(tmp_path, {"t_s": TIME, "goal_deg": ANGLE, "present_deg": ANGLE})
+    )
     assert status == 1
     text = " ".join(out.split())
-    assert "this log has no voltage, current or torque: nothing can be identified from it; log one of them" in text
+    assert (
+        "this log has no voltage, current or torque: nothing can be identified from it; log one of"
+        " them" in text
+    )
     assert "Feetech: Present Load" in text
     assert "codrl-mj identify" not in out
     assert "--columns time=t_s:s,command=goal_deg:deg,position=present_deg:deg" in out
 
 
 def test_of_a_duty_without_a_supply_it_says_what_to_write(tmp_path):
-    found = propose_columns(written(tmp_path, {"t_s": TIME, "present_deg": ANGLE, "duty": VOLTS / 12.0}))
+    found = propose_columns(
+        written(tmp_path, {"t_s": TIME, "present_deg": ANGLE, "duty": VOLTS / 12.0})
+    )
     assert found.columns == "time=t_s:s,position=present_deg:deg,duty=duty:1"
     assert "voltage=duty*12:V if the supply has 12 V" in found.problem
 
 
 EPISODE = [
-    {"timestamp": k / 30, "action": [a, 0.5], "observation.state": [a - 1.0, 1.0], "effort": [u, 0.0]}
+    {
+        "timestamp": k / 30,
+        "action": [a, 0.5],
+        "observation.state": [a - 1.0, 1.0],
+        "effort": [u, 0.0],
+    }
     for k, a, u in zip(range(90), map(float, ANGLE), map(float, CURRENT), strict=False)
 ]
 FEATURES = {
@@ -252,20 +345,28 @@ def episode(folder, kind):
     return path, columns
 
 
-@pytest.mark.parametrize("kind", ["json", "columns.json", "features.json", "csv", "numpy.csv", "parquet"])
+@pytest.mark.parametrize(
+    "kind", ["json", "columns.json", "features.json", "csv", "numpy.csv", "parquet"]
+)
 def test_an_entry_of_a_list_is_a_column(tmp_path, monkeypatch, kind):
     path, columns = episode(tmp_path, kind)
     table = SimpleNamespace(to_pydict=lambda: columns)
-    monkeypatch.setitem(__import__("sys").modules, "pyarrow.parquet", SimpleNamespace(read_table=lambda _: table))
+    monkeypatch.setitem(
+        __import__("sys").modules, "pyarrow.parquet", SimpleNamespace(read_table=lambda _: table)
+    )
     log = read_log(path, LISTED + 'command=action[1]:deg,position="observation.state"[0]:deg')
     np.testing.assert_allclose(log.signals["command"], np.deg2rad(0.5))
     np.testing.assert_allclose(log.signals["position"], np.deg2rad(ANGLE[:90] - 1.0))
     with pytest.raises(
-        ValueError, match=r"action holds lists of 2 numbers; write the one you want, such as action\[0\]"
+        ValueError,
+        match=r"action holds lists of 2 numbers; write the one you want, such as action\[0\]",
     ):
         read_log(path, LISTED + "command=action:deg")
     found = propose_columns(path)
-    assert 'command=action[0]:UNIT,position="observation.state[0]":UNIT,torque=effort[0]:UNIT' in found.columns
+    assert (
+        'command=action[0]:UNIT,position="observation.state[0]":UNIT,torque=effort[0]:UNIT'
+        in found.columns
+    )
     read_log(path, filled(found.columns))
 
 

@@ -30,7 +30,9 @@ def served(tmp_path, monkeypatch):
         "commit": "abc",
         "licence": "MIT",
         "columns": "time=time:s",
-        "files": {"ours.csv": {"path": "results/measured.csv", "sha256": hashlib.sha256(LOG).hexdigest()}},
+        "files": {
+            "ours.csv": {"path": "results/measured.csv", "sha256": hashlib.sha256(LOG).hexdigest()}
+        },
     }
     monkeypatch.setattr(module, "published", lambda: {"rig": about})
     yield there / "measured.csv"

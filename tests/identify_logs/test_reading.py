@@ -77,16 +77,26 @@ def test_json(tmp_path, content, packed):
 
 def test_constants_of_a_file_count_in_formulas(tmp_path):
     path = write(tmp_path, json.dumps({"entries": ENTRIES, "gain": 2}), "log.json")
-    np.testing.assert_array_equal(read_log(path, "time=t:s,current=i*gain:A").signals["current"], [8.0, 10.0, 14.0])
+    np.testing.assert_array_equal(
+        read_log(path, "time=t:s,current=i*gain:A").signals["current"], [8.0, 10.0, 14.0]
+    )
 
 
 def test_rows_that_cannot_be_used_are_left_out_and_named(tmp_path):
     lines = ["t,i"] + [f"{k},{k}" for k in range(20)]
-    lines[4], lines[8], lines[12] = "3", "5.5,7", "11,NA"  # the row is cut; the clock goes back; a value is missing
+    lines[4], lines[8], lines[12] = (
+        "3",
+        "5.5,7",
+        "11,NA",
+    )  # the row is cut; the clock goes back; a value is missing
     log = read_log(write(tmp_path, "\n".join(lines)), COLUMNS)
     np.testing.assert_array_equal(np.setdiff1d(np.arange(1, 21), log.row_numbers), [4, 8, 12])
     np.testing.assert_array_equal(log.row_numbers, log.time + 1.0)
-    assert {(one.check, one.row) for one in log.findings} == {("missing", 4), ("stamps", 8), ("missing", 12)}
+    assert {(one.check, one.row) for one in log.findings} == {
+        ("missing", 4),
+        ("stamps", 8),
+        ("missing", 12),
+    }
     assert [one.severity for one in log.findings if one.check == "stamps"] == ["error"]
 
 
@@ -99,7 +109,9 @@ def test_only_leaves_out_rows_and_leaves_a_gap(tmp_path):
 
 def test_a_register_with_a_sign_is_seen(tmp_path):
     numbers = np.round(100.0 * np.sin(np.arange(60.0))).astype(np.int16)
-    path = write(tmp_path, "\n".join(["t,i"] + [f"{k},{n.astype(np.uint16)}" for k, n in enumerate(numbers)]))
+    path = write(
+        tmp_path, "\n".join(["t,i"] + [f"{k},{n.astype(np.uint16)}" for k, n in enumerate(numbers)])
+    )
     (found,) = read_log(path, COLUMNS).findings
     first = 1 + int(np.argmax(numbers < 0))
     assert (found.check, found.row) == ("register", first)
@@ -112,19 +124,29 @@ def test_a_register_with_a_sign_is_seen(tmp_path):
     np.testing.assert_array_equal(log.signals["current"], numbers)
 
 
-@pytest.mark.parametrize(("signal", "bits"), [("duty", 11), ("voltage", 11), ("current", 16), ("velocity", 16)])
+@pytest.mark.parametrize(
+    ("signal", "bits"), [("duty", 11), ("voltage", 11), ("current", 16), ("velocity", 16)]
+)
 def test_a_register_whose_highest_bit_is_the_sign_is_seen(tmp_path, signal, bits):
     numbers = np.round(300.0 * np.sin(0.2 * np.arange(200.0))).astype(int)
     register = [abs(one) | (int(one < 0) << (bits - 1)) for one in map(int, numbers)]
-    path = write(tmp_path, "\n".join(["t,x"] + [f"{row},{one}" for row, one in enumerate(register)]))
+    path = write(
+        tmp_path, "\n".join(["t,x"] + [f"{row},{one}" for row, one in enumerate(register)])
+    )
     unit = {"duty": "1", "voltage": "V", "current": "A", "velocity": "rad/s"}[signal]
     (found,) = read_log(path, f"time=t:s,{signal}=x:{unit}").findings
-    assert (found.severity, found.check, found.row) == ("error", "register", 1 + int(np.argmax(numbers < 0)))
+    assert (found.severity, found.check, found.row) == (
+        "error",
+        "register",
+        1 + int(np.argmax(numbers < 0)),
+    )
     assert found.remedy == f"write sign_magnitude(x, {bits})"
     log = read_log(path, f"time=t:s,{signal}=sign_magnitude(x, {bits}):{unit}")
     assert log.findings == ()
     np.testing.assert_array_equal(log.signals[signal], numbers)
-    assert read_log(path, "time=t:s,position=x:rad").findings == ()  # an encoder's counts may be there
+    assert (
+        read_log(path, "time=t:s,position=x:rad").findings == ()
+    )  # an encoder's counts may be there
 
 
 def test_a_voltage_in_whole_millivolts_has_no_sign_to_lose(tmp_path):
@@ -139,7 +161,11 @@ def test_a_voltage_in_whole_millivolts_has_no_sign_to_lose(tmp_path):
         ("t,i\n1,2\n2,a\n", "log.csv", "column i in line 3 is 'a'"),
         ('t,i\n1,"2,5"\n2,"3,5"\n', "log.csv", "decimal point"),
         ("t,t\n1,2\n", "log.csv", "name the columns"),
-        ("t,i\n1,2\n", "log.csv", "1 of 1 rows can be used, must be 2 or more, and 80%: there are no more"),
+        (
+            "t,i\n1,2\n",
+            "log.csv",
+            "1 of 1 rows can be used, must be 2 or more, and 80%: there are no more",
+        ),
         ("t,i\n3,2\n2,2\n1,2\n", "log.csv", "1 of 3 rows"),
         ("t,j\n1,2\n2,2\n", "log.csv", "unknown column i"),
         ("", "log.csv", "name the columns"),
@@ -162,7 +188,9 @@ def test_parquet_is_read_by_pyarrow_and_says_so_without(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="pip install pyarrow"):
         read_log(path, COLUMNS)
     tables = {path: SimpleNamespace(to_pydict=lambda: ROWS)}
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", SimpleNamespace(read_table=tables.__getitem__))
+    monkeypatch.setitem(
+        sys.modules, "pyarrow.parquet", SimpleNamespace(read_table=tables.__getitem__)
+    )
     np.testing.assert_array_equal(read_log(path, COLUMNS).signals["current"], ROWS["i"])
 
 
@@ -170,7 +198,10 @@ def test_parquet_is_read_by_pyarrow_and_says_so_without(tmp_path, monkeypatch):
 @pytest.mark.parametrize("mean", [False, True])
 def test_what_is_written_is_read_again(tmp_path, name, mean):
     random = np.random.default_rng(0)
-    signals = {signal: random.standard_normal(50) for signal in ("voltage", "current", "duty", "temperature")}
+    signals = {
+        signal: random.standard_normal(50)
+        for signal in ("voltage", "current", "duty", "temperature")
+    }
     log = Log("log", np.cumsum(random.uniform(0.5, 1.5, 50)) * 1e-3, signals, mean_voltage=mean)
     again = read_log(tmp_path / name, write_log(tmp_path / name, log))
     assert again.mean_voltage is mean

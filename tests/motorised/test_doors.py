@@ -36,10 +36,19 @@ def _both(actuators, integrator, kind="hinge"):
     found, motors, count = [], list(actuators.values()), len(actuators)
     for build in (behind_callback, behind_plugin):
         model = build(arm(integrator, kind), actuators)
-        data, read, rows, shaft = mujoco.MjData(model), codrl_mj.engine.Readout(model), [], np.ones(2)
+        data, read, rows, shaft = (
+            mujoco.MjData(model),
+            codrl_mj.engine.Readout(model),
+            [],
+            np.ones(2),
+        )
         codrl_mj.engine.clear_motors(data, range(5, 5 + count))
-        if build is behind_callback:  # where a control is the torque at the shaft, or the shaft's motion
-            shaft[:count] = [(1 / one.arm_radius if one.MOTION else one.arm_radius) for one in motors]
+        if (
+            build is behind_callback
+        ):  # where a control is the torque at the shaft, or the shaft's motion
+            shaft[:count] = [
+                (1 / one.arm_radius if one.MOTION else one.arm_radius) for one in motors
+            ]
         for desired in controls(STEPS, 2):
             data.ctrl[:] = desired * shaft
             mujoco.mj_step(model, data)
@@ -90,7 +99,10 @@ SAVED = {
 @pytest.mark.parametrize("how", SAVED)
 def test_a_simulation_is_continued_from_what_is_saved_of_it(how, integrator):
     """Whatever forward calls there are meanwhile, and wherever the saved one goes."""
-    model, inputs = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["lag"]}), controls(STEPS, 2)
+    model, inputs = (
+        behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["lag"]}),
+        controls(STEPS, 2),
+    )
 
     def meddle(data):
         mujoco.mj_forward(model, data)
@@ -114,11 +126,14 @@ def test_a_reset_and_a_keyframe_bring_motors_to_rest(integrator):
     mujoco.mj_resetData(model, used)
     assert not used.plugin_state.any()
     np.testing.assert_array_equal(trajectory(model, inputs, used), trajectory(model, inputs, fresh))
-    # the time of a keyframe is not that of the motors' rest: under RK4 the first step must be held as all others are
+    # the time of a keyframe is not that of the motors' rest: under RK4 the first step must be held
+    # as all others are
     mujoco.mj_resetDataKeyframe(model, used, 0)
     plain = mujoco.MjData(model)
     plain.qpos[:] = used.qpos
-    np.testing.assert_allclose(trajectory(model, inputs, used), trajectory(model, inputs, plain), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        trajectory(model, inputs, used), trajectory(model, inputs, plain), rtol=0, atol=1e-11
+    )
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -161,7 +176,9 @@ def test_a_batch_is_a_loop(integrator, nthread):
     nsim, steps = 8, 60
     resistances = np.linspace(0.8, 2.0, nsim)
     actuators = [LOOP.replaced({"motor.resistance": value}) for value in resistances]
-    models = [behind_plugin(arm(integrator), {"one": one, "two": ACTUATORS["lag"]}) for one in actuators]
+    models = [
+        behind_plugin(arm(integrator), {"one": one, "two": ACTUATORS["lag"]}) for one in actuators
+    ]
     inputs = [controls(steps, 2, seed) for seed in range(nsim)]
     batch = Batch(models[0], nsim=nsim, nthread=nthread)
     batch.expand("actuator_user")[:] = [model.actuator_user for model in models]

@@ -7,9 +7,18 @@ import pytest
 import codrl_mj
 from tests.matrix import but
 from tests.motorised import models
-from tests.motorised.models import GYMNASIUM, INTEGRATORS, MENAGERIE, SUITE, own_controls, trajectory
+from tests.motorised.models import (
+    GYMNASIUM,
+    INTEGRATORS,
+    MENAGERIE,
+    SUITE,
+    own_controls,
+    trajectory,
+)
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # deprecated attributes in other people's models
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::UserWarning"
+)  # deprecated attributes in other people's models
 
 
 def behind(spec):
@@ -29,11 +38,17 @@ def _check(path, integrator, steps):
 
 
 ROBOTS = [*GYMNASIUM, *SUITE, *MENAGERIE]
-SOME = [path for path in GYMNASIUM if path.stem in ("half_cheetah", "pusher_v5", "inverted_double_pendulum")]
+SOME = [
+    path
+    for path in GYMNASIUM
+    if path.stem in ("half_cheetah", "pusher_v5", "inverted_double_pendulum")
+]
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("path", but(SOME, ROBOTS), ids=lambda path: f"{path.parent.name}-{path.stem}")
+@pytest.mark.parametrize(
+    "path", but(SOME, ROBOTS), ids=lambda path: f"{path.parent.name}-{path.stem}"
+)
 def test_every_robot_is_as_before(path, integrator):
     _check(path, integrator, 100 if path in SOME else 1000)
 
@@ -62,16 +77,28 @@ KINDS = {
     "force limit": '<motor joint="b" gear="2" forcerange="-0.3 0.2" forcelimited="true"/>',
     "position": '<position joint="a" kp="20" kv="1.5" inheritrange="0.9"/>',
     "position, filtered": '<position joint="c" kp="20" dampratio="1" timeconst="0.05"/>',
-    "position, force limit": '<position joint="c" kp="20" kv="1" forcerange="-3 2" forcelimited="true"/>',
+    "position, force limit": (
+        '<position joint="c" kp="20" kv="1" forcerange="-3 2" forcelimited="true"/>'
+    ),
     "velocity": '<velocity joint="a" kv="2" gear="0.5"/>',
     "intvelocity": '<intvelocity joint="c" kp="15" kv="1" actrange="-0.3 0.2"/>',
     "damper": '<damper joint="b" kv="4" ctrlrange="0 1"/>',
     "cylinder": '<cylinder joint="b" timeconst="0.1" area="2" bias="0.1 -0.2 -0.3"/>',
-    "affine gain": '<general joint="a" gaintype="affine" gainprm="2 .3 -.1" biastype="affine" biasprm=".2 -1 -.4"/>',
-    "fixed gain, more numbers": '<general joint="a" gaintype="fixed" gainprm="2 9 9" biastype="none" biasprm="1 1 1"/>',
-    "early integrator": '<general joint="b" dyntype="integrator" actearly="true" actrange="-.2 .1" actlimited="true"/>',
+    "affine gain": (
+        '<general joint="a" gaintype="affine" gainprm="2 .3 -.1" biastype="affine" biasprm=".2 -1'
+        ' -.4"/>'
+    ),
+    "fixed gain, more numbers": (
+        '<general joint="a" gaintype="fixed" gainprm="2 9 9" biastype="none" biasprm="1 1 1"/>'
+    ),
+    "early integrator": (
+        '<general joint="b" dyntype="integrator" actearly="true" actrange="-.2 .1"'
+        ' actlimited="true"/>'
+    ),
     "early filter": '<general joint="b" dyntype="filter" dynprm="0.03" actearly="true"/>',
-    "early exact filter": '<general joint="b" dyntype="filterexact" dynprm="0.03" actearly="true" gainprm="3"/>',
+    "early exact filter": (
+        '<general joint="b" dyntype="filterexact" dynprm="0.03" actearly="true" gainprm="3"/>'
+    ),
     "tendon": '<position tendon="t" kp="9" kv="0.3"/>',
     "parent": '<motor jointinparent="b" gear="2"/>',
     "site": '<motor site="s" gear="0 0 1 0 0.2 0"/>',
@@ -81,7 +108,9 @@ KINDS = {
 
 
 def everything(kind, integrator="Euler"):
-    return mujoco.MjSpec.from_string(_EVERYTHING.format(actuator=KINDS[kind], integrator=integrator))
+    return mujoco.MjSpec.from_string(
+        _EVERYTHING.format(actuator=KINDS[kind], integrator=integrator)
+    )
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)

@@ -28,7 +28,11 @@ OWN = 'damping="0.55" armature="0.03" frictionloss="0.05"'
 RATIO, VOLTS, OHMS, CONSTANT = 100.0, 12.0, 2.0, 0.02
 MOTOR = Drive(
     GearMotor(
-        resistance=OHMS, torque_constant=CONSTANT, back_emf_constant=CONSTANT, rotor_inertia=1e-6, gear_ratio=RATIO
+        resistance=OHMS,
+        torque_constant=CONSTANT,
+        back_emf_constant=CONSTANT,
+        rotor_inertia=1e-6,
+        gear_ratio=RATIO,
     ),
     SampledLoop(10e3, max_current=math.inf),
     Supply(VOLTS),
@@ -60,7 +64,9 @@ def test_kept_losses_brake_a_joint_and_replaced_ones_do_not(saved):
     for how in ("keep", "replace"):
         spec = codrl_mj.motorise(_arm(), {"shoulder": MOTOR}, joint_dynamics=how)
         found[how] = mujoco.MjModel.from_xml_string(spec.to_xml()) if saved else spec.compile()
-    assert _top_speed(found["keep"]) == pytest.approx((STALL - 0.05) / (STALL / FREE + 0.55), rel=1e-3)
+    assert _top_speed(found["keep"]) == pytest.approx(
+        (STALL - 0.05) / (STALL / FREE + 0.55), rel=1e-3
+    )
     assert found["replace"].dof_damping[0] == 0.0
     assert found["replace"].dof_armature[0] == 0.0
     # friction is no loss that this motor brings, and stays
@@ -78,7 +84,10 @@ def test_the_warning_names_joint_numbers_and_remedy_once_and_at_the_caller():
     text = str(warned.message)
     # kT*kE/R through the motor's gear and the model's; the rotor through both
     braking, rotor = 4 * RATIO**2 * CONSTANT**2 / OHMS, 4 * RATIO**2 * 1e-6
-    assert f"joint shoulder has armature 0.03 (the motor's is {rotor:.3g}), damping 0.55 (the motor's is" in text
+    assert (
+        f"joint shoulder has armature 0.03 (the motor's is {rotor:.3g}), damping 0.55 (the"
+        " motor's is" in text
+    )
     assert f"{braking:.3g})" in text
     assert "joint_dynamics='replace'" in text
     assert "--env.joint-dynamics" in text
@@ -89,7 +98,11 @@ QUIET = [
     (OWN, MOTOR, "replace"),
     (OWN, "ideal", None),
     (OWN, "lag", None),
-    ('armature="0.03" frictionloss="0.05"', TorqueSpeed(), None),  # it brings neither rotor nor friction
+    (
+        'armature="0.03" frictionloss="0.05"',
+        TorqueSpeed(),
+        None,
+    ),  # it brings neither rotor nor friction
     ('damping="0.001"', TorqueSpeed(stall_torque=1.0, no_load_speed=10.0), None),  # a bearing's
 ]
 
@@ -113,7 +126,8 @@ def test_actuators_and_tendons_have_them_too():
 <tendon><fixed name="rope" damping="2" armature="0.5"><joint joint="j" coef="1"/></fixed></tendon>
 <actuator><motor name="pull" tendon="rope" armature="0.25" damping="3"/></actuator></mujoco>""")
     with pytest.warns(
-        MotorWarning, match=r"actuator pull has armature 0\.25.*damping 3.*tendon rope has armature 0\.5"
+        MotorWarning,
+        match=r"actuator pull has armature 0\.25.*damping 3.*tendon rope has armature 0\.5",
     ):
         codrl_mj.motorise(spec, {"rope": MOTOR})
     model = codrl_mj.motorise(spec, {"rope": MOTOR}, joint_dynamics="replace").compile()
@@ -129,13 +143,18 @@ def test_a_certificate_says_what_it_cannot_see():
         return [one.reason for one in skipped if one.name == "whether a motor is counted twice"]
 
     (reason,) = reasons(OWN)
-    assert "joint shoulder has armature 0.03 (the motor's is 0.01), damping 0.55 (the motor's is 2)" in reason
+    assert (
+        "joint shoulder has armature 0.03 (the motor's is 0.01), damping 0.55 (the motor's is 2)"
+        in reason
+    )
     assert reasons('damping="0"') == []
 
 
 def test_environments_keep_or_replace_and_so_do_their_configurations():
     arguments = {".*": MOTOR.replaced({"motor.gear_ratio": 1.0, "motor.rotor_inertia": 1e-4})}
-    config = codrl_mj.EnvConfig("InvertedPendulum-v5", arguments, joint_dynamics="replace", allow_unstable=True)
+    config = codrl_mj.EnvConfig(
+        "InvertedPendulum-v5", arguments, joint_dynamics="replace", allow_unstable=True
+    )
     again = codrl_mj.EnvConfig.from_mapping(config.as_mapping())
     assert again == config
     with pytest.warns(MotorWarning, match=r"joint slider has .*damping 1 \(") as caught:
@@ -173,17 +192,21 @@ def test_values_that_it_cannot_have_are_refused(task, value, message):
 
 def _legs(count, gravcomp=False):
     bodies = "".join(
-        f'<body pos="0 {n} 0" gravcomp="{int(gravcomp)}"><joint name="j{n}" axis="0 1 0" actuatorgravcomp="true"/>'
-        '<geom size=".1" mass="1" pos=".2 0 0"/></body>'
+        f'<body pos="0 {n} 0" gravcomp="{int(gravcomp)}"><joint name="j{n}" axis="0 1 0"'
+        ' actuatorgravcomp="true"/><geom size=".1" mass="1" pos=".2 0 0"/></body>'
         for n in range(count)
     )
     motors = "".join(f'<motor name="m{n}" joint="j{n}"/>' for n in range(count))
-    return mujoco.MjSpec.from_string(f"<mujoco><worldbody>{bodies}</worldbody><actuator>{motors}</actuator></mujoco>")
+    return mujoco.MjSpec.from_string(
+        f"<mujoco><worldbody>{bodies}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
 
 
 def test_several_supplies_that_sag_are_said_to_be_several():
     weak = MOTOR.replaced({"supply.resistance": 0.5})
-    with pytest.warns(MotorWarning, match=r"supply\.resistance: each of the motors m0, m1 has a supply of its own"):
+    with pytest.warns(
+        MotorWarning, match=r"supply\.resistance: each of the motors m0, m1 has a supply of its own"
+    ):
         codrl_mj.motorise(_legs(3), {"m[01]": weak, "m2": MOTOR})
     with warnings.catch_warnings():
         warnings.simplefilter("error", MotorWarning)
@@ -192,7 +215,8 @@ def test_several_supplies_that_sag_are_said_to_be_several():
 
 def test_gravity_compensation_goes_past_a_motor():
     with pytest.warns(
-        MotorWarning, match="joint j0: actuatorgravcomp: its gravity compensation passes through no motor"
+        MotorWarning,
+        match="joint j0: actuatorgravcomp: its gravity compensation passes through no motor",
     ):
         model = codrl_mj.motorise(_legs(1, gravcomp=True), {"m0": "lag"}).compile()
     data = mujoco.MjData(model)

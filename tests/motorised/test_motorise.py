@@ -58,7 +58,9 @@ def test_patterns_match_names_or_what_is_driven_from_beginning_to_end():
     ],
 )
 def test_actuators_are_given_as_everywhere(given, expected):
-    assert codrl_mj.engine.motors(codrl_mj.motorise(arm(), {"one": given}).compile()) == {0: expected}
+    assert codrl_mj.engine.motors(codrl_mj.motorise(arm(), {"one": given}).compile()) == {
+        0: expected
+    }
 
 
 def test_the_given_spec_is_not_changed_and_what_is_unstable_allowed_on_request():
@@ -87,7 +89,10 @@ IMPOSSIBLE = [  # an actuator, and why it cannot be motorised
 STEEP = Actuator(controller=CurrentLoop(kp=500.0))
 RUBBING = Drive(GearMotor(coulomb_friction=1e-3))
 TWICE = "'.*' matches both actuator kp of hip_left and actuator kv of hip_left: each"
-PAIR = ('<position name="kp" joint="hip_left" kp="5"/>', '<velocity name="kv" joint="hip_left" kv="0.5"/>')
+PAIR = (
+    '<position name="kp" joint="hip_left" kp="5"/>',
+    '<velocity name="kv" joint="hip_left" kv="0.5"/>',
+)
 SITE = '<general name="push" site="here" gear="1 0 0 0 0 0"/>'
 
 
@@ -100,14 +105,26 @@ SITE = '<general name="push" site="here" gear="1 0 0 0 0 0"/>'
         ),
         ((SITE,), {"push": RUBBING}, "it drives neither a joint nor a tendon, which the friction"),
         (THREE, {"hip": "lag"}, "'hip': no actuator has such a name, nor drives anything that has"),
-        (THREE, {"hip_rihgt": "lag"}, r"did you mean 'hip_right'\? there are left, hip_left, hip_right, "),
+        (
+            THREE,
+            {"hip_rihgt": "lag"},
+            r"did you mean 'hip_right'\? there are left, hip_left, hip_right, ",
+        ),
         ((), {".*": "lag"}, "the model has no actuators.*mechanicalReduction.*Add one per joint"),
-        (THREE, {"left": "lag", "hip_.*": "ideal"}, r"actuator left of hip_left: both 'left' and 'hip_.*' match it"),
+        (
+            THREE,
+            {"left": "lag", "hip_.*": "ideal"},
+            r"actuator left of hip_left: both 'left' and 'hip_.*' match it",
+        ),
         (PAIR, {".*": "lag"}, re.escape(TWICE)),
         (THREE, {"*": "lag"}, r"'\*': must be a regular expression \(nothing to repeat"),
         (THREE, {3: "lag"}, "3: must be a regular expression"),
         (THREE, [".*"], r"actuators = \['\.\*'\]: must be a mapping of patterns"),
-        (THREE, {"left": STEEP}, r"'left': actuator: the current loop is unstable at a step of 0.01 s"),
+        (
+            THREE,
+            {"left": STEEP},
+            r"'left': actuator: the current loop is unstable at a step of 0.01 s",
+        ),
     ],
 )
 def test_what_cannot_be_motorised_is_refused_with_the_reason(actuators, patterns, message):
@@ -123,7 +140,8 @@ def test_what_cannot_be_simulated_is_not_allowed_with_what_is_unstable():
 def test_plugins_and_motors_of_ours_are_not_motorised_again():
     once = codrl_mj.motorise(arm(), {"one": "lag"})
     with pytest.raises(
-        ValueError, match=r"actuator one of upper: cannot be motorised: it is a plugin, codrl_mj\.actuator"
+        ValueError,
+        match=r"actuator one of upper: cannot be motorised: it is a plugin, codrl_mj\.actuator",
     ):
         codrl_mj.motorise(once, {"one": "ideal"})
     twice = codrl_mj.motorise(once, {"two": "ideal"}).compile()
@@ -139,7 +157,11 @@ def test_the_limit_of_a_tendon_is_not_applied_to_plugins():
             spec.activate_plugin("mujoco.pid")
             spec.add_plugin(name="p", plugin_name="mujoco.pid").config = {"kp": "9"}
             target = spec.actuators[0]
-            target.plugin.plugin_name, target.plugin.name, target.plugin.active = "mujoco.pid", "p", True
+            target.plugin.plugin_name, target.plugin.name, target.plugin.active = (
+                "mujoco.pid",
+                "p",
+                True,
+            )
         model = spec.compile()
         data = mujoco.MjData(model)
         data.ctrl[:] = 5.0
@@ -149,7 +171,10 @@ def test_the_limit_of_a_tendon_is_not_applied_to_plugins():
 
 
 def test_several_actuators_of_one_joint_are_several_motors_if_one_says_so():
-    plain, ours = _spec(*PAIR).compile(), codrl_mj.motorise(_spec(*PAIR), {"kp": "ideal", "kv": "ideal"}).compile()
+    plain, ours = (
+        _spec(*PAIR).compile(),
+        codrl_mj.motorise(_spec(*PAIR), {"kp": "ideal", "kv": "ideal"}).compile(),
+    )
     inputs = controls(100, 2)
     np.testing.assert_array_equal(trajectory(ours, inputs), trajectory(plain, inputs))
 
@@ -157,10 +182,14 @@ def test_several_actuators_of_one_joint_are_several_motors_if_one_says_so():
 def test_two_motors_of_one_joint_are_together_one_twice_as_strong():
     """A lag is linear, and halves and doubles are exact."""
     lag = Lag(time_constant=0.05)
-    two = _spec('<motor name="a" joint="hip_left" gear="2"/>', '<motor name="b" joint="hip_left" gear="2"/>')
+    two = _spec(
+        '<motor name="a" joint="hip_left" gear="2"/>', '<motor name="b" joint="hip_left" gear="2"/>'
+    )
     one = _spec('<motor name="a" joint="hip_left" gear="4"/>')
     inputs = controls(100, 1)
-    together = trajectory(codrl_mj.motorise(two, {"a": lag, "b": lag}).compile(), np.tile(inputs, 2))
+    together = trajectory(
+        codrl_mj.motorise(two, {"a": lag, "b": lag}).compile(), np.tile(inputs, 2)
+    )
     alone = trajectory(codrl_mj.motorise(one, {"a": lag}).compile(), inputs)
     count = one.compile().nq + one.compile().nv
     np.testing.assert_array_equal(together[:, :count], alone[:, :count])
@@ -184,13 +213,17 @@ def test_inertia_and_friction_are_added_to_the_joint_through_the_gear(integrator
     added = codrl_mj.motorise(spec(), {"one": Worn(rotor=0.004)}, joint_dynamics="keep")
     expected = codrl_mj.motorise(by_hand, {"one": Worn()})
     inputs = controls(200, 2)
-    np.testing.assert_allclose(trajectory(added.compile(), inputs), trajectory(expected.compile(), inputs), atol=1e-11)
+    np.testing.assert_allclose(
+        trajectory(added.compile(), inputs), trajectory(expected.compile(), inputs), atol=1e-11
+    )
     plain = trajectory(codrl_mj.motorise(spec(), {"one": Worn()}).compile(), inputs)
     assert not np.allclose(trajectory(added.compile(), inputs), plain, atol=1e-3)
 
 
 def test_friction_goes_to_a_tendon_that_is_driven():
-    model = codrl_mj.motorise(_spec('<motor name="m" tendon="rope" gear="-2"/>'), {"m": Worn(rotor=0.1)}).compile()
+    model = codrl_mj.motorise(
+        _spec('<motor name="m" tendon="rope" gear="-2"/>'), {"m": Worn(rotor=0.1)}
+    ).compile()
     assert model.tendon_frictionloss[0] == pytest.approx(2 * 3 * 0.1)
     assert model.actuator_armature[0] == 0.1
 
@@ -225,13 +258,21 @@ PULLEY = '<geom geom="pulley" sidesite="side"/>'
 
 def test_a_rotor_has_no_place_on_a_tendon_around_a_geom():
     around, straight = (mujoco.MjSpec.from_string(CABLE.format(via)) for via in (PULLEY, ""))
-    message = "actuator flexor of rope: cannot be motorised: its tendon wraps around geom pulley, where MuJoCo has no"
+    message = (
+        "actuator flexor of rope: cannot be motorised: its tendon wraps around geom pulley, where"
+        " MuJoCo has no"
+    )
     with pytest.raises(ValueError, match=message):
         codrl_mj.motorise(around, {"flexor": Worn(rotor=0.1)})
     codrl_mj.motorise(around, {"flexor": Worn()}).compile()
-    assert codrl_mj.motorise(straight, {"flexor": Worn(rotor=0.1)}).compile().actuator_armature[0] == 0.1
+    assert (
+        codrl_mj.motorise(straight, {"flexor": Worn(rotor=0.1)}).compile().actuator_armature[0]
+        == 0.1
+    )
     around.actuators[0].armature = 0.1
-    with pytest.raises(ValueError, match="geom wrapping"):  # why: MuJoCo says this of any armature there
+    with pytest.raises(
+        ValueError, match="geom wrapping"
+    ):  # why: MuJoCo says this of any armature there
         around.compile()
 
 
@@ -243,7 +284,11 @@ velocity="3"/></joint></robot>"""
     spec = mujoco.MjSpec.from_string(urdf)
     with pytest.raises(ValueError, match="'shoulder': the model has no actuators") as refused:
         codrl_mj.motorise(spec, {"shoulder": "lag"})
-    remedy = re.search(r"spec\.add_actuator\(.*\)", str(refused.value)).group().replace("'JOINT'", "'shoulder'")
+    remedy = (
+        re.search(r"spec\.add_actuator\(.*\)", str(refused.value))
+        .group()
+        .replace("'JOINT'", "'shoulder'")
+    )
     eval(remedy, {"spec": spec, "mujoco": mujoco})
     model = codrl_mj.motorise(spec, {"shoulder": "ideal"}).compile()
     data = mujoco.MjData(model)
@@ -257,7 +302,9 @@ def test_a_servo_reads_a_control_as_the_model_means_it(kind, controls):
     """Else 0.5 rad/s would be taken for 0.5 rad, or the other way round."""
     spec = _spec(f'<{kind} name="it" joint="hip_left"/>')
     servo = {"family": "servo", "controller": {"sample_rate": 10e3}, "loop": {"controls": controls}}
-    with pytest.raises(ValueError, match=f"its control is a {kind}, and its motor is asked for a {controls}"):
+    with pytest.raises(
+        ValueError, match=f"its control is a {kind}, and its motor is asked for a {controls}"
+    ):
         codrl_mj.motorise(spec, {"it": servo}, allow_unstable=True)
     servo["loop"]["controls"] = kind
     codrl_mj.motorise(spec, {"it": servo}, allow_unstable=True)

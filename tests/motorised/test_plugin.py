@@ -29,15 +29,19 @@ def test_there_is_one_plugin_of_ours_and_it_stays_where_it_is():
 def test_importing_registers_and_compiles_nothing_and_a_second_copy_is_refused():
     """MuJoCo itself would end the process."""
     code = (
-        "import sys, codrl_mj; from codrl_mj import plugin; assert 'numba' not in sys.modules\n"
-        "print(list(plugin.registered())[-1])\n"
-        "for name in [name for name in sys.modules if name.startswith('codrl_mj')]: del sys.modules[name]\n"
-        "import codrl_mj"
+        "import sys, codrl_mj; from codrl_mj import plugin; assert 'numba' not in"
+        " sys.modules\nprint(list(plugin.registered())[-1])\nfor name in [name for name in"
+        " sys.modules if name.startswith('codrl_mj')]: del sys.modules[name]\nimport codrl_mj"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
     assert result.stdout.strip() == "codrl_mj.actuator"
     assert result.returncode == 1
-    assert "RuntimeError: MuJoCo has a plugin codrl_mj.actuator already: another copy of codrl_mj" in result.stderr
+    assert (
+        "RuntimeError: MuJoCo has a plugin codrl_mj.actuator already: another copy of codrl_mj"
+        in result.stderr
+    )
 
 
 @pytest.mark.parametrize(
@@ -70,7 +74,9 @@ def test_a_family_defined_anew_takes_the_place_of_the_one_before_if_models_can_g
         def advance(parameters, timestep, state, inputs):
             return state, factor * inputs.desired_torque, shown
 
-        return type("Anew", (Worn,), {"__module__": __name__, "advance": staticmethod(advance), **more})
+        return type(
+            "Anew", (Worn,), {"__module__": __name__, "advance": staticmethod(advance), **more}
+        )
 
     spec, forces = arm(), []
     for factor in (2.0, 3.0):
@@ -82,6 +88,7 @@ def test_a_family_defined_anew_takes_the_place_of_the_one_before_if_models_can_g
         forces.append(data.actuator_force[0])
     assert forces == [1.0, 1.5]
     with pytest.raises(
-        ValueError, match=r"Anew has .* states, signals and parameters, and .* when it was loaded before"
+        ValueError,
+        match=r"Anew has .* states, signals and parameters, and .* when it was loaded before",
     ):
         load_family(family(2.0, Signals=Nothing))

@@ -31,7 +31,10 @@ def test_motors_of_both_doors_are_found_and_of_none_nothing():
     plain = arm().compile()
     assert codrl_mj.engine.motors(plain) == {}
     found = codrl_mj.signals(plain, mujoco.MjData(plain))
-    assert {name: values.shape for name, values in found.items()} == {"desired_force": (0,), "actual_force": (0,)}
+    assert {name: values.shape for name, values in found.items()} == {
+        "desired_force": (0,),
+        "actual_force": (0,),
+    }
 
 
 def test_signals_of_both_doors_are_read():
@@ -48,7 +51,9 @@ def test_signals_of_both_doors_are_read():
     ]
     np.testing.assert_allclose(found["desired_force"], [0.15 * gear, 0.5], rtol=1e-15)
     kt = LOOP.motor.torque_constant
-    np.testing.assert_allclose(found["actual_force"], [kt * found["current"][0] * gear, 0.3], rtol=1e-15)
+    np.testing.assert_allclose(
+        found["actual_force"], [kt * found["current"][0] * gear, 0.3], rtol=1e-15
+    )
     np.testing.assert_allclose(found["reference_current"], [0.15 / kt, np.nan])
     np.testing.assert_array_equal(found["saturated"], [0.0, 1.0])
     np.testing.assert_array_equal(found["upper_limit"], [np.nan, 0.3])
@@ -64,7 +69,10 @@ def test_controls_beyond_their_range_are_what_the_model_makes_of_them():
         model.actuator_ctrllimited[:], model.actuator_ctrlrange[:] = True, (-0.4, 0.5)
         data, readout = mujoco.MjData(model), codrl_mj.engine.Readout(model)
         data.ctrl[:] = 0.9, -0.7
-        for flags, expected in ((0, [0.5, -0.4]), (mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL, [0.9, -0.7])):
+        for flags, expected in (
+            (0, [0.5, -0.4]),
+            (mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL, [0.9, -0.7]),
+        ):
             model.opt.disableflags = flags
             mujoco.mj_step(model, data)
             found = readout(data)
@@ -87,7 +95,9 @@ def test_desired_and_actual_force_are_before_the_models_own_gear():
 
 
 @pytest.mark.parametrize("key", [-1, 1.5, 2**53, np.nan, np.inf, "7", None])
-def test_clearing_motors_at_both_doors_brings_them_to_rest_and_a_key_that_is_none_changes_nothing(key):
+def test_clearing_motors_at_both_doors_brings_them_to_rest_and_a_key_that_is_none_changes_nothing(
+    key,
+):
     model = _mixed()
     data = mujoco.MjData(model)
     codrl_mj.engine.clear_motors(data, np.array([2**53 - 1, 8]))

@@ -31,7 +31,9 @@ from tests.motorised.models import (
     trajectory,
 )
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # deprecated attributes in other people's models
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::UserWarning"
+)  # deprecated attributes in other people's models
 
 TWO = {"one": NOISY, "two": Worn()}
 
@@ -89,12 +91,16 @@ HUMANOID = [(path, "implicitfast") for path in GYMNASIUM if path.stem == "humano
 ROBOTS = [*itertools.product([*GYMNASIUM, *SUITE], INTEGRATORS)]
 
 
-@pytest.mark.parametrize(("path", "integrator"), but(HUMANOID, ROBOTS), ids=lambda one: getattr(one, "stem", one))
+@pytest.mark.parametrize(
+    ("path", "integrator"), but(HUMANOID, ROBOTS), ids=lambda one: getattr(one, "stem", one)
+)
 def test_robots_saved_and_loaded_are_as_before(path, integrator):
     """Ideal actuators saved and loaded are what the model without them is, saved and loaded."""
     spec = mujoco.MjSpec.from_file(str(path))
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-    spec.meshdir, spec.texturedir = (str(path.parent / folder) for folder in (spec.meshdir, spec.texturedir))
+    spec.meshdir, spec.texturedir = (
+        str(path.parent / folder) for folder in (spec.meshdir, spec.texturedir)
+    )
     spec.compile()
     plain = mujoco.MjModel.from_xml_string(spec.to_xml())
     ours = mujoco.MjModel.from_xml_string(codrl_mj.motorise(spec, {".*": "ideal"}).to_xml())
@@ -134,13 +140,20 @@ def test_another_process_has_the_same_motors_and_imports_no_code_because_a_model
     (tmp_path / "model.xml").write_text(ours.to_xml())
     (tmp_path / "somebody.xml").write_text(somebodys.to_xml())
     mujoco.mj_saveModel(ours.compile(), str(tmp_path / "model.mjb"), None)
-    options = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}, "timeout": 300}
+    options = {
+        "cwd": tmp_path,
+        "env": {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+        "timeout": 300,
+    }
     command = [sys.executable, "-c", _ANOTHER_PROCESS]
     result = subprocess.run(command, **options, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     without, refused, *found = result.stdout.splitlines()
     assert "plugin codrl_mj.actuator not found" in without
-    assert "its family 'tests.motorised.models:Worn' is not loaded, and is not imported because a model" in refused
+    assert (
+        "its family 'tests.motorised.models:Worn' is not loaded, and is not imported because a"
+        " model" in refused
+    )
     expected = []
     for model in (ours.compile(), ours.compile(), somebodys.compile()):
         data = mujoco.MjData(model)
@@ -160,10 +173,14 @@ def test_another_process_has_the_same_motors_and_imports_no_code_because_a_model
 )
 def test_what_does_not_agree_is_refused_when_it_is_loaded(old, new, reason):
     text = codrl_mj.motorise(arm(), {"one": Lag(time_constant=0.3, delay=0.007)}).to_xml()
-    text = re.sub(r'<size nuser_actuator="\d+"/>', "", text)  # so that it is as long as it has to be
+    text = re.sub(
+        r'<size nuser_actuator="\d+"/>', "", text
+    )  # so that it is as long as it has to be
     mujoco.MjModel.from_xml_string(text)
     assert old in text
-    with pytest.raises(ValueError, match=f"plugin->init failed(.|\n)*{NAME}: plugin instance 0: .*{reason}"):
+    with pytest.raises(
+        ValueError, match=f"plugin->init failed(.|\n)*{NAME}: plugin instance 0: .*{reason}"
+    ):
         mujoco.MjModel.from_xml_string(text.replace(old, new))
 
 
@@ -179,7 +196,9 @@ def set_user(entry, value):
 
 
 def register_anew(model):
-    model.plugin[:] = 0  # as in an .mjb file from a process where plugins were registered in another order
+    model.plugin[:] = (
+        0  # as in an .mjb file from a process where plugins were registered in another order
+    )
 
 
 @pytest.mark.parametrize(

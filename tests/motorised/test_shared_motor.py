@@ -28,11 +28,18 @@ _LEG = """
 </mujoco>
 """
 KP, KV = 50.0, 2.0
-PAIR = '<position name="hip_p" joint="hip" kp="50" {}/><velocity name="hip_v" joint="hip" kv="2" {}/>'
+PAIR = (
+    '<position name="hip_p" joint="hip" kp="50" {}/><velocity name="hip_v" joint="hip" kv="2" {}/>'
+)
 SUM = '<general name="hip" joint="hip" gainprm="1" biastype="affine" biasprm="0 -50 -2"/>'
 KNEE = '<motor name="knee" joint="knee"/>'
 MAXON = {"name": "maxon-ec45-flat-50w", "motor": {"gear_ratio": 100.0}}
-MOTORS = {"drive": MAXON, "lag": Lag(time_constant=0.01), "torque_speed": TorqueSpeed(8.0, 5.0, 6.0), "ideal": "ideal"}
+MOTORS = {
+    "drive": MAXON,
+    "lag": Lag(time_constant=0.01),
+    "torque_speed": TorqueSpeed(8.0, 5.0, 6.0),
+    "ideal": "ideal",
+}
 TOGETHER = ("hip_p", "hip_v")
 
 
@@ -86,11 +93,18 @@ def test_what_is_asked_is_the_closed_form():
 def test_ideally_it_is_the_plain_pair():
     targets = _targets()
     ours = codrl_mj.motorise(_pair(), {TOGETHER: "ideal"}).compile()
-    np.testing.assert_allclose(_run(ours, targets), _run(_pair().compile(), targets), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        _run(ours, targets), _run(_pair().compile(), targets), rtol=0, atol=1e-11
+    )
 
 
 def test_each_joint_gets_one():
-    spec = _pair(also='<position name="knee_p" joint="knee" kp="9"/><velocity name="knee_v" joint="knee" kv="1"/>')
+    spec = _pair(
+        also=(
+            '<position name="knee_p" joint="knee" kp="9"/><velocity name="knee_v" joint="knee"'
+            ' kv="1"/>'
+        )
+    )
     model = codrl_mj.motorise(spec, {".*_p & .*_v": "lag"}).compile()
     assert motors(model) == {0: Lag(), 2: Lag()}
     assert model.nu == 4
@@ -100,7 +114,11 @@ def test_saved_copied_and_attached_models_keep_it():
     targets, lag = _targets(), {"hip_p & hip_v": Lag(time_constant=0.01)}
     spec = codrl_mj.motorise(_pair(), lag)
     expected = _run(spec.compile(), targets)
-    for model in (mujoco.MjModel.from_xml_string(spec.to_xml()), copy.deepcopy(spec.compile()), spec.copy().compile()):
+    for model in (
+        mujoco.MjModel.from_xml_string(spec.to_xml()),
+        copy.deepcopy(spec.compile()),
+        spec.copy().compile(),
+    ):
         np.testing.assert_array_equal(_run(model, targets), expected)
     scene = mujoco.MjSpec()
     scene.option.timestep = 0.002
@@ -113,7 +131,9 @@ def test_saved_copied_and_attached_models_keep_it():
 
 
 def test_the_certificate_passes_it_and_leaves_nothing_out():
-    certificate = validate_model(codrl_mj.motorise(_pair(), {TOGETHER: "lag"}).compile(), quick=True)
+    certificate = validate_model(
+        codrl_mj.motorise(_pair(), {TOGETHER: "lag"}).compile(), quick=True
+    )
     assert certificate.passed
     assert not [one for one in certificate.skipped if "not motors" in one.reason]
 
@@ -132,7 +152,12 @@ REFUSED = [
     ((), TOGETHER, Servo(), "a Servo is asked for one motion"),
     (('gear="2"', ""), TOGETHER, "lag", "whose gear differs"),
     (('group="2"', ""), TOGETHER, "lag", "whose group differs"),
-    (('forcelimited="true" forcerange="-3 3"',) * 2, TOGETHER, "lag", "limit the joint, actuatorfrcrange"),
+    (
+        ('forcelimited="true" forcerange="-3 3"',) * 2,
+        TOGETHER,
+        "lag",
+        "limit the joint, actuatorfrcrange",
+    ),
     ((), ("hip_p", "knee"), "lag", "'hip_p & knee' matches actuator hip_p of hip alone"),
     ((), ("hip_p", "hip_w"), "lag", "'hip_w': no actuator has such a name"),
     ((), ".*", "lag", r"For one motor behind all of them write 'hip_p & hip_v'"),
@@ -147,7 +172,10 @@ def test_what_cannot_be_one_motor_is_refused(attributes, pattern, actuator, mess
 
 
 def test_an_actuator_beside_a_motor_is_said_to_go_past_it():
-    with pytest.warns(MotorWarning, match="actuator hip_v drives the joint of hip_p past its motor: 'hip_p & hip_v'"):
+    with pytest.warns(
+        MotorWarning,
+        match="actuator hip_v drives the joint of hip_p past its motor: 'hip_p & hip_v'",
+    ):
         codrl_mj.motorise(_pair(), {"hip_p": "lag"})
 
 
@@ -164,7 +192,9 @@ class Leg(gymnasium.Env):
 
     def __init__(self, knee=KNEE):
         """Build the model."""
-        self.model = mujoco.MjModel.from_xml_string(_LEG.format("Euler", PAIR.format("", "") + knee))
+        self.model = mujoco.MjModel.from_xml_string(
+            _LEG.format("Euler", PAIR.format("", "") + knee)
+        )
         self.data, self.dt = mujoco.MjData(self.model), 0.02
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,))
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
@@ -199,10 +229,15 @@ def test_an_environment_has_one_motor_for_it():
 
 
 def test_an_evaluation_that_changes_others_leaves_it_whole(monkeypatch):
-    monkeypatch.setitem(gymnasium.registry, "Leg-v0", gymnasium.envs.registration.EnvSpec("Leg-v0", Leg))
+    monkeypatch.setitem(
+        gymnasium.registry, "Leg-v0", gymnasium.envs.registration.EnvSpec("Leg-v0", Leg)
+    )
     config = codrl_mj.EnvConfig("Leg-v0", ACTUATORS, max_episode_steps=10)
     lag = Lag(time_constant=0.01)
-    assert config.world.overlaid(config, {"knee": "ideal"}) == {"hip_p & hip_v": lag, "knee": "ideal"}
+    assert config.world.overlaid(config, {"knee": "ideal"}) == {
+        "hip_p & hip_v": lag,
+        "knee": "ideal",
+    }
     assert codrl_mj.EnvConfig.from_mapping(config.as_mapping()) == config
 
 
@@ -235,9 +270,13 @@ def test_a_force_range_that_would_cut_a_voltage_is_refused(limit, fits):
     if fits:
         env = codrl_mj.make(Leg, {"knee": MAXON}, **options)
         env.reset(seed=0)
-        assert env.step(np.array([0, 0, 24.0], dtype=np.float32))[-1]["voltage"] == pytest.approx(24.0)
+        assert env.step(np.array([0, 0, 24.0], dtype=np.float32))[-1]["voltage"] == pytest.approx(
+            24.0
+        )
     else:
-        with pytest.raises(ValueError, match=f"knee: forcerange = {limit:g}: would cut commands of up to 24 V"):
+        with pytest.raises(
+            ValueError, match=f"knee: forcerange = {limit:g}: would cut commands of up to 24 V"
+        ):
             codrl_mj.make(Leg, {"knee": MAXON}, **options)
 
 
@@ -253,7 +292,9 @@ def test_what_was_chosen_for_it_is_for_both():
     class Demand:
         model_gear = 1.0
 
-    assert list(actuators_of({"hip_p & hip_v": (Choice(), Demand()), "a.b": (Choice(), Demand())})) == [
+    assert list(
+        actuators_of({"hip_p & hip_v": (Choice(), Demand()), "a.b": (Choice(), Demand())})
+    ) == [
         "hip_p & hip_v",
         r"a\.b",
     ]

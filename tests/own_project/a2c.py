@@ -25,7 +25,9 @@ class A2CConfig(DeepAgentConfig):
         """See `AgentConfig.make_model`."""
         from stable_baselines3 import A2C
 
-        return A2C("MlpPolicy", env, self.learning_rate, self.rollout_steps, seed=seed, device="cpu")
+        return A2C(
+            "MlpPolicy", env, self.learning_rate, self.rollout_steps, seed=seed, device="cpu"
+        )
 
     def _policy_class(self) -> Any:
         from stable_baselines3.common.policies import ActorCriticPolicy

@@ -32,7 +32,14 @@ def initial_state(draws: Any) -> tuple[Any, ...]:
 
 def observation(state: Any) -> tuple[Any, ...]:
     """Sines, cosines and speeds."""
-    return np.cos(state[0]), np.sin(state[0]), np.cos(state[1]), np.sin(state[1]), 0.1 * state[2], 0.1 * state[3]
+    return (
+        np.cos(state[0]),
+        np.sin(state[0]),
+        np.cos(state[1]),
+        np.sin(state[1]),
+        0.1 * state[2],
+        0.1 * state[3],
+    )
 
 
 def error(state: Any) -> Any:
@@ -74,5 +81,10 @@ TASK = Task(
     reward=reward,
     terminated=terminated,
     motors=("shoulder", "elbow"),
-    attributes={"gravity": GRAVITY, "upper_mass": mass("upper"), "most": Setting.LARGEST_FORCE, "reach": Fixed(0.9)},
+    attributes={
+        "gravity": GRAVITY,
+        "upper_mass": mass("upper"),
+        "most": Setting.LARGEST_FORCE,
+        "reach": Fixed(0.9),
+    },
 )

@@ -24,7 +24,9 @@ class Signals(NamedTuple):
     saturated: float
 
 
-def advance(parameters: Any, timestep: float, state: State, inputs: Inputs) -> tuple[State, float, Signals]:
+def advance(
+    parameters: Any, timestep: float, state: State, inputs: Inputs
+) -> tuple[State, float, Signals]:
     """A spring that is wound towards the desired torque, and a bristle that breaks away at the Coulomb torque."""
     wanted = inputs.desired_torque / parameters.stiffness
     change = (wanted - state.deflection) * (1.0 - math.exp(-timestep / parameters.winding_time))

@@ -13,7 +13,14 @@ class Parsed(HTMLParser):
     def __init__(self, text):
         """Parse at once."""
         super().__init__()
-        self.open, self.fetched, self.ids, self.targets, self.words, self.data = [], [], [], [], [], []
+        self.open, self.fetched, self.ids, self.targets, self.words, self.data = (
+            [],
+            [],
+            [],
+            [],
+            [],
+            [],
+        )
         self.feed(text)
         assert self.open == []
 
@@ -24,7 +31,9 @@ class Parsed(HTMLParser):
             if name == "id":
                 assert value not in self.ids
                 self.ids.append(value)
-            if name in ("src", "href", "xlink:href", "data", "poster") and not value.startswith("data:"):
+            if name in ("src", "href", "xlink:href", "data", "poster") and not value.startswith(
+                "data:"
+            ):
                 (self.targets if value.startswith("#") else self.fetched).append(value)
         assert tag not in ("iframe", "object")
 

@@ -54,11 +54,19 @@ def test_correlations_are_of_the_fitted_parameters_and_files_have_no_traces(foun
 
 def test_the_page_has_fits_statuses_and_advice(found, tmp_path):
     refused = Estimate("coulomb_friction", 0.1, 0.0, 0.9, "refused", "too wide, <b>", {"logs": 0.4})
-    rough = Estimate("viscous_friction", 0.1, 0.0, 0.2, "rough", "its interval is 20 % of all friction")
-    bad = dataclasses.replace(found, estimates=(*found.estimates, refused, rough), warnings=("beware & see",))
+    rough = Estimate(
+        "viscous_friction", 0.1, 0.0, 0.2, "rough", "its interval is 20 % of all friction"
+    )
+    bad = dataclasses.replace(
+        found, estimates=(*found.estimates, refused, rough), warnings=("beware & see",)
+    )
     parsed = check_alone(identification_page(bad, tmp_path / "r.html").read_text())
     titles = [data["title"] for data in parsed.data]
-    traces = ("<one>: current", "two: current, residuals", "two: current, autocorrelation of residuals")
+    traces = (
+        "<one>: current",
+        "two: current, residuals",
+        "two: current, autocorrelation of residuals",
+    )
     assert [title for title in traces if title not in titles] == []
     for said in (
         "✗ not to be used as an actuator",

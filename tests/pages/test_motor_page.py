@@ -28,7 +28,9 @@ def test_what_is_assumed_stands_below_what_it_can_do():
     drive = find_drive("kraken-x60")
     text = str(_abilities(explain(drive), drive, None))
     assert "at 12 V" in text
-    assert "assumed, for none is given: controller.max_current = inf, motor.rotor_inertia = 0." in text
+    assert (
+        "assumed, for none is given: controller.max_current = inf, motor.rotor_inertia = 0." in text
+    )
 
 
 def test_the_diagram_goes_through_stall_and_no_load():
@@ -59,8 +61,14 @@ def test_limits_behind_a_supply_are_where_the_motor_settles():
         actuator = Actuator(motor, CurrentLoop(kp=10.0, max_voltage=most, substeps=20), supply)
         settled = []
         for asked, speed in itertools.product((-1e3, 1e3), speeds):
-            parameters, state, torque = parameters_type(Actuator)(*actuator.numbers), actuator.State(0.0, 0.0, 0.0), 0.0
+            parameters, state, torque = (
+                parameters_type(Actuator)(*actuator.numbers),
+                actuator.State(0.0, 0.0, 0.0),
+                0.0,
+            )
             for _ in range(200):
-                state, torque, _ = actuator.advance(parameters, 1e-3, state, Inputs(asked, 0.0, speed, 0.0, 0.0))
+                state, torque, _ = actuator.advance(
+                    parameters, 1e-3, state, Inputs(asked, 0.0, speed, 0.0, 0.0)
+                )
             settled.append(torque)
         np.testing.assert_allclose(np.ravel(limits(actuator, speeds)), settled, rtol=1e-6)

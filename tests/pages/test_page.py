@@ -20,11 +20,23 @@ def small(*parts, title="t"):
 def test_names_with_markup_show_as_text_everywhere():
     plot = Plot(EVIL, EVIL, EVIL, (Curve(EVIL, np.arange(3.0), np.arange(3.0)),), clock=True)
     parts = [kind(EVIL) for kind in (page.paragraph, page.note, page.heading)]
-    parts += [page.judged(True, EVIL, "p", "verdict"), page.plot(plot), page.definitions([(EVIL, EVIL)])]
-    parts += [page.folded(EVIL, page.paragraph("p")), page.table(EVIL, (EVIL, "b"), [(EVIL, EVIL)], cards=True)]
-    parts += [page.part("selector", EVIL, "run", [EVIL], None), page.part("film", EVIL, b"film", 20.0, None)]
+    parts += [
+        page.judged(True, EVIL, "p", "verdict"),
+        page.plot(plot),
+        page.definitions([(EVIL, EVIL)]),
+    ]
+    parts += [
+        page.folded(EVIL, page.paragraph("p")),
+        page.table(EVIL, (EVIL, "b"), [(EVIL, EVIL)], cards=True),
+    ]
+    parts += [
+        page.part("selector", EVIL, "run", [EVIL], None),
+        page.part("film", EVIL, b"film", 20.0, None),
+    ]
     parts += [page.part("image", b"image", EVIL), page.part("transport", "1", "0.1"), EVIL]
-    text = page.page(EVIL, EVIL, page.paragraph(EVIL), [page.Section("s", EVIL, page.joined(parts), EVIL)])
+    text = page.page(
+        EVIL, EVIL, page.paragraph(EVIL), [page.Section("s", EVIL, page.joined(parts), EVIL)]
+    )
     parsed = check_alone(text)
     assert "<img src=http" not in text
     assert parsed.text.count("<img src=http://there/x onerror='x()'> & \"y\"") > 20
@@ -33,7 +45,8 @@ def test_names_with_markup_show_as_text_everywhere():
 
 def test_a_page_has_what_it_was_given_and_its_licence():
     text = small(
-        page.part("film", "a film", b"bytes of a film", 25.0, b"poster"), page.part("image", b"picture", "about")
+        page.part("film", "a film", b"bytes of a film", 25.0, b"poster"),
+        page.part("image", b"picture", "about"),
     )
     check_alone(text)
     for content in (b"bytes of a film", b"poster", b"picture"):
@@ -49,7 +62,9 @@ def test_a_section_without_a_body_is_left_out():
 
 
 def test_a_plot_is_a_picture_where_no_script_may_run():
-    text = small(page.plot(Plot("t", "x [s]", "y [V]", (Curve("a", np.arange(3.0), np.arange(3.0)),))))
+    text = small(
+        page.plot(Plot("t", "x [s]", "y [V]", (Curve("a", np.arange(3.0), np.arange(3.0)),)))
+    )
     picture = text.partition("<noscript>")[2].partition("</noscript>")[0]
     encoded = picture.partition("base64,")[2].partition('"')[0]
     assert b"<svg" in base64.b64decode(encoded)
@@ -65,10 +80,13 @@ def test_tables_have_captions_and_headings():
 
 
 def test_what_joins_the_clock_stands_as_it_is():
-    part = page.clocked("a replay", "<canvas></canvas>", "function setTime(t) { element.title = t; }")
+    part = page.clocked(
+        "a replay", "<canvas></canvas>", "function setTime(t) { element.title = t; }"
+    )
     assert "<canvas></canvas>" in part
     assert (
-        "codrl.clocked(own, (element, seek) => {\nfunction setTime(t) { element.title = t; }\nreturn setTime;" in part
+        "codrl.clocked(own, (element, seek) => {\nfunction setTime(t) { element.title = t;"
+        " }\nreturn setTime;" in part
     )
     check_alone(small(part))
 

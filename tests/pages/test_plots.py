@@ -7,7 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from codrl_mj.pages.plots import POINTS, Curve, Plot, Shade, as_json, description, save, spans, still, thinned
+from codrl_mj.pages.plots import (
+    POINTS,
+    Curve,
+    Plot,
+    Shade,
+    as_json,
+    description,
+    save,
+    spans,
+    still,
+    thinned,
+)
 
 
 def read(plot):
@@ -23,7 +34,9 @@ def line(*y):
 
 def test_the_page_gets_every_value_and_each_array_once():
     x = np.linspace(0.0, 1.0, 50)
-    content, arrays = read(Plot("t", "x [s]", "y [V]", (Curve("a", x, np.sin(x)), Curve("b", x, np.cos(x)))))
+    content, arrays = read(
+        Plot("t", "x [s]", "y [V]", (Curve("a", x, np.sin(x)), Curve("b", x, np.cos(x))))
+    )
     first, second = content["curves"]
     assert first["x"] == second["x"]
     assert len(arrays) == 3
@@ -48,12 +61,18 @@ def test_spans_are_the_intervals_in_which_a_flag_is_set():
     assert spans(times, np.zeros(4)).shape == (0, 2)
 
 
-@pytest.mark.parametrize("y", [[0.0, 0.0], [np.nan, np.inf], [1.0, 1.0], [-3.0, 1e300], [1e-300, 1.0], []])
+@pytest.mark.parametrize(
+    "y", [[0.0, 0.0], [np.nan, np.inf], [1.0, 1.0], [-3.0, 1e300], [1e-300, 1.0], []]
+)
 @pytest.mark.parametrize("log", [False, True])
 def test_any_numbers_can_be_drawn(y, log):
     plot = Plot("t", "x [s]", "y [1]", (line(*y),), log, log)
     _, arrays = read(plot)
-    finite = [value for value in y if math.isfinite(value) and abs(value) < 3e38 and (value > 1e-37 or not log)]
+    finite = [
+        value
+        for value in y
+        if math.isfinite(value) and abs(value) < 3e38 and (value > 1e-37 or not log)
+    ]
     drawn = arrays[json.loads(as_json(plot))["curves"][0]["y"]]
     assert np.isfinite(drawn).sum() == len(finite)
     assert still(plot).lstrip().startswith("<?xml")
@@ -76,7 +95,9 @@ def test_names_cannot_end_the_script_that_holds_the_data():
 
 def test_names_are_no_formulas(tmp_path):
     names = "$KP_$KD", "cost_$10_to_$20"
-    plot = Plot(names[0], "x", "y", tuple(Curve(name, np.arange(3), np.arange(3)) for name in names))
+    plot = Plot(
+        names[0], "x", "y", tuple(Curve(name, np.arange(3), np.arange(3)) for name in names)
+    )
     assert all(name in still(plot) for name in names)
     save(plot, tmp_path / "plot.png")
 

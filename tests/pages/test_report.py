@@ -59,10 +59,14 @@ def test_a_report_is_one_small_file_with_every_section(text):
 
 def test_the_plots_show_the_episode_that_the_film_shows(text):
     """The oracle: the same episode, run anew."""
-    (episode,) = run_episodes(load_policy(PENDULUM), load_config(PENDULUM).evaluation_env.make, 1, MEDIAN)
+    (episode,) = run_episodes(
+        load_policy(PENDULUM), load_config(PENDULUM).evaluation_env.make, 1, MEDIAN
+    )
     drawn = curves(text, "Torque at the shaft")
     arm = episode.actuator.arm_radius
-    np.testing.assert_allclose(drawn["actual"][1][:-1], episode.trace["actual_force"] * arm, rtol=1e-6)
+    np.testing.assert_allclose(
+        drawn["actual"][1][:-1], episode.trace["actual_force"] * arm, rtol=1e-6
+    )
     steps = np.repeat(episode.signals["desired_force"], episode.inner_steps) * arm
     np.testing.assert_allclose(drawn["desired"][1][:-1], steps, rtol=1e-6)
     error = curves(text, "Error: desired less actual")["desired less actual"][1][:-1]
@@ -89,12 +93,18 @@ def test_it_says_which_loops_it_leaves_out_and_why_there_is_none():
     def run(actuators):
         return Shown("run", SimpleNamespace(driven=actuators), None, None, None, 0)
 
-    drives = {f"m{place}": find_drive("maxon-dcx22l", bandwidth=300.0 + place) for place in range(6)}
-    assert "The first 4 of 6 different loops are shown; not those of m4, m5" in str(reports._loop([run(drives)]))
+    drives = {
+        f"m{place}": find_drive("maxon-dcx22l", bandwidth=300.0 + place) for place in range(6)
+    }
+    assert "The first 4 of 6 different loops are shown; not those of m4, m5" in str(
+        reports._loop([run(drives)])
+    )
     said = str(reports._loop([run({"lag": Lag(time_constant=0.1)})]))
     assert "lag: The delivered torque follows the desired one with a time constant" in said
     assert "There is no current loop in it." in said
-    assert "m: assumed, for none is given: supply.voltage = 24 V" in str(reports._loop([run({"m": Drive()})]))
+    assert "m: assumed, for none is given: supply.voltage = 24 V" in str(
+        reports._loop([run({"m": Drive()})])
+    )
 
 
 @pytest.fixture
@@ -105,7 +115,9 @@ def run(tmp_path):
 
 def of(*runs, **options):
     """The page of runs, read."""
-    return check_alone(report(runs, runs[-1].with_name("r.html"), filmed=False, **options).read_text())
+    return check_alone(
+        report(runs, runs[-1].with_name("r.html"), filmed=False, **options).read_text()
+    )
 
 
 def test_without_opengl_there_is_no_film_and_everything_else(tmp_path, monkeypatch):
@@ -115,7 +127,10 @@ def test_without_opengl_there_is_no_film_and_everything_else(tmp_path, monkeypat
     monkeypatch.setattr(episodes, "clip", no_film)
     text = report([PENDULUM], tmp_path / "r.html").read_text()
     parsed = check_alone(text)
-    assert "No film of pendulum: RenderingUnavailableError: cannot make an OpenGL context" in parsed.text
+    assert (
+        "No film of pendulum: RenderingUnavailableError: cannot make an OpenGL context"
+        in parsed.text
+    )
     assert "<video" not in text
     assert len(parsed.data) > 8
 
@@ -185,7 +200,13 @@ def test_a_damaged_run_says_what_is_damaged(run):
 
 def test_several_runs_stand_side_by_side(run):
     checks = [{"group": "motor", "passed": True}]
-    certificate = {"verdict": "passed", "subject": "pendulum", "made": "then", "quick": True, "checks": checks}
+    certificate = {
+        "verdict": "passed",
+        "subject": "pendulum",
+        "made": "then",
+        "quick": True,
+        "checks": checks,
+    }
     (run / "certificate.json").write_text(json.dumps(certificate))
     text = report([PENDULUM, run], run.with_name("r.html"), filmed=False).read_text()
     parsed = check_alone(text)
@@ -205,14 +226,19 @@ def test_several_motors_can_be_chosen():
     env = load_config(PENDULUM).evaluation_env
     (one,) = run_episodes(load_policy(PENDULUM), env.make, 1, 0)
     arrays = {
-        field: {name: np.stack([values, 2.0 * values], axis=1) for name, values in getattr(one, field).items()}
+        field: {
+            name: np.stack([values, 2.0 * values], axis=1)
+            for name, values in getattr(one, field).items()
+        }
         for field in ("trace", "signals")
     }
     arrays |= {"first_speeds": np.repeat(one.first_speeds, 2)}
     two = dataclasses.replace(one, actuator=(one.actuator,) * 2, motors=("left", "right"), **arrays)
     section = str(episode_section([Shown("arm", env, two, None, "none was asked for", 0)]))
     assert motors_of(section) == [
-        (f"{side}: {what}", f"motor:{place}") for place, side in enumerate(two.motors) for what in ("actual", "desired")
+        (f"{side}: {what}", f"motor:{place}")
+        for place, side in enumerate(two.motors)
+        for what in ("actual", "desired")
     ]
     assert section.count('name="show-motor"') == 2
     assert "No film of arm: none was asked for" in Parsed(section).text
@@ -220,7 +246,9 @@ def test_several_motors_can_be_chosen():
 
 def test_an_ideal_actuator_beside_a_motor_has_a_force():
     envs = (EnvConfig("pendulum", name, max_episode_steps=2) for name in ("weak", "ideal"))
-    shown = [show(env.actuator.family, env, RandomPolicy("pendulum"), 0, filmed=False) for env in envs]
+    shown = [
+        show(env.actuator.family, env, RandomPolicy("pendulum"), 0, filmed=False) for env in envs
+    ]
     labels = {one["title"]: one["y"]["label"] for one in Parsed(str(episode_section(shown))).data}
     assert labels["Torque at the shaft"] == "torque [N·m], of the ideal actuator force [N]"
     alone = Parsed(str(episode_section(shown[1:]))).data
@@ -231,9 +259,13 @@ def test_a_plot_is_shaded_where_its_own_limit_is_met():
     geared = find_drive("maxon-ec45-flat-50w", gear_ratio=20.0)
     drive = dataclasses.replace(geared, controller=SampledLoop(max_current=0.1))
     env = EnvConfig("pendulum", drive, max_episode_steps=10)
-    section = str(episode_section([show("limited", env, RandomPolicy("pendulum"), 0, filmed=False)]))
+    section = str(
+        episode_section([show("limited", env, RandomPolicy("pendulum"), 0, filmed=False)])
+    )
     met = {
-        one["title"]: {shade["label"]: len(one["arrays"][shade["spans"]]) for shade in one["shades"]}
+        one["title"]: {
+            shade["label"]: len(one["arrays"][shade["spans"]]) for shade in one["shades"]
+        }
         for one in Parsed(section).data
     }
     assert list(met["Torque at the shaft"]) == ["saturated"]
@@ -244,7 +276,10 @@ def test_a_plot_is_shaded_where_its_own_limit_is_met():
 
 def test_states_of_every_kind_of_joint_have_units(monkeypatch):
     """The oracle: three metres and a quaternion, a quaternion, a metre, a radian; and what they are in a second."""
-    bodies = "".join(f'<body><joint type="{kind}"/><geom size=".1"/></body>' for kind in ("ball", "slide", "hinge"))
+    bodies = "".join(
+        f'<body><joint type="{kind}"/><geom size=".1"/></body>'
+        for kind in ("ball", "slide", "hinge")
+    )
     bodies += "<body><freejoint/><geom size='.1'/></body>"
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     made = SimpleNamespace(unwrapped=SimpleNamespace(model=model), close=lambda: None)
@@ -269,11 +304,15 @@ def test_a_step_is_at_each_actuators_own_steps():
 
 @pytest.mark.matrix
 def test_motors_of_somebody_elses_robot_are_filmed():
-    env = EnvConfig("Reacher-v5", {"joint0": "maxon-ec45-flat-50w", "joint1": "quanser-qube-servo-2"})
+    env = EnvConfig(
+        "Reacher-v5", {"joint0": "maxon-ec45-flat-50w", "joint1": "quanser-qube-servo-2"}
+    )
     shown = show("reacher", env, RandomPolicy(env.make().action_space), 0)
     assert shown.problem is None
     assert 1.0 / shown.episode.time[0] == pytest.approx(50.0)
-    assert shown.film.rate == pytest.approx(25.0)  # every second: more than 30 a second are not shown
+    assert shown.film.rate == pytest.approx(
+        25.0
+    )  # every second: more than 30 a second are not shown
     section = str(episode_section([shown]))
     assert [tag for _, tag in motors_of(section)] == ["motor:0", "motor:0", "motor:1", "motor:1"]
     assert "State: target x, target y" in Parsed(section).text
@@ -285,11 +324,18 @@ def test_motors_of_somebody_elses_robot_are_filmed():
         ([], "r.html", {}, "runs: none was given"),
         ([PENDULUM], "r.html", {"seed": -1}, "seed = -1: must be >= 0"),
         ([PENDULUM], "r.pdf", {}, r"must be \.html"),
-        ([PENDULUM], "r.html", {"certificate": Path("certificate.json")}, "is no certificate: KeyError: 'checks'"),
+        (
+            [PENDULUM],
+            "r.html",
+            {"certificate": Path("certificate.json")},
+            "is no certificate: KeyError: 'checks'",
+        ),
         ([Path("nowhere")], "r.html", {}, "no run at"),
     ],
 )
-def test_bad_input_is_refused_before_anything_is_run(tmp_path, monkeypatch, runs, out, options, message):
+def test_bad_input_is_refused_before_anything_is_run(
+    tmp_path, monkeypatch, runs, out, options, message
+):
     monkeypatch.chdir(tmp_path)
     Path("certificate.json").write_text("{}")
     with pytest.raises((ValueError, FileNotFoundError), match=message):

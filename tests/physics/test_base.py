@@ -14,7 +14,9 @@ FIELDS = {"body_mass": np.ones((1, 2)), "body_ipos": np.zeros((1, 2, 3))}
 
 
 @every_task
-def test_steps_are_the_papers_inner_loop_with_a_motor_and_gymnasiums_without_unless_they_are_given(task):
+def test_steps_are_the_papers_inner_loop_with_a_motor_and_gymnasiums_without_unless_they_are_given(
+    task,
+):
     assert task.steps_within(Actuator(), None, None) == task.motor_inner_steps
     assert task.steps_within(IDEAL, None, None) == (10 if task.name == "furuta" else 1)
     for count in (1, 2, 3, 7, 10, 1000):
@@ -26,7 +28,9 @@ def test_steps_are_the_papers_inner_loop_with_a_motor_and_gymnasiums_without_unl
 @pytest.mark.parametrize("ratio", [0.5, 1.001, 1.5, 2.5, 9.99])
 def test_a_timestep_that_does_not_divide_is_refused_with_both_numbers(task, ratio):
     timestep = task.step_duration / ratio
-    with pytest.raises(ValueError, match=rf"{timestep:g} s does not divide .*{task.step_duration:g} s") as refused:
+    with pytest.raises(
+        ValueError, match=rf"{timestep:g} s does not divide .*{task.step_duration:g} s"
+    ) as refused:
         task.steps_within(IDEAL, None, timestep)
     assert f"the ratio is {ratio:.6g}, must be an integer >= 1" in str(refused.value)
 
@@ -36,7 +40,9 @@ def test_the_default_integrator_is_the_first_and_others_are_refused_with_the_cho
     assert task.integrator(None) == task.integrators[0]
     for name in task.integrators:
         assert task.integrator(name) == name
-    with pytest.raises(ValueError, match=f"integrator = 'leapfrog': {task.name} has {', '.join(task.integrators)}"):
+    with pytest.raises(
+        ValueError, match=f"integrator = 'leapfrog': {task.name} has {', '.join(task.integrators)}"
+    ):
         task.integrator("leapfrog")
 
 
@@ -49,7 +55,10 @@ def test_divergence_names_every_broken_entry_and_the_time(task, bad):
     for index, name in enumerate(task.state_names):
         physics.state = np.zeros(len(task.state_names))
         physics.state[index] = bad
-        message = f"{task.name}: the simulation diverged at t = 1.25 s: {name} = {bad:g}. Reset the environment"
+        message = (
+            f"{task.name}: the simulation diverged at t = 1.25 s: {name} = {bad:g}. Reset the"
+            " environment"
+        )
         with pytest.raises(SimulationDivergedError, match=re.escape(message)):
             physics.check_finite()
 
@@ -59,7 +68,9 @@ def test_a_physics_without_a_model_refuses_its_fields_by_its_own_name(monkeypatc
         """Of nobody else."""
 
     plant = Plant(TASKS["pendulum"], [IDEAL])
-    said = "fields = body_mass, body_ipos: they are a MuJoCo model's, which {!r} has not; use 'mujoco'"
+    said = (
+        "fields = body_mass, body_ipos: they are a MuJoCo model's, which {!r} has not; use 'mujoco'"
+    )
     for make, name in ((AnalyticPhysics, "analytic"), (Mine, "Mine")):
         with pytest.raises(ValueError, match=said.format(name)):
             make(plant).set_model(FIELDS)

@@ -37,12 +37,16 @@ def test_steps_are_gymnasiums_of_a_fraction_of_the_time(physics, integrator, inn
     step = _gymnasiums_step(integrator, 0.02 / inner_steps)
     generator = np.random.default_rng(0)
     high = np.array([2.4, 5.0, np.pi, 10.0])
-    for state, force in zip(generator.uniform(-high, high, (2000, 4)), generator.uniform(-10, 10, 2000), strict=True):
+    for state, force in zip(
+        generator.uniform(-high, high, (2000, 4)), generator.uniform(-10, 10, 2000), strict=True
+    ):
         simulation.reset(state)
         simulation.step(force)
         for _ in range(inner_steps):
             state = step(state, force)
-        np.testing.assert_allclose(simulation.state, state, rtol=0, atol=1e-12 if inner_steps == 1 else 1e-11)
+        np.testing.assert_allclose(
+            simulation.state, state, rtol=0, atol=1e-12 if inner_steps == 1 else 1e-11
+        )
 
 
 def test_the_asset_has_gymnasiums_inertias_and_the_papers_actuator():
@@ -51,7 +55,9 @@ def test_the_asset_has_gymnasiums_inertias_and_the_papers_actuator():
     assert model.body("cart").mass == env.masscart
     assert model.body("pole").mass == env.masspole
     assert model.body("pole").ipos[2] == env.length
-    assert model.body("pole").inertia[0] == pytest.approx(env.masspole * (2 * env.length) ** 2 / 12, rel=1e-15)
+    assert model.body("pole").inertia[0] == pytest.approx(
+        env.masspole * (2 * env.length) ** 2 / 12, rel=1e-15
+    )
     assert -model.opt.gravity[2] == env.gravity
     for end, sign in (("left_end", -1), ("right_end", 1)):
         assert model.geom(end).pos[0] == sign * env.x_threshold

@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from codrl_mj import engine
-from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop, JointAdditions, Lag, Motor, parameters_type
+from codrl_mj.actuators import (
+    IDEAL,
+    Actuator,
+    CurrentLoop,
+    JointAdditions,
+    Lag,
+    Motor,
+    parameters_type,
+)
 from codrl_mj.disturbances import Joint
 from codrl_mj.engine import motors
 from codrl_mj.engine.families import HEAD, slot_size, user_head
@@ -37,14 +45,20 @@ def _spec(actuator=None, max_force=None):
 
 
 @given(of_every_family, st.none() | st.floats(1e-3, 1e3))
-def test_every_family_comes_back_as_it_was_written_and_the_ideal_one_is_none_of_ours(actuator, max_force):
+def test_every_family_comes_back_as_it_was_written_and_the_ideal_one_is_none_of_ours(
+    actuator, max_force
+):
     engine.load_family(type(actuator))
     model = _spec(actuator, max_force).compile()
     found = motors(model)
-    assert {index: type(one) for index, one in found.items()} == ({} if actuator == IDEAL else {0: type(actuator)})
+    assert {index: type(one) for index, one in found.items()} == (
+        {} if actuator == IDEAL else {0: type(actuator)}
+    )
     for one in found.values():
         assert one.numbers == actuator.numbers
-        assert one.arm_radius == pytest.approx(actuator.arm_radius, rel=1e-15)  # through gear = 1/arm
+        assert one.arm_radius == pytest.approx(
+            actuator.arm_radius, rel=1e-15
+        )  # through gear = 1/arm
     assert model.actuator_ctrllimited[0] == (max_force is not None)
     if max_force is not None:  # the largest torque at the shaft
         limit = max_force * actuator.arm_radius
@@ -61,13 +75,18 @@ def test_a_motor_s_arm_and_limits_are_its_own_behind_an_actuator_of_several_outp
     ):
         text = text.replace(mark, mark + beside)
     asset.write_text(text)
-    task, (short, long) = dataclasses.replace(TASKS["pendulum"], asset=str(asset)), (Motor(arm_radius=0.2), Motor())
+    task, (short, long) = (
+        dataclasses.replace(TASKS["pendulum"], asset=str(asset)),
+        (Motor(arm_radius=0.2), Motor()),
+    )
     compiled, exchanged = (MujocoPhysics(Plant(task, [Actuator(motor)])) for motor in (long, short))
     exchanged.set_actuators([Actuator(long)])
     batch = MujocoBatchPhysics(Plant(task, [Actuator(short)]), [[Actuator(long)]])
     assert compiled.model.nout > compiled.model.nactuator
     for field in ("actuator_gear", "actuator_ctrlrange", "actuator_user"):
-        np.testing.assert_array_equal(getattr(exchanged.model, field), getattr(compiled.model, field))
+        np.testing.assert_array_equal(
+            getattr(exchanged.model, field), getattr(compiled.model, field)
+        )
         np.testing.assert_array_equal(batch.field(field)[0], getattr(compiled.model, field))
 
 
@@ -75,20 +94,39 @@ def test_the_ideal_actuator_is_a_plain_motor_of_gear_one_whatever_was_there_befo
     spec = _spec(Actuator(Motor(arm_radius=0.2)), 3.0)
     drive(spec.actuator("drive"), IDEAL, None)
     model, plain = spec.compile(), mujoco.MjModel.from_xml_string(XML)
-    assert motors(model) == motors(plain) == motors(mujoco.MjModel.from_xml_string("<mujoco/>")) == {}
+    assert (
+        motors(model) == motors(plain) == motors(mujoco.MjModel.from_xml_string("<mujoco/>")) == {}
+    )
     assert model.na == 0
-    for field in ("dyntype", "gaintype", "gainprm", "biastype", "biasprm", "gear", "ctrllimited", "actnum"):
-        np.testing.assert_array_equal(getattr(model, f"actuator_{field}"), getattr(plain, f"actuator_{field}"))
+    for field in (
+        "dyntype",
+        "gaintype",
+        "gainprm",
+        "biastype",
+        "biasprm",
+        "gear",
+        "ctrllimited",
+        "actnum",
+    ):
+        np.testing.assert_array_equal(
+            getattr(model, f"actuator_{field}"), getattr(plain, f"actuator_{field}")
+        )
 
 
 def test_motors_are_found_by_their_index_in_order():
     spec = _spec()
     for index in range(3):
-        driver = spec.add_actuator(name=f"extra{index}", trntype=mujoco.mjtTrn.mjTRN_JOINT, target="hinge")
+        driver = spec.add_actuator(
+            name=f"extra{index}", trntype=mujoco.mjtTrn.mjTRN_JOINT, target="hinge"
+        )
         if index != 1:
             drive(driver, Actuator(controller=CurrentLoop(kp=float(index + 2))), None)
     found = motors(spec.compile())
-    assert {index: actuator.controller.kp for index, actuator in found.items()} == {0: 1.0, 1: 2.0, 3: 4.0}
+    assert {index: actuator.controller.kp for index, actuator in found.items()} == {
+        0: 1.0,
+        1: 2.0,
+        3: 4.0,
+    }
 
 
 @pytest.mark.parametrize(
@@ -112,7 +150,9 @@ def test_motors_are_found_by_their_index_in_order():
     ],
 )
 @pytest.mark.parametrize(("name", "called"), [("drive", "drive"), ("", "actuator 0")])
-def test_a_motor_that_would_not_run_as_described_is_refused_by_name(name, called, field, value, message):
+def test_a_motor_that_would_not_run_as_described_is_refused_by_name(
+    name, called, field, value, message
+):
     spec = _spec()
     spec.actuator("drive").name = name
     model = spec.compile()
@@ -132,10 +172,13 @@ def test_user_data_too_short_for_a_motor_is_refused():
     user = " ".join(map(repr, [*user_head(Actuator), 1]))
     short = XML.replace(
         '<motor name="drive" joint="hinge"/>',
-        f'<general name="drive" joint="hinge" dyntype="user" actdim="{SIZE}" gainprm="0" biastype="user" '
-        f'user="{user}"/>',
+        f'<general name="drive" joint="hinge" dyntype="user" actdim="{SIZE}" gainprm="0"'
+        f' biastype="user" user="{user}"/>',
     )
-    with pytest.raises(ValueError, match=r"drive: user = .*: a Actuator needs 3 numbers and resistance, inductance, "):
+    with pytest.raises(
+        ValueError,
+        match=r"drive: user = .*: a Actuator needs 3 numbers and resistance, inductance, ",
+    ):
         motors(mujoco.MjModel.from_xml_string(short))
 
 
@@ -151,7 +194,10 @@ class _Heavy(Lag):
 def test_what_actuator_and_environment_add_to_the_joint_is_summed_there_alone(task):
     plain, added = (
         task_model(Plant(TASKS[task], (actuator,), joint=joint))
-        for actuator, joint in ((Lag(), Joint()), (_Heavy(), Joint(damping=0.5, friction=0.25, armature=0.125)))
+        for actuator, joint in (
+            (Lag(), Joint()),
+            (_Heavy(), Joint(damping=0.5, friction=0.25, armature=0.125)),
+        )
     )
     dof = np.arange(plain.nv) == plain.jnt_dofadr[plain.actuator("motor").trnid[0]]
     for field, sum_of_both in (("armature", 1.125), ("damping", 2.5), ("frictionloss", 3.25)):

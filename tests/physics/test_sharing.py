@@ -32,7 +32,10 @@ class _Batch:
     """Rows, and lanes that count what they did."""
 
     def __init__(self, count, threads, rounds=0):
-        self.board, self.lanes = new_board(), [(apart(np.zeros(1, np.int64)),) for _ in range(threads)]
+        self.board, self.lanes = (
+            new_board(),
+            [(apart(np.zeros(1, np.int64)),) for _ in range(threads)],
+        )
         self.done, self.rounds = np.zeros(count, np.int64), rounds
 
     def turn(self, work, steps=1000):
@@ -104,9 +107,8 @@ def test_a_forked_process_has_helpers_of_its_own(work):
 
 def test_a_process_ends_while_others_wait_for_its_next_turn():
     code = (
-        "import codrl_mj, gymnasium\n"
-        "envs = gymnasium.make_vec('codrl_mj/Pendulum-v0', 256, 'vector_entry_point', num_threads=2)\n"
-        "envs.reset(seed=0)\n"
-        "for _ in range(20): envs.step(envs.action_space.sample())\n"
+        "import codrl_mj, gymnasium\nenvs = gymnasium.make_vec('codrl_mj/Pendulum-v0', 256,"
+        " 'vector_entry_point', num_threads=2)\nenvs.reset(seed=0)\nfor _ in range(20):"
+        " envs.step(envs.action_space.sample())\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

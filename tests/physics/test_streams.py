@@ -17,7 +17,14 @@ def _seeded():
 
 def test_draws_are_numpys_one_by_one_from_any_rows_in_any_order_and_between_the_users_own():
     streams, generators = _seeded()
-    for rows, count in (([0, 1, 2, 3, 4], 3), ([2], 1), ([4, 1], 7), ([0], 0), ([], 3), ([3, 0, 4], 2)):
+    for rows, count in (
+        ([0, 1, 2, 3, 4], 3),
+        ([2], 1),
+        ([4, 1], 7),
+        ([0], 0),
+        ([], 3),
+        ([3, 0, 4], 2),
+    ):
         drawn = streams.random(np.array(rows, dtype=np.int64), count)
         assert drawn.shape == (len(rows), count)
         for values, row in zip(drawn, rows, strict=True):
@@ -47,5 +54,7 @@ def test_the_state_is_numpys_and_restores_every_draw_spare_half_included():
     for _ in range(3):
         for stream, again in zip(streams.generators, other.generators, strict=True):
             assert stream.integers(1000, dtype=np.int32) == again.integers(1000, dtype=np.int32)
-    np.testing.assert_array_equal(streams.random(np.arange(SIZE), 4), other.random(np.arange(SIZE), 4))
+    np.testing.assert_array_equal(
+        streams.random(np.arange(SIZE), 4), other.random(np.arange(SIZE), 4)
+    )
     np.testing.assert_array_equal(state, kept)  # a copy

@@ -17,7 +17,11 @@ every_kind = pytest.mark.parametrize("kind", [MujocoPhysics, AnalyticPhysics])
 
 def _rows(kind, actuator):
     """The traces of twenty steps under random forces, one below the other, and the forces."""
-    physics, forces, rows = kind(Plant(TASK, [actuator], 3, "euler")), np.random.default_rng(0).uniform(-10, 10, 20), []
+    physics, forces, rows = (
+        kind(Plant(TASK, [actuator], 3, "euler")),
+        np.random.default_rng(0).uniform(-10, 10, 20),
+        [],
+    )
     for force in forces:
         physics.step(float(force))
         rows.append(physics.trace[:, 0].copy())
@@ -37,8 +41,12 @@ def test_an_ideal_actuator_delivers_what_is_desired_and_has_no_current(kind):
 def test_the_integration_steps_are_marked_in_which_the_voltage_is_at_its_sagging_limit(kind):
     limit, supply_resistance = 2.0, 0.8
     loop = CurrentLoop(kp=2.0, max_voltage=limit)
-    rows, _ = _rows(kind, Actuator(Motor(arm_radius=0.15), loop, Supply(resistance=supply_resistance)))
-    before = np.append(0.0, rows[:-1, CURRENT])  # the supply sags by the current at the step's start
+    rows, _ = _rows(
+        kind, Actuator(Motor(arm_radius=0.15), loop, Supply(resistance=supply_resistance))
+    )
+    before = np.append(
+        0.0, rows[:-1, CURRENT]
+    )  # the supply sags by the current at the step's start
     available = limit - supply_resistance * np.abs(before)
     expected = np.abs(rows[:, VOLTAGE]) >= available * (1 - 1e-12)
     np.testing.assert_array_equal(rows[:, SATURATED].astype(bool), expected)

@@ -61,7 +61,9 @@ def test_poses_are_those_of_mujoco(arm):
         data.qpos[:] = state
         mujoco.mj_kinematics(arm, data)
         np.testing.assert_allclose(poses[:, :3], data.xpos[made.bodies], atol=1e-6)
-        same = np.abs((poses[:, 3:] * data.xquat[made.bodies]).sum(axis=1))  # a quaternion's negative is the same turn
+        same = np.abs(
+            (poses[:, 3:] * data.xquat[made.bodies]).sum(axis=1)
+        )  # a quaternion's negative is the same turn
         np.testing.assert_allclose(same, 1.0, atol=1e-6)
     assert ((made.poses[1:, :, 3:] * made.poses[:-1, :, 3:]).sum(axis=2) >= -1e-6).all()
 
@@ -71,7 +73,9 @@ def test_only_as_many_instants_are_kept_as_are_needed_and_the_last(arm):
     made = motion(arm, positions(arm, 1001), time)
     assert made.time[0] == 0.0
     assert made.time[-1] == 2.0
-    assert np.diff(made.time)[:-1] == pytest.approx(0.032)  # the largest number of steps not above 1/30 s
+    assert np.diff(made.time)[:-1] == pytest.approx(
+        0.032
+    )  # the largest number of steps not above 1/30 s
     slow = motion(arm, positions(arm, 5), np.arange(5) * 0.2)
     assert len(slow.time) == 5
     later = motion(arm, positions(arm, 5), 100.0 + np.arange(5) * 0.2)
@@ -82,9 +86,13 @@ def test_only_as_many_instants_are_kept_as_are_needed_and_the_last(arm):
 
 
 def test_shapes_are_what_mujoco_shows(arm):
-    found = {arm.geom(one.geom).name or str(one.geom): one for one in shapes(arm) if one.geom is not None}
+    found = {
+        arm.geom(one.geom).name or str(one.geom): one for one in shapes(arm) if one.geom is not None
+    }
     assert "hidden" not in found
-    assert found["floor"].colour == pytest.approx((0.5, 0.5, 0.5, 1), abs=0.01)  # the mean of its picture
+    assert found["floor"].colour == pytest.approx(
+        (0.5, 0.5, 0.5, 1), abs=0.01
+    )  # the mean of its picture
     assert found["floor"].chequered
     assert found["post"].colour == pytest.approx((0, 1, 0, 0.5))
     capsule = next(one for one in found.values() if one.kind == "capsule")
@@ -122,25 +130,34 @@ def test_the_car_is_on_its_hill():
                 continue
             turned = np.empty(3)
             mujoco.mju_rotVecQuat(turned, one.position, poses[place, 3:].astype(float))
-            np.testing.assert_allclose(poses[place, :3] + turned, env.data.geom_xpos[one.geom], atol=1e-6)
+            np.testing.assert_allclose(
+                poses[place, :3] + turned, env.data.geom_xpos[one.geom], atol=1e-6
+            )
     assert np.ptp(made.poses[:, place, 2]) > 0.1
 
 
 def test_a_thinned_mesh_is_the_same_shape():
     angles = np.linspace(0, np.pi, 200)
     turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
-    vertices = np.array([[np.sin(a) * np.cos(t), np.sin(a) * np.sin(t), np.cos(a)] for a in angles for t in turns])
+    vertices = np.array(
+        [[np.sin(a) * np.cos(t), np.sin(a) * np.sin(t), np.cos(a)] for a in angles for t in turns]
+    )
     row, column = np.meshgrid(np.arange(199), np.arange(400), indexing="ij")
     corner, beside = row * 400 + column, row * 400 + (column + 1) % 400
     triangles = np.concatenate(
-        [np.stack([corner, beside, corner + 400], 2), np.stack([beside, beside + 400, corner + 400], 2)]
+        [
+            np.stack([corner, beside, corner + 400], 2),
+            np.stack([beside, beside + 400, corner + 400], 2),
+        ]
     ).reshape(-1, 3)
     few, corners = thinned(vertices, triangles, 4000)
     assert 1500 < len(corners) <= 4000
     assert corners.max() < len(few)
     np.testing.assert_allclose(np.linalg.norm(few, axis=1), 1.0, atol=0.01)
     a, b, c = np.moveaxis(few[corners], 1, 0)
-    assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(4 * np.pi, rel=0.05)
+    assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(
+        4 * np.pi, rel=0.05
+    )
     assert thinned(vertices, triangles, len(triangles))[1] is triangles
 
 

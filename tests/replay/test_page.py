@@ -12,7 +12,9 @@ from codrl_mj.replay import motion, replay, write_replay
 from tests.pages.parsed import Parsed, check_alone
 from tests.replay.test_motion import ARM, positions
 
-OUTSIDE = re.compile(r"""(?:src|href|action)\s*=\s*["']?(?!data:|#)[^"'\s>]+|url\((?!["']?data:)|@import|\bfetch\(""")
+OUTSIDE = re.compile(
+    r"""(?:src|href|action)\s*=\s*["']?(?!data:|#)[^"'\s>]+|url\((?!["']?data:)|@import|\bfetch\("""
+)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +28,9 @@ NAME = "<b>bold</b> & {{SCRIPT}} </script>"
 
 @pytest.fixture(scope="module")
 def page(what, tmp_path_factory):
-    return write_replay(what, tmp_path_factory.mktemp("page") / "new" / "arm.html", NAME).read_text(encoding="utf-8")
+    return write_replay(what, tmp_path_factory.mktemp("page") / "new" / "arm.html", NAME).read_text(
+        encoding="utf-8"
+    )
 
 
 def content(page):
@@ -38,7 +42,9 @@ def test_the_positions_in_the_page_are_those_of_the_motion(what, page):
     data = content(page)
     poses = np.frombuffer(base64.b64decode(data["poses"]), "<f4").reshape(what.poses.shape)
     np.testing.assert_array_equal(poses, what.poses)
-    np.testing.assert_allclose(np.frombuffer(base64.b64decode(data["time"]), "<f4"), what.time, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.frombuffer(base64.b64decode(data["time"]), "<f4"), what.time, rtol=1e-6
+    )
     assert data["bodies"] == ["upper", "lower", "ball"]
     assert sorted({shape["body"] for shape in data["shapes"] if "body" in shape}) == [0, 1, 2]
     (field,) = data["meshes"]
@@ -49,7 +55,9 @@ def test_the_positions_in_the_page_are_those_of_the_motion(what, page):
 
 def test_names_stand_as_text(page):
     assert NAME in Parsed(page).text
-    model = mujoco.MjModel.from_xml_string(ARM.replace('name="ball"', 'name="&lt;/script&gt;&lt;i&gt;"'))
+    model = mujoco.MjModel.from_xml_string(
+        ARM.replace('name="ball"', 'name="&lt;/script&gt;&lt;i&gt;"')
+    )
     part = replay(motion(model, positions(model, 3), np.arange(3.0)), '"><i>')
     assert "</script><i>" in content(part)["bodies"]
     assert re.search(r"<i[ >]", part) is None

@@ -19,9 +19,13 @@ def pretend(grid, score, leaving_out=()):
     for cell, config in grid.cells.items():
         if cell not in leaving_out:
             folders[cell].mkdir(parents=True)
-            (folders[cell] / "config.json").write_text(json.dumps({"train": config.as_mapping(), "code": "c0de" * 16}))
+            (folders[cell] / "config.json").write_text(
+                json.dumps({"train": config.as_mapping(), "code": "c0de" * 16})
+            )
             (folders[cell] / "episodes.csv").write_text(_episodes(config.total_steps or 2000))
-            (folders[cell] / "result.json").write_text(json.dumps({"steps": config.total_steps, "seconds": 10.0}))
+            (folders[cell] / "result.json").write_text(
+                json.dumps({"steps": config.total_steps, "seconds": 10.0})
+            )
     for trial in grid.trials:
         for seed in grid.seeds_of(trial.arm):
             if (trial.arm.name, seed) not in leaving_out:
@@ -32,7 +36,9 @@ def pretend(grid, score, leaving_out=()):
 
 def _episodes(steps):
     """Twenty equally long ones, which return 1, 2, ... 20."""
-    rows = [f"{number},{round(number * steps / 20)},{number},{steps // 20}" for number in range(1, 21)]
+    rows = [
+        f"{number},{round(number * steps / 20)},{number},{steps // 20}" for number in range(1, 21)
+    ]
     return "\n".join(["episode,steps,return,length", *rows, ""])
 
 

@@ -50,7 +50,11 @@ def alone(root, **options):
 
 def judged(grid):
     """The verdicts of the primary questions."""
-    return judge(Scores(grid.collect(), FLOORS, [at_home(ideal(task)) for task in SECONDS]), primary(), primary=True)
+    return judge(
+        Scores(grid.collect(), FLOORS, [at_home(ideal(task)) for task in SECONDS]),
+        primary(),
+        primary=True,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +73,8 @@ def study(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "task", [pytest.param(task, marks=[] if task == "furuta" else pytest.mark.matrix) for task in SECONDS]
+    "task",
+    [pytest.param(task, marks=[] if task == "furuta" else pytest.mark.matrix) for task in SECONDS],
 )
 @pytest.mark.parametrize("axis", AXES)
 def test_every_dose_is_an_environment_that_can_be_stepped(task, axis):
@@ -86,8 +91,12 @@ def test_doses_are_in_steps_of_the_policy_and_shares_of_the_force():
     for task in SECONDS:
         definition = find_task(task)
         assert AXES["lag"].at(task, 2.0).actuator == Lag(2.0 * definition.step_duration)
-        assert AXES["delay"].at(task, 3.0).disturbances.command_delay == 3.0 * definition.step_duration
-        assert AXES["friction"].at(task, 0.1).joint.friction == pytest.approx(0.1 * definition.max_force)
+        assert (
+            AXES["delay"].at(task, 3.0).disturbances.command_delay == 3.0 * definition.step_duration
+        )
+        assert AXES["friction"].at(task, 0.1).joint.friction == pytest.approx(
+            0.1 * definition.max_force
+        )
         supply = AXES["supply"].at(task, 0.35).actuator
         assert supply.supply.voltage == pytest.approx(0.65 * needed_voltage(task))
         stall = supply.motor.torque_constant * supply.controller.max_current
@@ -121,18 +130,30 @@ def test_the_plan_is_what_is_computed():
     grid = ActuatorStudy().grid
     assert set(planned) <= set(grid.trials)
     counts = len(grid.arms), len(grid.cells), len(planned) * 20
-    assert "{} arms, 20 seeds each: {} trainings, {} tests of {} episodes".format(*counts, grid.episodes) in plan
-    assert [hypothesis.name for hypothesis in primary()] == [f"P{number}" for number in range(1, 13)]
+    assert (
+        "{} arms, 20 seeds each: {} trainings, {} tests of {} episodes".format(
+            *counts, grid.episodes
+        )
+        in plan
+    )
+    assert [hypothesis.name for hypothesis in primary()] == [
+        f"P{number}" for number in range(1, 13)
+    ]
     for name, axis in AXES.items():
         doses = ", ".join(f"{dose:g}" for dose in axis.doses)
         trained = ", ".join(f"{axis.trained[task]:g}" for task in arms.TRAINED)
-        assert f"| {doses} | {trained} |" in next(line for line in plan.splitlines() if line.startswith(f"| {name} |"))
+        assert f"| {doses} | {trained} |" in next(
+            line for line in plan.splitlines() if line.startswith(f"| {name} |")
+        )
 
 
 def test_wrong_motors_differ_from_the_nominal_by_what_they_are_called():
     nominal = posed("pendulum", "weaker")
     motors = wrong_motors("pendulum")
-    assert motors["resistance -25 %"].actuator.motor.resistance == 0.75 * nominal.actuator.motor.resistance
+    assert (
+        motors["resistance -25 %"].actuator.motor.resistance
+        == 0.75 * nominal.actuator.motor.resistance
+    )
     assert motors["resistance -25 %"].actuator.controller == nominal.actuator.controller
     assert motors["friction 20 %"].joint.friction == pytest.approx(0.4)
     assert motors["friction 20 %"].actuator == nominal.actuator
@@ -145,9 +166,16 @@ def test_drawn_doses_end_at_the_dose_that_they_are_said_to(task, axis):
     (name, distribution), *rest = arms.drawn(task, axis).config.env.distributions.items()
     assert not rest
     of = operator.attrgetter(name)
-    ends = [of(AXES[axis].at(task, dose).actuator) for dose in (0.0, arms.drawn_up_to(axis, AXES[axis].trained[task]))]
+    ends = [
+        of(AXES[axis].at(task, dose).actuator)
+        for dose in (0.0, arms.drawn_up_to(axis, AXES[axis].trained[task]))
+    ]
     assert [distribution.low, distribution.high] == pytest.approx(sorted(ends), rel=1e-5)
-    assert AXES[axis].trained[task] < arms.drawn_up_to(axis, AXES[axis].trained[task]) <= AXES[axis].doses[-1]
+    assert (
+        AXES[axis].trained[task]
+        < arms.drawn_up_to(axis, AXES[axis].trained[task])
+        <= AXES[axis].doses[-1]
+    )
 
 
 def test_what_is_explored_is_one_thing_otherwise():
@@ -162,11 +190,15 @@ def test_what_is_explored_is_one_thing_otherwise():
         nominal = posed(task, "paper")
         flat = {name: flattened(env.as_mapping()) for name, env in paper_loops(task).items()}
         changed = {
-            name: {key for key, value in flattened(nominal.as_mapping()).items() if found[key] != value}
+            name: {
+                key for key, value in flattened(nominal.as_mapping()).items() if found[key] != value
+            }
             for name, found in flat.items()
         }
         assert {len(keys) for name, keys in changed.items() if name != "feed-forward 0"} == {1}
-        assert changed["feed-forward 0"] == ({"actuator.controller.kff"} if task == "cartpole" else set())
+        assert changed["feed-forward 0"] == (
+            {"actuator.controller.kff"} if task == "cartpole" else set()
+        )
 
 
 def flattened(mapping, prefix=""):
@@ -211,7 +243,10 @@ def test_seeds_that_would_tell_find_it_as_often_as_power_says(kind, mean, seeds)
     verdict = Verdict(hypothesis, (20, 20), (1, 1), interval, 0.2, 1.0)
     assert verdict.seeds_to_close(12) == seeds
     random = np.random.default_rng(0)
-    one, other = random.normal(mean, 0.05, (20_000, seeds)), random.normal(0.0, 0.05, (20_000, seeds))
+    one, other = (
+        random.normal(mean, 0.05, (20_000, seeds)),
+        random.normal(0.0, 0.05, (20_000, seeds)),
+    )
     if kind == "better":
         found = stats.ttest_ind(one, other, axis=1).pvalue < 0.05 / 12
     else:
@@ -277,15 +312,22 @@ def test_the_page_has_every_number_in_a_file(study, tmp_path):
     assert len(rows) == len(primary()) + len(secondary())
     first = rows[0]
     page = files["actuators.md"].read_text()
-    assert f"{float(first['effect']):+.3f} [{float(first['low']):+.3f}, {float(first['high']):+.3f}]" in page
+    assert (
+        f"{float(first['effect']):+.3f} [{float(first['low']):+.3f}, {float(first['high']):+.3f}]"
+        in page
+    )
     assert len(page.splitlines()) <= 190
     assert len(list(csv.DictReader(files["runs.csv"].open()))) == len(study.deployments)
-    assert sum(file.stat().st_size for name, file in files.items() if name.endswith(".svg")) < 500_000
+    assert (
+        sum(file.stat().st_size for name, file in files.items() if name.endswith(".svg")) < 500_000
+    )
     assert f"({FOLDER}/chart.svg)" in page
     evidence = Evidence.read(files["runs.csv"])
     for task in SECONDS:
         for axis, described in AXES.items():
-            assert evidence.loss(task, axis, described.doses[3]).outcome.loss.mean == pytest.approx(0.5)
+            assert evidence.loss(task, axis, described.doses[3]).outcome.loss.mean == pytest.approx(
+                0.5
+            )
     written = {name: file.read_bytes() for name, file in files.items()}
     again = {file.name: file.read_bytes() for file in write(study.collect(), tmp_path)}
     assert written == again
@@ -318,7 +360,9 @@ def test_from_the_command_line_a_small_study_is_computed_and_goes_on(tmp_path, m
     assert main(ActuatorStudy, call) == 0
     assert page.read_bytes() == written
     assert not [*(tmp_path / "runs").glob("mountain_car-*")]
-    assert main(ActuatorStudy, [*call, "--total-steps", "500"]) == 0  # of another configuration they do not
+    assert (
+        main(ActuatorStudy, [*call, "--total-steps", "500"]) == 0
+    )  # of another configuration they do not
     assert [*(tmp_path / "runs").glob("mountain_car-*/result.json")]
 
 
@@ -333,12 +377,17 @@ def test_the_published_page_is_what_the_published_rows_say(tmp_path):
     shutil.copy(RESULTS / "actuators_conclusions.md", tmp_path)
     files, failures = ActuatorStudy(root=tmp_path / "none", out=tmp_path).write()
     assert not failures
-    assert {file.name for file in files} == {PAGE, *(file.name for file in (RESULTS / FOLDER).iterdir())}
+    assert {file.name for file in files} == {
+        PAGE,
+        *(file.name for file in (RESULTS / FOLDER).iterdir()),
+    }
     for file in files:
         assert file.read_bytes() == (RESULTS / file.relative_to(tmp_path)).read_bytes(), file.name
 
 
-@pytest.mark.parametrize("wrong", [{"tasks": ("pendulm",)}, {"seeds": 0}, {"episodes": 1.5}, {"total_steps": True}])
+@pytest.mark.parametrize(
+    "wrong", [{"tasks": ("pendulm",)}, {"seeds": 0}, {"episodes": 1.5}, {"total_steps": True}]
+)
 def test_what_cannot_be_is_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         ActuatorStudy(**wrong)
@@ -347,7 +396,9 @@ def test_what_cannot_be_is_refused(wrong):
 @pytest.mark.parametrize("flag", ["--root", "--out"])
 def test_what_cannot_be_written_is_refused_before_anything_is_computed(flag, tmp_path, capsys):
     (tmp_path / "file").touch()
-    options = {"--root": tmp_path / "runs", "--out": tmp_path / "out"} | {flag: tmp_path / "file" / "inside"}
+    options = {"--root": tmp_path / "runs", "--out": tmp_path / "out"} | {
+        flag: tmp_path / "file" / "inside"
+    }
     assert main(ActuatorStudy, [*(str(word) for pair in options.items() for word in pair)]) == 2
     assert "file" in capsys.readouterr().err
     assert not (tmp_path / "runs").exists()
@@ -363,7 +414,9 @@ def test_a_stranger_recomputes_the_numbers_without_the_package():
     assert len(lines) == 13
     for line in lines[1:]:
         task, axis, dose, *cells = line.replace(";", "").split()
-        for trained, mean, failed in zip(("ideal", "generic", axis), cells[::2], cells[1::2], strict=True):
+        for trained, mean, failed in zip(
+            ("ideal", "generic", axis), cells[::2], cells[1::2], strict=True
+        ):
             found = trials[task, trained, f"{axis} {dose}"]
             assert float(mean) == pytest.approx(float(found["score"]), abs=6e-4)
             assert int(failed) == round(20 * float(found["failed"]))
@@ -371,6 +424,8 @@ def test_a_stranger_recomputes_the_numbers_without_the_package():
 
 def test_what_cannot_be_published_yet_stops_no_study(tmp_path, monkeypatch, capsys):
     study = ActuatorStudy(root=tmp_path, out=tmp_path)
-    monkeypatch.setattr(ActuatorStudy, "write", lambda _: (_ for _ in ()).throw(ValueError("a damaged file")))
+    monkeypatch.setattr(
+        ActuatorStudy, "write", lambda _: (_ for _ in ()).throw(ValueError("a damaged file"))
+    )
     study.publish()
     assert capsys.readouterr().err == "not published yet: a damaged file\n"

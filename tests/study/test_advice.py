@@ -36,8 +36,9 @@ from tests.matrix import but
 from tests.study.pretended import pretend
 
 OWN_STEPS = {"supply": 1.0 / (2.0 * math.pi * 0.0555 * 20.0), "noise": 1.0}
-"""Integration steps that the loops of the axes' own motors take: a bandwidth of 0.0555 of 20 samples a step; and half
-of what is left in each step, 1/2 + 1/4 + ..."""
+"""Integration steps that the loops of the axes' own motors take: a bandwidth of 0.0555 of 20
+samples a step; and half of what is left in each step, 1/2 + 1/4 + ...
+"""
 
 
 @pytest.mark.parametrize("task", but(["furuta"], REFERENCE_SPEEDS))
@@ -51,9 +52,13 @@ def test_the_bench_finds_every_dose_of_the_study_and_nothing_else(task, axis):
             missing = math.exp(-20.0 / dose) if dose else 0.0  # after the horizon of 20 steps
             assert found.pop("weakness") == pytest.approx(missing, abs=2e-3)
             whole = (dose - 20.0 * missing / (1.0 - missing)) if dose else 0.0
-            assert found.pop("lag") == pytest.approx(max(whole - finest / 2, 0.0), abs=0.1 * finest, rel=5e-3)
+            assert found.pop("lag") == pytest.approx(
+                max(whole - finest / 2, 0.0), abs=0.1 * finest, rel=5e-3
+            )
         else:
-            assert found.pop("lag") == pytest.approx(OWN_STEPS.get(axis, 0.0) * finest, abs=0.1 * finest)
+            assert found.pop("lag") == pytest.approx(
+                OWN_STEPS.get(axis, 0.0) * finest, abs=0.1 * finest
+            )
         for name, value in found.items():
             assert value == pytest.approx(expected[name], abs=2e-3, rel=2e-3), name
 
@@ -97,8 +102,12 @@ def test_what_creeps_to_its_end_counts_as_missing():
     loop = CurrentLoop(kp=1.0, ki=2.0 / (1000 * step), max_voltage=1e3)
     found = delivered(Actuator(Motor(1.0, 10 * dt, 1.0, 1.0), loop), "pendulum")
     assert found.at_rest == pytest.approx(1.0 - 0.5 * math.exp(-0.02), abs=2e-3)
-    # of what is there in the 20th step: the quick half, by a fifth in each of ten integration steps, and what creeps
-    quick, creeps = np.sum(0.8 ** np.arange(1, 100)) / 10.0, 1000.0 * (1.0 - math.exp(-0.02)) - 20.0 * math.exp(-0.0195)
+    # of what is there in the 20th step: the quick half, by a fifth in each of ten integration
+    # steps, and what creeps
+    quick, creeps = (
+        np.sum(0.8 ** np.arange(1, 100)) / 10.0,
+        1000.0 * (1.0 - math.exp(-0.02)) - 20.0 * math.exp(-0.0195),
+    )
     assert found.lag == pytest.approx(0.5 * (quick + creeps) / found.at_rest, abs=0.005)
 
 
@@ -153,16 +162,25 @@ def test_a_loss_is_interpolated_policy_by_policy_and_says_between_which_tests(ax
     """Policy 0 loses twice as much as policy 1, at every dose."""
     tested = AXES[axis].doses
     rows = [
-        {**row, "score": str(1.0 - (2 - int(row["seed"])) * proportional(axis, float(row["tested"].split()[-1])))}
+        {
+            **row,
+            "score": str(
+                1.0 - (2 - int(row["seed"])) * proportional(axis, float(row["tested"].split()[-1]))
+            ),
+        }
         for row in results(proportional)
-        if row["tested"].startswith(f"{axis} ") and row["seed"] in "01" and row["trained"] == "ideal"
+        if row["tested"].startswith(f"{axis} ")
+        and row["seed"] in "01"
+        and row["trained"] == "ideal"
     ]
     home = [row for row in results(proportional) if row["tested"] == "ideal"]
     middle = (tested[1] + tested[2]) / 2
     loss = Evidence([*home, *rows]).loss("acrobot", axis, middle)
     extra = 0.0 if AXES[axis].own_motor else 0.001  # of the test without it
     expected = [2 * proportional(axis, middle), proportional(axis, middle)]
-    assert loss.outcome.lost == pytest.approx(np.array(expected) + np.array([extra, -extra]), abs=1e-12)
+    assert loss.outcome.lost == pytest.approx(
+        np.array(expected) + np.array([extra, -extra]), abs=1e-12
+    )
     assert loss.between == tuple(sorted(f"{axis} {at:g}" for at in tested[1:3]))
     assert not loss.beyond
 
@@ -223,13 +241,22 @@ UNKNOWN = Prospect(None, None)
         ({IDEAL: known(0.5), LOOP: known(0.04), THROUGH: known(0.0)}, LOOP),
         ({IDEAL: known(0.5), RANDOMISE: known(0.04), THROUGH: known(0.0)}, RANDOMISE),
         ({IDEAL: known(0.5), RANDOMISE: known(0.2), THROUGH: known(0.04)}, THROUGH),
-        ({IDEAL: known(0.5), RANDOMISE: known(0.24), THROUGH: known(0.2)}, RANDOMISE),  # as good, and takes less
+        (
+            {IDEAL: known(0.5), RANDOMISE: known(0.24), THROUGH: known(0.2)},
+            RANDOMISE,
+        ),  # as good, and takes less
         ({IDEAL: known(0.5), RANDOMISE: known(0.3), THROUGH: known(0.2)}, THROUGH),  # in part
         ({IDEAL: known(0.5), RANDOMISE: known(0.48), THROUGH: known(0.47)}, BUY),
         ({IDEAL: known(0.5), RANDOMISE: UNKNOWN, THROUGH: known(0.47)}, MEASURE),
         ({IDEAL: known(0.5), THROUGH: UNKNOWN}, MEASURE),
-        ({IDEAL: known(0.5), THROUGH: Prospect(None, known(0.2).least)}, MEASURE),  # 0.2 at least, which would win
-        ({IDEAL: Prospect(None, known(0.0).least), THROUGH: UNKNOWN}, MEASURE),  # beyond tests, which cost nothing
+        (
+            {IDEAL: known(0.5), THROUGH: Prospect(None, known(0.2).least)},
+            MEASURE,
+        ),  # 0.2 at least, which would win
+        (
+            {IDEAL: Prospect(None, known(0.0).least), THROUGH: UNKNOWN},
+            MEASURE,
+        ),  # beyond tests, which cost nothing
     ],
 )
 def test_the_rule(options, verdict):
@@ -239,12 +266,24 @@ def test_the_rule(options, verdict):
 def test_verdicts(evidence):
     step = find_task("pendulum").step_duration
     assert advise(Lag(0.0), "pendulum", evidence).verdict == IDEAL
-    assert advise(Lag(2 * step), "pendulum", evidence).verdict == THROUGH  # which keeps all but 0.02
-    assert advise(Lag(3 * step), "pendulum", evidence).verdict == MEASURE  # more than was trained through
+    assert (
+        advise(Lag(2 * step), "pendulum", evidence).verdict == THROUGH
+    )  # which keeps all but 0.02
+    assert (
+        advise(Lag(3 * step), "pendulum", evidence).verdict == MEASURE
+    )  # more than was trained through
     untried = advise(Lag(3 * find_task("cartpole").step_duration), "cartpole", evidence)
     assert (untried.verdict, untried.options[THROUGH]) == (MEASURE, UNKNOWN)
-    random = [{**row, "trained": "random", "score": "0.99"} for row in evidence.rows if row["tested"] == "lag 4"]
-    known_of = advise(Lag(3 * find_task("cartpole").step_duration), "cartpole", Evidence([*evidence.rows, *random]))
+    random = [
+        {**row, "trained": "random", "score": "0.99"}
+        for row in evidence.rows
+        if row["tested"] == "lag 4"
+    ]
+    known_of = advise(
+        Lag(3 * find_task("cartpole").step_duration),
+        "cartpole",
+        Evidence([*evidence.rows, *random]),
+    )
     assert known_of.verdict == RANDOMISE  # no less lag was tested, and cost 0.01
     assert known_of.options[RANDOMISE].most.loss.mean == pytest.approx(0.01, abs=2e-3)
     late = advise(named_actuator("weaker", "pendulum"), "pendulum", evidence)
@@ -264,7 +303,9 @@ def test_buying_takes_that_all_that_was_tried_with_no_more_of_it_failed():
 
     def at_most(share):
         drive = supplied("pendulum", 100.0)
-        limited = dataclasses.replace(drive.controller, max_current=share * drive.controller.max_current)
+        limited = dataclasses.replace(
+            drive.controller, max_current=share * drive.controller.max_current
+        )
         return advise(dataclasses.replace(drive, controller=limited), "pendulum", hopeless)
 
     assert at_most(0.45).verdict == BUY
@@ -298,7 +339,9 @@ def test_a_tested_drive_is_known_by_its_own_tests_and_not_without_them():
     ]
     actuator = posed("pendulum", REAL["pendulum"]["marginal motor"]).actuator
     tested = Evidence([*rows, *motor])
-    assert advise(actuator, "pendulum", tested).options[THROUGH].most.loss.mean == pytest.approx(0.02)
+    assert advise(actuator, "pendulum", tested).options[THROUGH].most.loss.mean == pytest.approx(
+        0.02
+    )
     assert advise(actuator, "pendulum", tested).verdict == THROUGH
     assert advise(actuator, "pendulum", tested.without("marginal motor")).verdict == MEASURE
 
@@ -307,17 +350,23 @@ def test_commanding_more_makes_up_for_what_a_gear_loses(evidence):
     """A gear that passes on 80 % under a motor that has current to spare, asked for 1.25 times the force."""
     drive = supplied("pendulum", 100.0)
     limit = dataclasses.replace(drive.controller, max_current=2.0 * drive.controller.max_current)
-    lossy = dataclasses.replace(drive, motor=dataclasses.replace(drive.motor, gear_efficiency=0.8), controller=limit)
+    lossy = dataclasses.replace(
+        drive, motor=dataclasses.replace(drive.motor, gear_efficiency=0.8), controller=limit
+    )
     found = advise(lossy, "pendulum", evidence)
     assert found.found.at_rest == pytest.approx(0.8, abs=1e-3)
     assert (found.verdict, "by 1.25" in found.reason) == (COMMAND, True)
     short = dataclasses.replace(lossy, controller=drive.controller)  # no current to spare
     found = advise(short, "pendulum", evidence)
-    assert found.options[COMMAND].least.loss.mean == pytest.approx(found.options[IDEAL].least.loss.mean, abs=0.01)
+    assert found.options[COMMAND].least.loss.mean == pytest.approx(
+        found.options[IDEAL].least.loss.mean, abs=0.01
+    )
 
 
 def test_more_than_was_tested_is_no_reason_to_buy_where_it_cost_nothing():
-    harmless = Evidence(list(results(lambda axis, dose: 0.0 if axis == "weakness" else proportional(axis, dose))))
+    harmless = Evidence(
+        list(results(lambda axis, dose: 0.0 if axis == "weakness" else proportional(axis, dose)))
+    )
     drive = supplied("acrobot", 100.0)
     limited = dataclasses.replace(drive.controller, max_current=0.1 * drive.controller.max_current)
     found = advise(dataclasses.replace(drive, controller=limited), "acrobot", harmless)
@@ -332,15 +381,21 @@ def test_more_than_is_asked_for_is_not_called_harmless(evidence):
 def test_a_force_that_nobody_asked_for_is_not_called_harmless(evidence):
     """A sensor that reads 0.1 A too much: a loop with an integrator takes -0.1 A for none."""
     paper = named_actuator("paper", "pendulum")
-    wrong = dataclasses.replace(paper, controller=dataclasses.replace(paper.controller, current_bias=0.1))
+    wrong = dataclasses.replace(
+        paper, controller=dataclasses.replace(paper.controller, current_bias=0.1)
+    )
     found = advise(wrong, "pendulum", evidence)
     assert (found.verdict, "nothing is asked for" in found.reason) == (MEASURE, True)
-    share = 0.1 * paper.motor.torque_constant / paper.motor.arm_radius / find_task("pendulum").max_force
+    share = (
+        0.1 * paper.motor.torque_constant / paper.motor.arm_radius / find_task("pendulum").max_force
+    )
     assert found.found.unasked == pytest.approx(share, rel=0.05)
 
 
 def test_the_largest_dose_is_not_beyond_it(evidence):
-    found = advise(AXES["supply"].at("acrobot", AXES["supply"].doses[-1]).actuator, "acrobot", evidence)
+    found = advise(
+        AXES["supply"].at("acrobot", AXES["supply"].doses[-1]).actuator, "acrobot", evidence
+    )
     assert not any(loss.beyond for loss in found.losses)
 
 
@@ -365,7 +420,9 @@ def test_a_designed_loop_keeps_the_supply_and_does_not_cure_a_sensor(evidence):
     paper = named_actuator("paper", "pendulum")
     sagging = dataclasses.replace(paper, supply=Supply(5.0, 0.3))
     assert redesign(sagging, "pendulum").supply == Supply(5.0, 0.3)
-    noisy = dataclasses.replace(paper, controller=dataclasses.replace(paper.controller, current_noise=0.1))
+    noisy = dataclasses.replace(
+        paper, controller=dataclasses.replace(paper.controller, current_noise=0.1)
+    )
     assert redesign(noisy, "pendulum") is None
     assert LOOP not in advise(noisy, "pendulum", evidence).options
 
@@ -395,8 +452,12 @@ def test_the_verdict_of_a_measurement(tmp_path, ideal, designed, randomised, thr
     asked = measurement(named_actuator("weaker", "cartpole"), "cartpole", 4, tmp_path)
 
     def score(trial, seed):
-        level = {"cartpole: through it": through, "cartpole: generic": randomised}.get(trial.arm.name)
-        level = {"ideal": 1.0, "designed": designed}.get(trial.test, ideal) if level is None else level
+        level = {"cartpole: through it": through, "cartpole: generic": randomised}.get(
+            trial.arm.name
+        )
+        level = (
+            {"ideal": 1.0, "designed": designed}.get(trial.test, ideal) if level is None else level
+        )
         return FLOORS["cartpole"] + 200.0 * (level + 0.001 * (-1) ** seed)
 
     pretend(asked.grid, score)
@@ -428,7 +489,9 @@ def test_a_measurement_that_is_not_finished_says_so(tmp_path):
 
 
 def test_a_run_is_measured_with_its_own_environment_agent_and_budget(tmp_path):
-    config = TrainConfig.preset("cartpole", "ppo", total_steps=3000, env={"inner_steps": 20, "actuator": "weak"})
+    config = TrainConfig.preset(
+        "cartpole", "ppo", total_steps=3000, env={"inner_steps": 20, "actuator": "weak"}
+    )
     write_json(tmp_path / "run" / "config.json", {"train": config.as_mapping()})
     asked = measurement("weaker", str(tmp_path / "run"), 2, tmp_path)
     for arm in asked.grid.arms:
@@ -441,7 +504,16 @@ def test_a_run_is_measured_with_its_own_environment_agent_and_budget(tmp_path):
 def test_an_environment_of_others_is_measured_beside_random_actions_of_its_own(tmp_path, capsys):
     config = TrainConfig.preset("InvertedPendulum-v5", "ppo", total_steps=4096, num_envs=2)
     write_json(tmp_path / "run" / "config.json", {"train": config.as_mapping()})
-    words = ["advise", "lag", str(tmp_path / "run"), "--measure", "2", "--root", str(tmp_path / "runs"), "--json"]
+    words = [
+        "advise",
+        "lag",
+        str(tmp_path / "run"),
+        "--measure",
+        "2",
+        "--root",
+        str(tmp_path / "runs"),
+        "--json",
+    ]
     assert cli.main(words) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["advice"] is None
@@ -485,7 +557,9 @@ def test_evidence_that_is_no_number_is_refused(tmp_path, file, value):
     cells[lines[0].split(",").index("score")] = value
     wrong = tmp_path / "wrong.csv"
     wrong.write_text("\n".join([lines[0], lines[1], ",".join(cells), *lines[3:]]) + "\n")
-    with pytest.raises(ValueError, match=rf"wrong.csv, line 3: score = '{value}': must be a finite number"):
+    with pytest.raises(
+        ValueError, match=rf"wrong.csv, line 3: score = '{value}': must be a finite number"
+    ):
         Evidence.read(wrong)
 
 
@@ -496,7 +570,10 @@ def test_evidence_that_is_no_number_is_refused(tmp_path, file, value):
         (["paper", "cartpol"], "did you mean 'cartpole'"),
         (["paper", "cartpole", "--measure", "1"], "must be >= 2"),
         (["paper", "cartpole", "--evidence", "nowhere.csv"], "nowhere.csv"),
-        (["paper", "cartpole", "--evidence", "docs/upright_tolerances.csv"], "has no column 'task'"),
+        (
+            ["paper", "cartpole", "--evidence", "docs/upright_tolerances.csv"],
+            "has no column 'task'",
+        ),
         (["ideal", "cartpole", "--measure", "2"], "actuator = 'ideal'"),
         (["maxon-dcx22l", "pendulum", "--gear-ratio", "0"], "gear_ratio = 0.0"),
         (["lag", "pendulum", "--voltage", "3"], "--voltage: "),
@@ -512,14 +589,26 @@ def test_a_motor_s_gear_and_supply_are_the_command_line_s(gear, volts, file, cap
     words = ["advise", "maxon-dcx22l", "pendulum", "--evidence", str(file), "--json"]
     assert cli.main([*words, "--gear-ratio", str(gear), "--voltage", str(volts)]) == 0
     found = json.loads(capsys.readouterr().out)["advice"]["found"]
-    drive, force = find_drive("maxon-dcx22l", gear_ratio=gear, voltage=volts), find_task("pendulum").max_force
-    frictionless = dataclasses.replace(drive, motor=dataclasses.replace(drive.motor, coulomb_friction=0.0))
+    drive, force = (
+        find_drive("maxon-dcx22l", gear_ratio=gear, voltage=volts),
+        find_task("pendulum").max_force,
+    )
+    frictionless = dataclasses.replace(
+        drive, motor=dataclasses.replace(drive.motor, coulomb_friction=0.0)
+    )
     for name, speed in (("at_rest", 0.0), ("at_speed", REFERENCE_SPEEDS["pendulum"])):
-        expected = min(float(torque_limits(frictionless, speed, drive.controller.max_current)[1]) / force, 1.0)
+        expected = min(
+            float(torque_limits(frictionless, speed, drive.controller.max_current)[1]) / force, 1.0
+        )
         assert found[name] == pytest.approx(expected, rel=2e-3), name
     assert found["friction"] == pytest.approx(gear * drive.motor.coulomb_friction / force, rel=1e-3)
 
 
 def test_what_is_assumed_of_a_motor_is_said(file, capsys):
-    assert cli.main(["advise", "maxon-dcx22l", "pendulum", "--gear-ratio", "59", "--evidence", str(file)]) == 0
+    assert (
+        cli.main(
+            ["advise", "maxon-dcx22l", "pendulum", "--gear-ratio", "59", "--evidence", str(file)]
+        )
+        == 0
+    )
     assert "assumed, for none is given: controller.max_current = inf" in capsys.readouterr().out

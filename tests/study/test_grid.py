@@ -15,7 +15,14 @@ from codrl_mj.agents import PPOConfig
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.runs.policies import load_policy
-from codrl_mj.study.grid import Deployment, cell_folder, deploy_cells, failure_record, read_failure, train_runs
+from codrl_mj.study.grid import (
+    Deployment,
+    cell_folder,
+    deploy_cells,
+    failure_record,
+    read_failure,
+    train_runs,
+)
 from codrl_mj.study.parallel import Workers, compute
 from codrl_mj.training import TrainConfig, finished, load_config
 
@@ -106,7 +113,9 @@ def test_a_failure_is_forgotten_when_the_cell_succeeds(tmp_path):
 def test_ray_computes_the_same(computed, tmp_path):
     _, runs, _, _ = computed
     ray_runs, failures = train_cells(
-        CELLS | {"unstable": dataclasses.replace(TINY, env=UNSTABLE)}, tmp_path, Workers(jobs=2, backend="ray")
+        CELLS | {"unstable": dataclasses.replace(TINY, env=UNSTABLE)},
+        tmp_path,
+        Workers(jobs=2, backend="ray"),
     )
     assert set(failures) == {ray_runs["unstable"]}
     for name in CELLS:
@@ -156,14 +165,22 @@ except TrainingStoppedError as stopped:
     for count in (1, 3):
         root = tmp_path / str(count)
         line = [sys.executable, "-c", code, str(root), str(count)]
-        with subprocess.Popen(line, start_new_session=True, stdout=subprocess.PIPE, text=True) as grid:
+        with subprocess.Popen(
+            line, start_new_session=True, stdout=subprocess.PIPE, text=True
+        ) as grid:
             expected = ["0/progress.csv", "short/result.json" if count == 1 else "1/progress.csv"]
-            while not all((root / file).exists() and "\n" in (root / file).read_text().strip() for file in expected):
+            while not all(
+                (root / file).exists() and "\n" in (root / file).read_text().strip()
+                for file in expected
+            ):
                 assert grid.poll() is None
                 time.sleep(0.05)
             os.killpg(grid.pid, signal.SIGINT)
             text, _ = grid.communicate(timeout=60)
-        assert (grid.returncode, text) == (130, "stopped: the same command goes on from the last checkpoints\n")
+        assert (grid.returncode, text) == (
+            130,
+            "stopped: the same command goes on from the last checkpoints\n",
+        )
         for run in ("0", "1")[:count]:
             assert list((root / run / "checkpoints").iterdir())
         assert not (root / "2").exists()
@@ -178,17 +195,23 @@ def test_what_a_call_raises_is_raised():
 def test_deployments_are_evaluations_that_are_made_once(computed):
     _, runs, _, _ = computed
     deployments = {
-        name: Deployment(runs["seed 0"], EnvConfig("cartpole", name), episodes=3, seed=7) for name in ("paper", "ideal")
+        name: Deployment(runs["seed 0"], EnvConfig("cartpole", name), episodes=3, seed=7)
+        for name in ("paper", "ideal")
     }
     deploy_cells(deployments, ONE)
     for deployment in deployments.values():
         expected = evaluate(load_policy(runs["seed 0"]), deployment.env, episodes=3, seed=7)
         assert json.loads(deployment.record.read_text())["returns"] == expected.returns._asdict()
-    before = {deployment.record: deployment.record.stat().st_mtime_ns for deployment in deployments.values()}
+    before = {
+        deployment.record: deployment.record.stat().st_mtime_ns
+        for deployment in deployments.values()
+    }
     assert len(before) == 2
     deploy_cells(deployments, ONE)
     assert {record: record.stat().st_mtime_ns for record in before} == before
-    other = Deployment(runs["seed 0"], EnvConfig("cartpole", max_episode_steps=5), episodes=3, seed=7)
+    other = Deployment(
+        runs["seed 0"], EnvConfig("cartpole", max_episode_steps=5), episodes=3, seed=7
+    )
     deploy_cells({"short": other}, ONE)
     assert json.loads(other.record.read_text())["length"]["mean"] == 5.0
 
@@ -214,7 +237,10 @@ def test_a_deployment_that_fails_is_recorded_and_does_not_stop_the_others(comput
 @pytest.mark.matrix
 def test_a_failure_of_a_deployment_is_forgotten_when_it_succeeds(computed):
     _, runs, _, _ = computed
-    deployment, policy = Deployment(runs["seed 2"], IDEAL, episodes=2), runs["seed 2"] / "policy.json"
+    deployment, policy = (
+        Deployment(runs["seed 2"], IDEAL, episodes=2),
+        runs["seed 2"] / "policy.json",
+    )
     content = policy.read_text()
     policy.write_text("{")
     try:
@@ -229,7 +255,11 @@ def test_a_failure_of_a_deployment_is_forgotten_when_it_succeeds(computed):
 
 @pytest.mark.parametrize(
     ("field", "value", "expected"),
-    [("backend", "slurm", "must be one of local, ray"), ("jobs", 0, ">= 1, or -1"), ("jobs", 2.5, ">= 1, or -1")],
+    [
+        ("backend", "slurm", "must be one of local, ray"),
+        ("jobs", 0, ">= 1, or -1"),
+        ("jobs", 2.5, ">= 1, or -1"),
+    ],
 )
 def test_impossible_workers_are_refused(field, value, expected):
     with pytest.raises(ValueError, match=field) as caught:

@@ -32,7 +32,9 @@ def test_the_effect_of_one_stratum_is_welch_s():
 
 def test_the_effect_of_pairs_is_student_s():
     expected = stats.ttest_rel(TWICE, ONE).confidence_interval(0.9)
-    assert effect([Stratum(TWICE, ONE, True)], 0.9)[1:] == pytest.approx((expected.low, expected.high), rel=1e-12)
+    assert effect([Stratum(TWICE, ONE, True)], 0.9)[1:] == pytest.approx(
+        (expected.low, expected.high), rel=1e-12
+    )
 
 
 def test_pooled_strata_of_equal_spread_are_as_one_of_twice_the_runs():
@@ -55,7 +57,9 @@ def test_a_permutation_test_counts_what_all_relabellings_give():
         for chosen in itertools.combinations(range(8), 4)
     ]
     exact = np.mean(np.abs(differences) >= seen - 1e-12)
-    assert permutation_p([Stratum(one, other)]) == pytest.approx(exact, abs=5e-3)  # 3 deviations of 50,000 draws
+    assert permutation_p([Stratum(one, other)]) == pytest.approx(
+        exact, abs=5e-3
+    )  # 3 deviations of 50,000 draws
     upper = np.mean(np.array(differences) >= seen - 1e-12)
     assert permutation_p([Stratum(one, other)], two_sided=False) == pytest.approx(upper, abs=5e-3)
 
@@ -70,9 +74,13 @@ def test_a_paired_permutation_test_exchanges_within_pairs():
 
 
 def test_large_samples_agree_with_student_s_tests():
-    assert permutation_p([Stratum(TWICE, ONE, True)]) == pytest.approx(stats.ttest_rel(TWICE, ONE).pvalue, abs=0.01)
+    assert permutation_p([Stratum(TWICE, ONE, True)]) == pytest.approx(
+        stats.ttest_rel(TWICE, ONE).pvalue, abs=0.01
+    )
     one, other = RANDOM.normal(0.3, 1.0, 100), RANDOM.normal(0.0, 1.0, 100)
-    assert permutation_p([Stratum(one, other)]) == pytest.approx(stats.ttest_ind(one, other).pvalue, abs=0.01)
+    assert permutation_p([Stratum(one, other)]) == pytest.approx(
+        stats.ttest_ind(one, other).pvalue, abs=0.01
+    )
 
 
 def test_under_no_difference_p_is_uniform():
@@ -80,7 +88,10 @@ def test_under_no_difference_p_is_uniform():
     random = np.random.default_rng(1)
     p = [
         permutation_p(
-            [Stratum(random.exponential(1.0, 6), random.exponential(1.0, 6)), Stratum(*random.random((2, 5)))]
+            [
+                Stratum(random.exponential(1.0, 6), random.exponential(1.0, 6)),
+                Stratum(*random.random((2, 5))),
+            ]
         )
         for _ in range(60)
     ]

@@ -69,7 +69,9 @@ def test_a_longer_delay_is_that_of_the_environment(task, steps):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_what_is_shown_is_the_last_four_commands(task):
-    config = posed(task, late(task, delay=1.3 * find_task(task).step_duration), observe_actuator=True)
+    config = posed(
+        task, late(task, delay=1.3 * find_task(task).step_duration), observe_actuator=True
+    )
     space = posed(task).make().action_space
     actions = [space.sample() for _ in range(12)]
     shown = played(config, actions)[:, -4:]
@@ -92,7 +94,9 @@ def test_doses_and_reaches_follow_from_the_first_study_by_the_rules_of_the_plan(
     evidence = Evidence.read()
     for task in TASKS:
         for axis, harmless in HARMLESS[task].items():
-            known = [(dose, evidence.loss(task, axis, dose).outcome) for dose in AXES[axis].doses[1:]]
+            known = [
+                (dose, evidence.loss(task, axis, dose).outcome) for dose in AXES[axis].doses[1:]
+            ]
             spared = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].spared, known)]
             assert harmless == (spared[-1] if spared else 0.0)
             assert reach(task, axis) == (2 * harmless or AXES[axis].doses[1])
@@ -134,7 +138,9 @@ def test_random_actuators_reach_as_far_as_they_are_said_to():
             assert ends["delay"] == (0.0, pytest.approx(share * reach(task, "delay") * step))
             short = share * reach(task, "weakness")
             assert ends["gain"] == pytest.approx((1 - short, 1 + short))
-            assert env.disturbances.pulse_force == pytest.approx(0.25 * share * find_task(task).max_force)
+            assert env.disturbances.pulse_force == pytest.approx(
+                0.25 * share * find_task(task).max_force
+            )
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +161,10 @@ def written(tmp_path_factory):
         patch.setattr("insurance_study.page.PLANNED", 4)
         study = InsuranceStudy(root=out / "runs", out=out, seeds=4)
         spread = [-0.02, 0.02, 0.01, -0.01]  # sums to 0
-        pretend(study.grid, lambda trial, seed: FLOORS[trial.arm.task] + 100.0 * (level(trial) + spread[seed]))
+        pretend(
+            study.grid,
+            lambda trial, seed: FLOORS[trial.arm.task] + 100.0 * (level(trial) + spread[seed]),
+        )
         yield out, list(study.write()[0])
 
 
@@ -163,8 +172,20 @@ def test_what_is_so_stands_on_the_page(written):
     out, files = written
     assert all(file.is_file() for file in files)
     rows = {row["name"]: row for row in read_csv(out / "insurance" / "hypotheses.csv")}
-    effects = {name: float(rows[name]["effect"]) for name in ("I1", "I2", "I3", "I4", "I6", "I8", "I9", "I10")}
-    wanted = {"I1": 0.2, "I2": 0.2, "I3": 0.0, "I4": 0.0, "I6": 0.2, "I8": 0.0, "I9": 0.2, "I10": -0.2}
+    effects = {
+        name: float(rows[name]["effect"])
+        for name in ("I1", "I2", "I3", "I4", "I6", "I8", "I9", "I10")
+    }
+    wanted = {
+        "I1": 0.2,
+        "I2": 0.2,
+        "I3": 0.0,
+        "I4": 0.0,
+        "I6": 0.2,
+        "I8": 0.0,
+        "I9": 0.2,
+        "I10": -0.2,
+    }
     assert effects == pytest.approx(wanted, abs=1e-9)
     assert rows["I10"]["outcome"] == "the other way"
     assert rows["I3"]["outcome"] == "yes"
@@ -190,13 +211,17 @@ def test_nothing_is_judged_of_fewer_policies_than_are_planned(written, tmp_path)
     assert page.count("| not judged |") == 10
     assert "The 266 others, each of one task, are not judged yet either." in page
     judged = read_csv(tmp_path / "insurance" / "hypotheses.csv")
-    assert {(row["outcome"], row["p"], row["corrected_p"]) for row in judged} == {("not judged", "", "")}
+    assert {(row["outcome"], row["p"], row["corrected_p"]) for row in judged} == {
+        ("not judged", "", "")
+    }
 
 
 def test_what_policies_returned_in_tenths_of_their_training_is_published(written):
     rows = read_csv(written[0] / "insurance" / "learning.csv")
     assert len(rows) == 4 * len({trial.arm.name for trial in trials()})
-    assert [float(rows[0][f"tenth_{number}"]) for number in range(1, 11)] == [2 * at + 1.5 for at in range(10)]
+    assert [float(rows[0][f"tenth_{number}"]) for number in range(1, 11)] == [
+        2 * at + 1.5 for at in range(10)
+    ]
     assert len({row["run"] for row in rows}) == len(rows)
 
 
@@ -210,7 +235,10 @@ def test_rows_stand_for_run_folders_that_are_gone(written, tmp_path):
 
 def test_of_how_many_kinds_of_training_the_returns_still_rise():
     def runs(task, trained, *rises):
-        return [{"task": task, "trained": trained, "tenth_8": 10.0, "tenth_10": 10.0 + rise} for rise in rises]
+        return [
+            {"task": task, "trained": trained, "tenth_8": 10.0, "tenth_10": 10.0 + rise}
+            for rise in rises
+        ]
 
     rows = [*runs("a", "up", 4.0, 8.0), *runs("a", "level", 4.0, 4.0), *runs("a", "down", -9.0)]
     rows += [*runs("b", "wide span", 8.0), *runs("c", "no span", 99.0)]

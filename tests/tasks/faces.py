@@ -13,7 +13,8 @@ every_rebuilt = pytest.mark.parametrize("task", REBUILT)
 NEW = ("pendulum", "acrobot", "mountain_car", "mountain_car_continuous")
 WITH_HILL = ("mountain_car", "mountain_car_continuous")
 
-SPEED_LIMITED = {  # task -> (least, largest) state to draw from, a little beyond the bounds that a step keeps
+# task -> (least, largest) state to draw from, a little beyond the bounds that a step keeps
+SPEED_LIMITED = {
     "pendulum": ([-10.0, -8.5], [10.0, 8.5]),
     "cartpole": ([-2.5, -3.0, -0.3, -3.0], [2.5, 3.0, 0.3, 3.0]),
     "acrobot": ([-np.pi, -np.pi, -4 * np.pi, -9 * np.pi], [np.pi, np.pi, 4 * np.pi, 9 * np.pi]),

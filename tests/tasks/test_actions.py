@@ -19,7 +19,14 @@ GIVEN = [
         for (task, limit), dtype in itertools.product(LIMITS.items(), (np.float32, np.float64))
     ),
 ]
-NOT_CONTINUOUS = [np.array([np.nan]), np.array(0.5), np.zeros(2), np.zeros((1, 1)), np.array([1]), np.array(["1"])]
+NOT_CONTINUOUS = [
+    np.array([np.nan]),
+    np.array(0.5),
+    np.zeros(2),
+    np.zeros((1, 1)),
+    np.array([1]),
+    np.array(["1"]),
+]
 NONE = [
     *itertools.product(LIMITS, ["Box"], [*NOT_CONTINUOUS, 0.5, None]),
     *itertools.product(LEVELS, ["Discrete"], [-1, 3, 0.5, None, np.array([0])]),
@@ -46,7 +53,9 @@ def test_what_is_no_action_is_refused_and_changes_nothing(task, space, action):
     np.testing.assert_array_equal(env.unwrapped.state, state)
 
 
-@pytest.mark.parametrize(("task", "weight"), [("pendulum", 0.001), ("mountain_car_continuous", 0.1)])
+@pytest.mark.parametrize(
+    ("task", "weight"), [("pendulum", 0.001), ("mountain_car_continuous", 0.1)]
+)
 def test_the_reward_charges_the_force_that_was_delivered(task, weight):
     definition, env = TASKS[task], ours(task, actuator="weaker")
     env.reset(seed=0)
@@ -68,6 +77,8 @@ def test_a_batch_of_states_is_many_single_states(task):
         reward = definition.reward(before, force, after, definition.options())
         return np.stack(definition.observation(after)), definition.terminated(after), reward
 
-    for batch, *rows in zip(returned(before.T, forces, after.T), *map(returned, before, forces, after), strict=True):
+    for batch, *rows in zip(
+        returned(before.T, forces, after.T), *map(returned, before, forces, after), strict=True
+    ):
         each = np.broadcast_to(np.transpose(batch), np.shape(rows))
         np.testing.assert_allclose(each, rows, rtol=1e-15, atol=0)

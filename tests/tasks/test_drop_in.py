@@ -17,7 +17,9 @@ def compare(task, seed, choose, states_to, steps=None):
     rewards_to = 0 if isinstance(TASKS[task].action_space, gym.spaces.Discrete) else 100 * states_to
     for step in range(steps or pair[1].spec.max_episode_steps):
         action = choose(step, pair[1].unwrapped.state)
-        (observation, reward, *ends, _), (_, expected, *expected_ends, _) = (env.step(action) for env in pair)
+        (observation, reward, *ends, _), (_, expected, *expected_ends, _) = (
+            env.step(action) for env in pair
+        )
         assert observation in pair[0].observation_space
         np.testing.assert_allclose(*(env.unwrapped.state for env in pair), rtol=0, atol=states_to)
         assert reward == pytest.approx(expected, rel=0, abs=rewards_to)
@@ -32,12 +34,18 @@ def compare(task, seed, choose, states_to, steps=None):
     ("task", "dtype", "states_to", "steps"),
     [
         ("pendulum", np.float64, 1e-9, None),
-        # Gymnasium computes in float32 with such actions; passing near upright (unstable) magnifies the 1e-8 of a step
+        # Gymnasium computes in float32 with such actions; passing near upright (unstable) magnifies
+        # the 1e-8 of a step
         ("pendulum", np.float32, 1e-5, 100),
         ("pendulum", np.float32, 2e-4, None),
         ("acrobot", None, 1e-6, 100),  # chaotic
         ("mountain_car", None, 1e-9, None),
-        ("mountain_car_continuous", np.float64, 1e-5, None),  # Gymnasium rounds its state to float32
+        (
+            "mountain_car_continuous",
+            np.float64,
+            1e-5,
+            None,
+        ),  # Gymnasium rounds its state to float32
         ("mountain_car_continuous", np.float32, 1e-5, None),
     ],
 )
@@ -48,7 +56,9 @@ def test_random_actions_to_the_end_of_the_episode(task, dtype, states_to, steps,
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize(("task", "states_to"), [("mountain_car", 1e-9), ("mountain_car_continuous", 1e-5)])
+@pytest.mark.parametrize(
+    ("task", "states_to"), [("mountain_car", 1e-9), ("mountain_car_continuous", 1e-5)]
+)
 def test_an_episode_that_reaches_the_goal(task, states_to, seed):
     def pump(step, state):
         push = 1 if state[1] >= 0 else -1
@@ -67,7 +77,9 @@ def test_reward_and_end_of_a_step_are_gymnasiums_all_over_the_state_space(task):
         pair[1].state, pair[1].steps_beyond_terminated = state, None
         (_, reward, terminated, *_), (_, expected, end, *_) = (env.step(action) for env in pair)
         assert terminated == end
-        assert reward == pytest.approx(expected, rel=0, abs=1e-5 if task == "mountain_car_continuous" else 1e-9)
+        assert reward == pytest.approx(
+            expected, rel=0, abs=1e-5 if task == "mountain_car_continuous" else 1e-9
+        )
         seen.append(terminated)
     assert task == "pendulum" or 0 < sum(seen) < len(seen)
 
@@ -90,7 +102,9 @@ def test_reset_options_draw_what_gymnasium_draws(task, options):
         np.testing.assert_array_equal(env.unwrapped.state, reference.unwrapped.state)
 
 
-@pytest.mark.parametrize(("task", "name"), [("pendulum", "x_init"), ("acrobot", "low"), ("mountain_car", "high")])
+@pytest.mark.parametrize(
+    ("task", "name"), [("pendulum", "x_init"), ("acrobot", "low"), ("mountain_car", "high")]
+)
 def test_reset_options_are_checked_as_gymnasium_checks_them(task, name):
     with pytest.raises(ValueError, match="could not be converted to a float"):
         ours(task).reset(options={name: "wide"})

@@ -45,11 +45,16 @@ every_actuator = pytest.mark.parametrize("actuator", ["default", "ideal"])
 def lagrange():
     """Accelerations of arm and rod, from the positions and the turning of their parts alone.
 
-    The rod is integrated over its length: no theorem of parallel axes, and no moment of inertia but that of its axis.
+    The rod is integrated over its length: no theorem of parallel axes, and no moment of inertia but
+    that of its axis.
     """
     theta, alpha, w, v, a1, a2, torque, s = sympy.symbols("theta alpha w v a1 a2 torque s")
     arm_mass, arm, mass, rod, r, hub, c, d, g = symbols = sympy.symbols(list(NUMBERS))
-    angles, speeds, accelerations = sympy.Matrix([theta, alpha]), sympy.Matrix([w, v]), sympy.Matrix([a1, a2])
+    angles, speeds, accelerations = (
+        sympy.Matrix([theta, alpha]),
+        sympy.Matrix([w, v]),
+        sympy.Matrix([a1, a2]),
+    )
     outwards = sympy.Matrix([sympy.cos(theta), sympy.sin(theta), 0])
     across = sympy.Matrix([-sympy.sin(theta), sympy.cos(theta), 0])
     up = sympy.Matrix([0, 0, 1])
@@ -60,7 +65,9 @@ def lagrange():
         moving = point.jacobian(angles) * speeds
         return sympy.integrate(sympy.expand(density * moving.dot(moving) / 2), (s, 0, length))
 
-    energy = kinetic(s * outwards, arm_mass / arm, arm) + kinetic(arm * outwards + s * along, mass / rod, rod)
+    energy = kinetic(s * outwards, arm_mass / arm, arm) + kinetic(
+        arm * outwards + s * along, mass / rod, rod
+    )
     energy += hub * w**2 / 2 + mass * r**2 / 2 * turning.dot(along) ** 2 / 2
     lagrangian = energy - mass * g * rod / 2 * sympy.cos(alpha)
     momenta = sympy.Matrix([lagrangian.diff(speed) for speed in speeds])
@@ -93,7 +100,9 @@ def test_the_engines_accelerations_are_lagranges(actuator):
     model, data = physics.model, mujoco.MjData(physics.model)
     hub = NUMBERS["hub"] + (ROTOR if actuator == "default" else 0.0)
     generator = np.random.default_rng(1)
-    for state, torque in zip(states(300), generator.uniform(-MAX_TORQUE, MAX_TORQUE, 300), strict=True):
+    for state, torque in zip(
+        states(300), generator.uniform(-MAX_TORQUE, MAX_TORQUE, 300), strict=True
+    ):
         data.qpos[:], data.qvel[:] = state[:2], state[2:]
         data.qfrc_applied[0] = torque
         mujoco.mj_forward(model, data)
@@ -108,7 +117,13 @@ def test_the_closed_form_is_lagranges():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("rod_length", 0.2), ("rod_mass", 0.05), ("arm_length", 0.17), ("arm_mass", 0.2), ("gravity", 1.62)],
+    [
+        ("rod_length", 0.2),
+        ("rod_mass", 0.05),
+        ("arm_length", 0.17),
+        ("arm_mass", 0.2),
+        ("gravity", 1.62),
+    ],
 )
 def test_a_number_that_is_set_is_lagranges(name, value):
     env = gymnasium.make(TASK.env_id, actuator="ideal").unwrapped
@@ -133,7 +148,9 @@ def test_energy_is_kept_over_an_episode_without_damping():
             each.step(0.0)
             mujoco.mj_forward(each.model, each.data)
             energies.append(each.data.energy.sum())
-        lost[count] = np.ptp(energies) / (NUMBERS["rod_mass"] * NUMBERS["gravity"] * NUMBERS["rod_length"])
+        lost[count] = np.ptp(energies) / (
+            NUMBERS["rod_mass"] * NUMBERS["gravity"] * NUMBERS["rod_length"]
+        )
     assert lost[10] < 2e-7
     assert 1e-3 < lost[1] < 2e-2
 
@@ -158,11 +175,17 @@ def test_its_own_actuator_is_the_motor_of_the_catalogue_at_every_door():
     ("arguments", "said"),
     [
         *(
-            ({"actuator": name}, f"'{name}': a variation of the paper's actuator, of which furuta has none")
+            (
+                {"actuator": name},
+                f"'{name}': a variation of the paper's actuator, of which furuta has none",
+            )
             for name in NAMED
             if name != "ideal"
         ),
-        ({"physics": "analytic"}, r"the Drive's armature = 4e-06: the equations have no place for it"),
+        (
+            {"physics": "analytic"},
+            r"the Drive's armature = 4e-06: the equations have no place for it",
+        ),
     ],
 )
 def test_what_it_has_not_is_refused(arguments, said):
@@ -171,7 +194,8 @@ def test_what_it_has_not_is_refused(arguments, said):
 
 
 @pytest.mark.parametrize(
-    ("command", "unit"), but([("force", 1.0)], [("force", 1.0), ("current", 0.042), ("voltage", 0.042 / 8.4)])
+    ("command", "unit"),
+    but([("force", 1.0)], [("force", 1.0), ("current", 0.042), ("voltage", 0.042 / 8.4)]),
 )
 def test_a_command_is_delivered_or_what_its_winding_makes_of_it(command, unit):
     """The arm is as good as locked, so that the current of a voltage is u/R after a few L/R = 0.14 ms."""
@@ -199,8 +223,12 @@ def test_reward_goal_and_end():
     assert TASK.reward(hanging, 0.0, upright, options) == 1.0
     assert TASK.reward(upright, 0.0, hanging, options) == 0.0
     assert TASK.reward(upright, MAX_TORQUE, (2.0, 0.0, 0.0, 0.0), options) == pytest.approx(0.4)
-    assert [bool(TASK.goal((0.0, angle, 0.0, 0.0))) for angle in (0.099, 2 * math.pi - 0.099, 0.101)] == [1, 1, 0]
-    assert [bool(TASK.terminated((angle, 0.0, 0.0, 0.0))) for angle in (2.0, -2.0, 2.001, -2.001)] == [0, 0, 1, 1]
+    assert [
+        bool(TASK.goal((0.0, angle, 0.0, 0.0))) for angle in (0.099, 2 * math.pi - 0.099, 0.101)
+    ] == [1, 1, 0]
+    assert [
+        bool(TASK.terminated((angle, 0.0, 0.0, 0.0))) for angle in (2.0, -2.0, 2.001, -2.001)
+    ] == [0, 0, 1, 1]
 
 
 def test_it_starts_hanging_within_what_a_reset_asks_for():
@@ -215,7 +243,9 @@ def test_it_starts_hanging_within_what_a_reset_asks_for():
 
 @every_actuator
 def test_the_scripted_controller_swings_up_and_balances(actuator):
-    episodes = run_episodes(Scripted(TASK), lambda: state_observed(EnvConfig("furuta", actuator).make()), 10, seed=0)
+    episodes = run_episodes(
+        Scripted(TASK), lambda: state_observed(EnvConfig("furuta", actuator).make()), 10, seed=0
+    )
     assert summarize("furuta", episodes).success.mean == 1.0
 
 
@@ -242,7 +272,9 @@ FACES = {
     "ideal": {"actuator": "ideal"},
     "current": {"action": "current", "observe_actuator": True},
     "voltage": {"action": "voltage", "disturbances": {"command_delay": 0.004}},
-    "randomised": {"randomize": {"model.length.rod": Uniform(0.8, 1.2), "model.length.arm": Uniform(0.8, 1.2)}},
+    "randomised": {
+        "randomize": {"model.length.rod": Uniform(0.8, 1.2), "model.length.arm": Uniform(0.8, 1.2)}
+    },
 }
 
 
@@ -255,7 +287,9 @@ FACES = {
 )
 def test_a_batch_is_single_environments_bit_for_bit(face, mode):
     arguments = FACES[face]
-    ends = assert_equal_episodes(batched("furuta", 3, mode, **arguments), looped("furuta", 3, mode, **arguments), 60)
+    ends = assert_equal_episodes(
+        batched("furuta", 3, mode, **arguments), looped("furuta", 3, mode, **arguments), 60
+    )
     assert ends.any()
 
 

@@ -124,7 +124,9 @@ def test_foreign_models_are_left_alone(user, kind, bare_engine):
         model, data = _sled(user=user)
         model.jnt_type[0] = kind
         mujoco.mj_step(model, data, 50)
-        trajectories.append([data.qpos.copy(), data.qvel.copy(), data.qfrc_passive.copy(), data.geom_xpos.copy()])
+        trajectories.append(
+            [data.qpos.copy(), data.qvel.copy(), data.qfrc_passive.copy(), data.geom_xpos.copy()]
+        )
     for bare, ours_installed in zip(*trajectories, strict=True):
         np.testing.assert_array_equal(bare, ours_installed)
 
@@ -132,7 +134,10 @@ def test_foreign_models_are_left_alone(user, kind, bare_engine):
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"user": f'user="{_SIGNATURE} 1"'}, "user = .* needs signature_1, signature_2, gravity, wavenumber, height"),
+        (
+            {"user": f'user="{_SIGNATURE} 1"'},
+            "user = .* needs signature_1, signature_2, gravity, wavenumber, height",
+        ),
         ({"axis": 'axis="0 1 0"'}, 'a hill of codrl_mj needs type="slide" and axis="1 0 0"'),
     ],
 )
@@ -148,7 +153,9 @@ def test_somebody_elses_callback_is_not_replaced(bare_engine):
     mujoco.set_mjcb_passive(None)
     model, _ = _sled()
     mujoco.set_mjcb_passive(foreign)
-    with pytest.raises(CallbackInUseError, match=r"mjcb_passive is already set.*physics='analytic'"):
+    with pytest.raises(
+        CallbackInUseError, match=r"mjcb_passive is already set.*physics='analytic'"
+    ):
         install_callbacks(model)
     assert mujoco.get_mjcb_passive() is foreign
     assert mujoco.get_mjcb_control() is None

@@ -43,32 +43,68 @@ def tiny(task, agent, num_envs=1, actuator="paper", total_episodes=None, **env):
     return TrainConfig(env, agent, seed=3, num_envs=num_envs, **often, **budget)
 
 
-_SMALL = {"learning_starts": 40, "batch_size": 16, "buffer_size": 150}  # the buffer fills, and is written over
+_SMALL = {
+    "learning_starts": 40,
+    "batch_size": 16,
+    "buffer_size": 150,
+}  # the buffer fills, and is written over
 PPO = functools.partial(PPOConfig, rollout_steps=32, batch_size=16, epochs=2, hidden=(8, 8))
 DDPG = functools.partial(DDPGConfig, actor_units=(8,), joint_units=(8,), **_SMALL)
-DQN, TD3, SAC = (functools.partial(agent, hidden=(8,), **_SMALL) for agent in (DQNConfig, TD3Config, SACConfig))
-DRAWN = {"randomize": {"motor.inductance": "uniform(0.05, 0.15)", "controller.kp": "choice(0.5, 1)"}}
-DISTURBED = {"disturbances": Disturbances(command_delay=0.03, pulse_interval=0.2, pulse_force=0.5, pulse_duration=0.05)}
+DQN, TD3, SAC = (
+    functools.partial(agent, hidden=(8,), **_SMALL) for agent in (DQNConfig, TD3Config, SACConfig)
+)
+DRAWN = {
+    "randomize": {"motor.inductance": "uniform(0.05, 0.15)", "controller.kp": "choice(0.5, 1)"}
+}
+DISTURBED = {
+    "disturbances": Disturbances(
+        command_delay=0.03, pulse_interval=0.2, pulse_force=0.5, pulse_duration=0.05
+    )
+}
 NOISY = {"controller": {"current_noise": 0.1, "current_bias": 0.05}}
 NOISY_PAPER = {"name": "paper", **NOISY}
 """Actuators with what a sensor of the current gets wrong."""
 
 CASES = {
-    "ppo, one optimiser": tiny("cartpole", PPO(), 4, "weaker", options={"center_radius": 0.1}, observe_actuator=True),
-    "ppo, separate learning rates": tiny("cartpole", PPO(critic_learning_rate=3e-3), 2, physics="analytic"),
+    "ppo, one optimiser": tiny(
+        "cartpole", PPO(), 4, "weaker", options={"center_radius": 0.1}, observe_actuator=True
+    ),
+    "ppo, separate learning rates": tiny(
+        "cartpole", PPO(critic_learning_rate=3e-3), 2, physics="analytic"
+    ),
     "ppo, an episode budget": tiny(
-        "cartpole", PPO(critic_learning_rate=3e-3), 2, NOISY_PAPER, total_episodes=9, **DRAWN, **DISTURBED
+        "cartpole",
+        PPO(critic_learning_rate=3e-3),
+        2,
+        NOISY_PAPER,
+        total_episodes=9,
+        **DRAWN,
+        **DISTURBED,
     ),
     "ppo, state-dependent noise": tiny("pendulum", PPO(state_dependent_noise=True), 2),
-    "ppo, state-dependent noise, drawn often": tiny("pendulum", PPO(state_dependent_noise=True, noise_steps=5)),
-    "ddpg": tiny("pendulum", DDPG(critic_learning_rate=2e-3), 1, NOISY_PAPER, observe_actuator=True, **DISTURBED),
-    "ddpg, several environments": tiny("pendulum", DDPG(train_every=4, gradient_steps=1), 3, physics="analytic"),
+    "ppo, state-dependent noise, drawn often": tiny(
+        "pendulum", PPO(state_dependent_noise=True, noise_steps=5)
+    ),
+    "ddpg": tiny(
+        "pendulum",
+        DDPG(critic_learning_rate=2e-3),
+        1,
+        NOISY_PAPER,
+        observe_actuator=True,
+        **DISTURBED,
+    ),
+    "ddpg, several environments": tiny(
+        "pendulum", DDPG(train_every=4, gradient_steps=1), 3, physics="analytic"
+    ),
     "ddpg, trained after episodes": tiny(
         "pendulum", DDPG(train_every=None, gradient_steps=5), total_episodes=8, **DRAWN
     ),
     "dqn, epsilon by episodes": tiny("cartpole", DQN(target_every=7), **DRAWN),
     "dqn, epsilon by steps": tiny(
-        "cartpole", DQN(exploration_decay=None, exploration_fraction=0.8, target_every=10), 3, physics="analytic"
+        "cartpole",
+        DQN(exploration_decay=None, exploration_fraction=0.8, target_every=10),
+        3,
+        physics="analytic",
     ),
     "td3": tiny("pendulum", TD3(), 2, NOISY_PAPER, **DISTURBED),
     "sac, learned entropy coefficient": tiny("pendulum", SAC(), **DRAWN),
@@ -76,10 +112,17 @@ CASES = {
         "pendulum", SAC(entropy_coefficient=0.1, state_dependent_noise=True, train_every=6), 2
     ),
     "sarsa": tiny(
-        "mountain_car", SARSAConfig(epsilon=0.2, epsilon_decay=0.9), 1, {"name": "weak", **NOISY}, **DISTURBED
+        "mountain_car",
+        SARSAConfig(epsilon=0.2, epsilon_decay=0.9),
+        1,
+        {"name": "weak", **NOISY},
+        **DISTURBED,
     ),
     "sarsa, traces": tiny(
-        "mountain_car", SARSAConfig(epsilon=0.1, trace_decay=0.8), total_episodes=9, physics="analytic"
+        "mountain_car",
+        SARSAConfig(epsilon=0.1, trace_decay=0.8),
+        total_episodes=9,
+        physics="analytic",
     ),
 }
 """Every agent, alone and with several environments, on both physics, with everything that an environment can have."""
@@ -93,7 +136,9 @@ def crash(*_):
     raise Crash
 
 
-TERMINATE, INTERRUPT = (functools.partial(signal.raise_signal, number) for number in (signal.SIGTERM, signal.SIGINT))
+TERMINATE, INTERRUPT = (
+    functools.partial(signal.raise_signal, number) for number in (signal.SIGTERM, signal.SIGINT)
+)
 
 
 @contextlib.contextmanager

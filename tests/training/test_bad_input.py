@@ -11,7 +11,10 @@ from stable_baselines3 import PPO
 from codrl_mj.cli import main
 from codrl_mj.training import history, load_config
 
-TINY = "--total-steps 128 --num-envs 2 --agent.rollout-steps 64 --agent.batch-size 32 --agent.epochs 1 --agent.hidden 8"
+TINY = (
+    "--total-steps 128 --num-envs 2 --agent.rollout-steps 64 --agent.batch-size 32 --agent.epochs 1"
+    " --agent.hidden 8"
+)
 TINY += " --evaluation-episodes 1 --no-tensorboard"
 POLICY = ("policy.json", "policy.safetensors")
 TYPO, OTHER = "task: cartpole\ntotal_step: 5", "task: cartpole\nagent: {name: ppo}\nseed: 9"
@@ -33,7 +36,9 @@ def made(tmp_path_factory):
         (place / name).mkdir()
     for name in POLICY:
         shutil.copy(place / "run" / name, place / "alone")
-    PPO("MlpPolicy", gymnasium.make("CartPole-v1"), n_steps=8, batch_size=8).save(place / "model.zip")
+    PPO("MlpPolicy", gymnasium.make("CartPole-v1"), n_steps=8, batch_size=8).save(
+        place / "model.zip"
+    )
     (place / "typo.yaml").write_text(TYPO)
     (place / "other.yaml").write_text(OTHER)
     return place
@@ -96,28 +101,52 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
     [
         ("train --resume empty", "no run configuration at empty/config.json"),
         ("train --resume nowhere", "no run configuration at nowhere/config.json"),
-        ("train --resume cut", "cut/config.json is not a run configuration: it is truncated or not JSON"),
+        (
+            "train --resume cut",
+            "cut/config.json is not a run configuration: it is truncated or not JSON",
+        ),
         ("train --resume little", "little/config.json: not a run configuration: "),
-        ("train --resume unversioned", "unversioned/config.json: not a run configuration: versions = 5"),
+        (
+            "train --resume unversioned",
+            "unversioned/config.json: not a run configuration: versions = 5",
+        ),
         # no training
         ("train pendulum --agent sarsa", "agents that can: ppo, ddpg, td3, sac"),
         ("train pendulum --agent dqn", "cannot act in the Box actions of pendulum"),
         ("train acrobot --agent ddpg", "agents that can: ppo, dqn, sarsa"),
-        ("train cartpole --settings repaired", "settings = 'repaired': ppo on cartpole has no such settings; those on"),
-        ("train --config typo.yaml", "typo.yaml: unknown key total_step; did you mean total_steps?"),
+        (
+            "train cartpole --settings repaired",
+            "settings = 'repaired': ppo on cartpole has no such settings; those on",
+        ),
+        (
+            "train --config typo.yaml",
+            "typo.yaml: unknown key total_step; did you mean total_steps?",
+        ),
         ("train --config nowhere.yaml", "no configuration file at nowhere.yaml"),
-        ("train --no-tensorboard pendulum", "name the task before the flags, as in codrl-mj train pendulum"),
+        (
+            "train --no-tensorboard pendulum",
+            "name the task before the flags, as in codrl-mj train pendulum",
+        ),
         # no command line
-        ("train cartpole --settings printed", "--settings printed: must be one of default, paper, repaired"),
+        (
+            "train cartpole --settings printed",
+            "--settings printed: must be one of default, paper, repaired",
+        ),
         ("train cartpole --agent pppo", "--agent pppo: did you mean 'ppo'?"),
         ("train cartpole --agent", "--agent needs a value"),
         ("train --config", "--config needs a value"),
         ("train --resume", "--resume needs a value"),
-        ("train cartpole --agent.gama 0.9", "unknown flag --agent.gama: did you mean '--agent.gamma'?"),
+        (
+            "train cartpole --agent.gama 0.9",
+            "unknown flag --agent.gama: did you mean '--agent.gamma'?",
+        ),
         ("train", "codrl-mj train needs TASK"),
         # no policy of that task or agent, or only one
         ("evaluate unfinished", "unfinished is not finished"),
-        ("evaluate unfinished", "codrl-mj train --resume unfinished, or take its best one so far with --which best"),
+        (
+            "evaluate unfinished",
+            "codrl-mj train --resume unfinished, or take its best one so far with --which best",
+        ),
         ("evaluate run --task pendulum", "run was trained for cartpole"),
         ("evaluate run --agent dqn", "run was trained by ppo: leave --agent out"),
         ("evaluate alone", "name its task with --task"),
@@ -125,13 +154,22 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
         ("evaluate alone --task cartpole --which best", "leave --which out"),
         # a zip does not say what it is, and is loaded only on trust
         ("evaluate model.zip --task cartpole --agent ppo", "Pass --trust if that author is you"),
-        ("render model.zip --task cartpole --agent ppo --out film.gif", "Pass --trust if that author is you"),
+        (
+            "render model.zip --task cartpole --agent ppo --out film.gif",
+            "Pass --trust if that author is you",
+        ),
         ("evaluate nowhere.zip --task cartpole --agent ppo", "no model at nowhere.zip"),
         ("evaluate model.zip --agent ppo --trust", "name its task with --task"),
         ("evaluate model.zip --task cartpole --trust", "name it with --agent"),
         ("evaluate model.zip --task cartpole --agent dqn --trust", "is not a model of dqn"),
-        ("evaluate model.zip --task cartpole --agent sarsa --trust", "Stable-Baselines3 has no such agent"),
-        ("evaluate model.zip --task cartpole --which best", "no run folder and holds one policy alone"),
+        (
+            "evaluate model.zip --task cartpole --agent sarsa --trust",
+            "Stable-Baselines3 has no such agent",
+        ),
+        (
+            "evaluate model.zip --task cartpole --which best",
+            "no run folder and holds one policy alone",
+        ),
     ],
 )
 def test_what_cannot_be_done_is_named(capsys, line, expected):
@@ -144,7 +182,10 @@ def test_what_cannot_be_done_is_named(capsys, line, expected):
         ({"code": lambda _: "0123456789abcdef"}, "the code of codrl_mj was 01234567, is "),
         ({"versions": lambda there: there | {"torch": "1.13"}}, "torch was 1.13, is 2."),
         ({"versions": lambda there: there | {"cython": "3"}}, "cython was 3, is absent"),
-        ({"versions": lambda there: {name: there[name] for name in there if name != "numpy"}}, "numpy was absent, is "),
+        (
+            {"versions": lambda there: {name: there[name] for name in there if name != "numpy"}},
+            "numpy was absent, is ",
+        ),
     ],
     ids=["code", "version", "package gone", "package new"],
 )
@@ -171,11 +212,17 @@ def test_a_finished_run_is_left_alone(capsys):
 @pytest.mark.parametrize(
     "line",
     [
-        f"train cartpole --resume unfinished --agent ppo {TINY} --config unfinished/config.json",  # it agrees
+        # it agrees
+        f"train cartpole --resume unfinished --agent ppo {TINY} --config unfinished/config.json",
         "evaluate unfinished --which best --episodes 1",
-        "evaluate model.zip --task cartpole --agent ppo --trust --episodes 1 --env.max-episode-steps 2",
-        "render model.zip --task cartpole --agent ppo --trust --env.max-episode-steps 2 --width 160 --height 80"
-        " --out film.gif",
+        (
+            "evaluate model.zip --task cartpole --agent ppo --trust --episodes 1"
+            " --env.max-episode-steps 2"
+        ),
+        (
+            "render model.zip --task cartpole --agent ppo --trust --env.max-episode-steps 2 --width"
+            " 160 --height 80 --out film.gif"
+        ),
     ],
 )
 def test_what_is_enough_is_taken(line):
@@ -193,8 +240,9 @@ def test_a_policy_alone_is_that_of_its_run_and_the_best_one_another_file():
 
 def test_flags_win_over_the_file_and_leave_the_rest_of_it():
     Path("train.yaml").write_text(
-        "task: cartpole\nseed: 5\nagent: {name: ppo, gamma: 0.9, learning_rate: 3e-4, rollout_steps: 64}\n"
-        "actuator: {name: weaker, controller: {kp: 0.3}}\nenv: {center_radius: 0.2}"
+        "task: cartpole\nseed: 5\nagent: {name: ppo, gamma: 0.9, learning_rate: 3e-4,"
+        " rollout_steps: 64}\nactuator: {name: weaker, controller: {kp: 0.3}}\nenv: {center_radius:"
+        " 0.2}"
     )
     flags = "--agent ppo --seed 6 --actuator.controller.ki 0.4 --env.inner-steps 2"
     do(f"train --config train.yaml {flags} {TINY} --out new")

@@ -43,7 +43,10 @@ def expected(tmp_path_factory):
 def stopped_once(tmp_path_factory):
     out = tmp_path_factory.mktemp("stopped") / "run"
     interrupt(CONFIG, out, 180, TERMINATE)
-    assert [path.name[:17] for path in checkpoints(out)] == ["step-000000000128", "step-000000000192"]
+    assert [path.name[:17] for path in checkpoints(out)] == [
+        "step-000000000128",
+        "step-000000000192",
+    ]
     return out
 
 
@@ -99,7 +102,8 @@ def half_a_row(table):
 
 BOMB = pickle.dumps(Bomb(Path("exploded")))
 BACK, ANEW = "going back to the one before", "no other is left: starting anew"
-DAMAGES = {  # what is done to the run, and the remedy that is told for each checkpoint that cannot be used
+# what is done to the run, and the remedy that is told for each checkpoint that cannot be used
+DAMAGES = {
     "truncated": (lambda out: cut(checkpoints(out)[-1]), [BACK]),
     "a bit flipped": (last(flip_a_bit), [BACK]),
     "emptied": (last(lambda _: b""), [BACK]),
@@ -116,7 +120,9 @@ DAMAGES = {  # what is done to the run, and the remedy that is told for each che
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_a_run_goes_back_to_what_is_intact_says_so_and_comes_to_the_same(stopped, expected, monkeypatch, name):
+def test_a_run_goes_back_to_what_is_intact_says_so_and_comes_to_the_same(
+    stopped, expected, monkeypatch, name
+):
     monkeypatch.chdir(stopped.parent)
     harm, remedies = DAMAGES[name]
     harm(stopped)
@@ -191,11 +197,21 @@ def leave_half_written():
 
 
 def test_what_a_killed_process_left_half_written_goes_and_nothing_else(stopped, leave_half_written):
-    names = ["policy.json", "best/policy.safetensors", "result.json", "progress.csv", "learning_curve.png"]
+    names = [
+        "policy.json",
+        "best/policy.safetensors",
+        "result.json",
+        "progress.csv",
+        "learning_curve.png",
+    ]
     names += [f"checkpoints/{checkpoints(stopped)[0].name}"]
     ours = [leave_half_written(stopped / name) for name in names]
     others = [leave_half_written(stopped / name) for name in ("notes.txt", "best/film.mp4")]
-    others += [stopped / ".policy.json", stopped / ".policy-old.json", stopped / "checkpoints" / ".keep"]
+    others += [
+        stopped / ".policy.json",
+        stopped / ".policy-old.json",
+        stopped / "checkpoints" / ".keep",
+    ]
     for path in others:
         path.touch()
     assert all(path.exists() for path in ours)
@@ -229,7 +245,9 @@ def no_file_larger_than(size):
 
 
 @pytest.mark.parametrize("size", [8000, 1200, 120], ids=["checkpoint", "policy", "table"])
-def test_where_nothing_can_be_written_the_error_is_one_line_and_the_run_goes_on_later(stopped, expected, capsys, size):
+def test_where_nothing_can_be_written_the_error_is_one_line_and_the_run_goes_on_later(
+    stopped, expected, capsys, size
+):
     line = ["train", "--resume", str(stopped), "--no-tensorboard"]
     before = {path.name: path.read_bytes() for path in checkpoints(stopped)}
     with no_file_larger_than(size):
@@ -246,7 +264,9 @@ def test_where_nothing_can_be_written_the_error_is_one_line_and_the_run_goes_on_
 
 
 @pytest.mark.parametrize("best", [False, True])
-def test_where_nothing_can_be_written_before_a_checkpoint_it_says_what_there_is(tmp_path, capsys, best):
+def test_where_nothing_can_be_written_before_a_checkpoint_it_says_what_there_is(
+    tmp_path, capsys, best
+):
     """No policy fits into so much; or the best policy does, and no checkpoint."""
     out, yaml = tmp_path / "run", tmp_path / "train.yaml"
     config = dataclasses.replace(CONFIG, checkpoint_interval=10**6) if best else CONFIG

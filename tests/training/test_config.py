@@ -17,12 +17,19 @@ from codrl_mj.training import TrainConfig, load_config, read_config
 
 ENV = EnvConfig("cartpole", "weaker")
 TINY = TrainConfig(ENV, PPOConfig(hidden=(8, 8)), 1, 1000, num_envs=4)
-OWN = Actuator(Motor(inductance=0.07, arm_radius=0.3), CurrentLoop(kp=0.9, max_voltage=math.inf, substeps=3))
+OWN = Actuator(
+    Motor(inductance=0.07, arm_radius=0.3), CurrentLoop(kp=0.9, max_voltage=math.inf, substeps=3)
+)
 
 
-@pytest.mark.parametrize("actuator", ["ideal", None, "paper", OWN, {"motor": {"inductance": 0.2}}], ids=str)
+@pytest.mark.parametrize(
+    "actuator", ["ideal", None, "paper", OWN, {"motor": {"inductance": 0.2}}], ids=str
+)
 def test_a_configuration_survives_json_and_a_run_folder(tmp_path, actuator):
-    ppo, env = PPOConfig(hidden=(4, 5, 6), gamma=1.0), EnvConfig("cartpole", actuator, "analytic", "semi-implicit", 3)
+    ppo, env = (
+        PPOConfig(hidden=(4, 5, 6), gamma=1.0),
+        EnvConfig("cartpole", actuator, "analytic", "semi-implicit", 3),
+    )
     config = TrainConfig(env, ppo, 7, 123, 2)
     path = tmp_path / "config.json"
     path.write_text(json.dumps({"train": config.as_mapping(), "versions": {}}))
@@ -40,7 +47,9 @@ def test_a_configuration_survives_json_and_a_run_folder(tmp_path, actuator):
 def test_every_preset_is_a_configuration_that_survives_json(agent, task, settings):
     config = TrainConfig.preset(task, agent, settings)
     assert isinstance(config.agent, AGENTS[agent])
-    assert TrainConfig.from_mapping(json.loads(json.dumps(config.as_mapping())), whole=True) == config
+    assert (
+        TrainConfig.from_mapping(json.loads(json.dumps(config.as_mapping())), whole=True) == config
+    )
     assert TrainConfig.from_mapping({"task": task, "agent": agent, "settings": settings}) == config
 
 
@@ -49,7 +58,11 @@ def test_a_name_a_mapping_and_an_actuator_mean_the_same():
     over = {"name": "paper", "controller": {"kp": 0.2, "ki": 0.2, "kd": 0.0, "kff": 0.0}}
     forms = (own, over, named_actuator("weaker", "cartpole"))
     assert {TrainConfig(EnvConfig("cartpole", what)) for what in forms} == {TrainConfig(ENV)}
-    assert EnvConfig("cartpole", "ideal") == EnvConfig("cartpole", None) != EnvConfig("cartpole", "paper")
+    assert (
+        EnvConfig("cartpole", "ideal")
+        == EnvConfig("cartpole", None)
+        != EnvConfig("cartpole", "paper")
+    )
 
 
 def test_a_file_sets_fields_over_the_settings_that_it_names(tmp_path):
@@ -88,14 +101,20 @@ env:
         ({"total_steps": 0}, "total_steps = 0: must be an integer >= 1"),
         ({"total_steps": math.nan}, "total_steps = nan: must be an integer >= 1"),
         ({"total_steps": 1e5}, "total_steps = 100000.0: must be an integer >= 1"),
-        ({"total_steps": None}, "total_steps = None: must be an integer >= 1, or total_episodes must be one"),
+        (
+            {"total_steps": None},
+            "total_steps = None: must be an integer >= 1, or total_episodes must be one",
+        ),
         ({"num_envs": 0}, "num_envs = 0: must be an integer >= 1"),
         ({"num_envs": "8"}, "num_envs = '8': must be an integer >= 1"),
         ({"agent": {"gamma": 0.9}}, "agent = {'gamma': 0.9}: must be a AgentConfig"),
         ({"env": None}, "env = None: must be a EnvConfig"),
         (
             {"env": EnvConfig("acrobot"), "agent": DDPGConfig()},
-            "agent = 'ddpg': cannot act in the Discrete actions of acrobot; agents that can: ppo, dqn",
+            (
+                "agent = 'ddpg': cannot act in the Discrete actions of acrobot; agents that can:"
+                " ppo, dqn"
+            ),
         ),
     ],
 )
@@ -142,12 +161,27 @@ def test_a_damaged_run_configuration_is_named(tmp_path, content):
     ("text", "expected"),
     [
         ("task: cartpole\ntotal_step: 5", "unknown key total_step; did you mean total_steps?"),
-        ("task: cartpole\nagent: {name: ppo, gama: 0.9}", "unknown key agent.gama; did you mean agent.gamma?"),
-        ("task: cartpole\nenv: {center_radios: 0.1}", "unknown key env.center_radios; did you mean env.center_radius?"),
-        ("task: cartpole\nenv: {disturbances: {comand_delay: 1}}", "did you mean disturbances.command_delay?"),
+        (
+            "task: cartpole\nagent: {name: ppo, gama: 0.9}",
+            "unknown key agent.gama; did you mean agent.gamma?",
+        ),
+        (
+            "task: cartpole\nenv: {center_radios: 0.1}",
+            "unknown key env.center_radios; did you mean env.center_radius?",
+        ),
+        (
+            "task: cartpole\nenv: {disturbances: {comand_delay: 1}}",
+            "did you mean disturbances.command_delay?",
+        ),
         ("task: cartpole\nactuator: {controler: {kp: 1}}", "did you mean controller?"),
-        ("task: cartpole\nactuator: {name: weaker, controller: {kq: 1}}", "unknown actuator field controller.kq"),
-        ("task: cartpole\nactuator: {name: ideal, controller: {kp: 1}}", "ideal actuator has no motor"),
+        (
+            "task: cartpole\nactuator: {name: weaker, controller: {kq: 1}}",
+            "unknown actuator field controller.kq",
+        ),
+        (
+            "task: cartpole\nactuator: {name: ideal, controller: {kp: 1}}",
+            "ideal actuator has no motor",
+        ),
         ("task: cartpole\nagent: {gamma: 0.9}", "must be an agent's name"),
         ("task: cartpole\nagent: pppo", "unknown agent 'pppo': did you mean 'ppo'"),
         ("task: cartpole\nagent: {name: ppo, gamma: 1.5}", "PPOConfig.gamma = 1.5"),

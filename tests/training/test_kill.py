@@ -17,8 +17,14 @@ from tests.matrix import but
 from tests.training.interruptions import differing, kill_test, outcome
 
 INTERVAL = 500
-LINE = f"cartpole --actuator weaker --num-envs 4 --total-steps 2500 --checkpoint-interval {INTERVAL} --agent ppo"
-LINE += " --agent.rollout-steps 256 --agent.batch-size 64 --agent.epochs 2 --agent.hidden 8 --no-tensorboard"
+LINE = (
+    f"cartpole --actuator weaker --num-envs 4 --total-steps 2500 --checkpoint-interval {INTERVAL}"
+    " --agent ppo"
+)
+LINE += (
+    " --agent.rollout-steps 256 --agent.batch-size 64 --agent.epochs 2 --agent.hidden 8"
+    " --no-tensorboard"
+)
 LINE += " --evaluation-interval 1000 --evaluation-episodes 2"
 ROLLOUT = 256
 
@@ -91,7 +97,9 @@ def test_a_training_killed_at_a_random_moment_comes_to_the_same_result(expected,
     assert lost <= (INTERVAL + ROLLOUT if number == "SIGKILL" else 0)
     if number != "SIGKILL":
         said = Path("said").read_text().splitlines()[-1]
-        assert said.startswith(f"codrl-mj: stopped after {kill_test.saved_steps(Path('run')):,} steps: continue with ")
+        assert said.startswith(
+            f"codrl-mj: stopped after {kill_test.saved_steps(Path('run')):,} steps: continue with "
+        )
         assert said.endswith("codrl-mj train --resume run")
     continued(expected)
 

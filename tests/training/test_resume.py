@@ -8,7 +8,14 @@ import pytest
 from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import read_run
-from codrl_mj.training import RunInUseError, TrainConfig, TrainingStoppedError, finished, history, watcher
+from codrl_mj.training import (
+    RunInUseError,
+    TrainConfig,
+    TrainingStoppedError,
+    finished,
+    history,
+    watcher,
+)
 from tests.matrix import but
 from tests.training.interruptions import (
     CASES,
@@ -56,7 +63,9 @@ def test_a_run_of_interruptions_changes_nothing(tmp_path, uninterrupted, name):
     interrupt(config, out, 1, TERMINATE)  # twice in a row
     interrupt(config, out, 40, INTERRUPT)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(history, "save_learning_curve", crash)  # after the last checkpoint, before result.json
+        patch.setattr(
+            history, "save_learning_curve", crash
+        )  # after the last checkpoint, before result.json
         with pytest.raises(Crash):
             resume(config, out)
     assert not finished(out)
@@ -64,12 +73,20 @@ def test_a_run_of_interruptions_changes_nothing(tmp_path, uninterrupted, name):
     assert differing(uninterrupted(name), outcome(out)) == []
 
 
-FINAL = ("policy.safetensors", "policy.json", "evaluation.json", "learning_curve.png", "result.json")
+FINAL = (
+    "policy.safetensors",
+    "policy.json",
+    "evaluation.json",
+    "learning_curve.png",
+    "result.json",
+)
 """What a training writes when it has learned, in this order."""
 
 
 @pytest.mark.parametrize("last", FINAL)
-def test_between_the_final_files_a_run_is_not_finished_for_anybody(tmp_path, uninterrupted, monkeypatch, last):
+def test_between_the_final_files_a_run_is_not_finished_for_anybody(
+    tmp_path, uninterrupted, monkeypatch, last
+):
     name, out = "ppo, one optimiser", tmp_path / "run"
     replace, written = Path.replace, []
 
@@ -82,7 +99,9 @@ def test_between_the_final_files_a_run_is_not_finished_for_anybody(tmp_path, uni
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", crash_behind)
-        patch.setattr(history, "save_learning_curve", lambda path, *_: write_json(path, "no picture"))
+        patch.setattr(
+            history, "save_learning_curve", lambda path, *_: write_json(path, "no picture")
+        )
         with pytest.raises(Crash):
             resume(CASES[name], out)
     assert tuple(written) == FINAL[: len(written)]
@@ -93,7 +112,9 @@ def test_between_the_final_files_a_run_is_not_finished_for_anybody(tmp_path, uni
     assert differing(uninterrupted(name), outcome(out)) == []
 
 
-def test_a_signal_before_the_first_step_leaves_a_run_that_starts(tmp_path, uninterrupted, monkeypatch):
+def test_a_signal_before_the_first_step_leaves_a_run_that_starts(
+    tmp_path, uninterrupted, monkeypatch
+):
     name, out = "ppo, one optimiser", tmp_path / "run"
     with monkeypatch.context() as patch:
         reset = ActuatedVecEnv.reset
@@ -105,7 +126,9 @@ def test_a_signal_before_the_first_step_leaves_a_run_that_starts(tmp_path, unint
     assert differing(uninterrupted(name), outcome(out)) == []
 
 
-def test_a_signal_in_the_last_but_one_step_stops_and_one_in_the_last_comes_too_late(tmp_path, uninterrupted):
+def test_a_signal_in_the_last_but_one_step_stops_and_one_in_the_last_comes_too_late(
+    tmp_path, uninterrupted
+):
     name, out = "dqn, epsilon by episodes", tmp_path / "run"
     assert "stopped after 239 steps" in interrupt(CASES[name], out, 239, TERMINATE)
     with after(1, TERMINATE):

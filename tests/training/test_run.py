@@ -69,7 +69,11 @@ def read(path):
 
 def test_the_run_folder_has_the_best_policy_and_a_picture(run):
     out, _ = run
-    assert {path.name for path in (out / "best").iterdir()} == {"evaluation.json", "policy.json", "policy.safetensors"}
+    assert {path.name for path in (out / "best").iterdir()} == {
+        "evaluation.json",
+        "policy.json",
+        "policy.safetensors",
+    }
     with Image.open(out / "learning_curve.png") as image:
         assert image.size == (900, 525)
         assert len(image.convert("RGB").getcolors(100_000)) > 10  # something is drawn
@@ -85,27 +89,39 @@ def test_the_configuration_records_what_was_resolved_and_the_versions(run):
     assert len(content["code"]) == 64
 
 
-def test_progress_is_reported_and_written_at_the_ends_of_rollouts_and_every_episode_is_in_its_table(run):
+def test_progress_is_reported_and_written_at_the_ends_of_rollouts_and_every_episode_is_in_its_table(
+    run,
+):
     out, (report,) = run
     assert report.steps == 512  # 500 rounded up to whole rollouts
     (row,) = read_csv(out / "progress.csv")
     assert {name: float(value) for name, value in row.items()} == dataclasses.asdict(report)
-    assert 8 <= report.mean_return < report.mean_length <= 100  # at most 1 a step, nothing beyond the radius
-    assert min(report.torque_error, report.steps_per_second, report.seconds) > 0  # the actuator is not ideal
+    assert (
+        8 <= report.mean_return < report.mean_length <= 100
+    )  # at most 1 a step, nothing beyond the radius
+    assert (
+        min(report.torque_error, report.steps_per_second, report.seconds) > 0
+    )  # the actuator is not ideal
     episodes = read_csv(out / "episodes.csv")
     assert [int(row["episode"]) for row in episodes] == list(range(1, report.episodes + 1))
     steps = [int(row["steps"]) for row in episodes]
     assert steps == sorted(steps)
     assert steps[-1] <= report.steps
-    assert report.mean_return == pytest.approx(np.mean([float(row["return"]) for row in episodes[-100:]]), rel=1e-12)
+    assert report.mean_return == pytest.approx(
+        np.mean([float(row["return"]) for row in episodes[-100:]]), rel=1e-12
+    )
     lengths = sum(int(row["length"]) for row in episodes)
-    assert report.steps - TINY.num_envs * 500 < lengths <= report.steps  # the rest is in episodes that go on
+    assert (
+        report.steps - TINY.num_envs * 500 < lengths <= report.steps
+    )  # the rest is in episodes that go on
 
 
 def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_policy(run):
     out, (report,) = run
     result = read(out / "result.json")
-    anew = evaluate(load_policy(out), EnvConfig("cartpole", "weaker"), episodes=5, seed=EVALUATION_SEED).returns.mean
+    anew = evaluate(
+        load_policy(out), EnvConfig("cartpole", "weaker"), episodes=5, seed=EVALUATION_SEED
+    ).returns.mean
     assert read(out / "evaluation.json")["returns"]["mean"] == anew == result["evaluation_return"]
     assert (result["steps"], result["episodes"]) == (report.steps, report.episodes)
     assert result["best"] == {"return": anew, "steps": 512}  # the only evaluation
@@ -113,25 +129,38 @@ def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_pol
 
 def test_another_seed_gives_another_policy(run, tmp_path):
     other = train(dataclasses.replace(TINY, seed=2), tmp_path / "other")
-    assert (other / "policy.safetensors").read_bytes() != (run[0] / "policy.safetensors").read_bytes()
+    assert (other / "policy.safetensors").read_bytes() != (
+        run[0] / "policy.safetensors"
+    ).read_bytes()
 
 
 def test_a_report_has_the_evaluation_that_took_place_then_and_no_other(tmp_path, monkeypatch):
     monkeypatch.setattr(watcher, "REPORT_INTERVAL", 1250)
-    config = dataclasses.replace(TINY, total_steps=2500, evaluation_interval=1000, evaluation_episodes=2)
+    config = dataclasses.replace(
+        TINY, total_steps=2500, evaluation_interval=1000, evaluation_episodes=2
+    )
     rows = read_csv(train(config, tmp_path / "run") / "progress.csv")
     found = {int(row["steps"]): math.isfinite(float(row["evaluation_return"])) for row in rows}
-    assert found == {1024: True, 1280: False, 2048: True, 2560: True}  # 1280: the report alone; 2560: the end
+    assert found == {
+        1024: True,
+        1280: False,
+        2048: True,
+        2560: True,
+    }  # 1280: the report alone; 2560: the end
 
 
 def test_the_best_policy_is_kept_though_a_worse_one_comes_last(tmp_path):
     ppo = dataclasses.replace(TINY_PPO, learning_rate=0.05)  # unsteady
-    config = dataclasses.replace(TINY, agent=ppo, total_steps=3000, evaluation_interval=256, evaluation_episodes=5)
+    config = dataclasses.replace(
+        TINY, agent=ppo, total_steps=3000, evaluation_interval=256, evaluation_episodes=5
+    )
     out = train(config, tmp_path / "run")
     evaluations = [float(row["evaluation_return"]) for row in read_csv(out / "progress.csv")]
     result = read(out / "result.json")
     assert result["best"]["return"] >= max(evaluations) > result["evaluation_return"]
-    best = evaluate(load_policy(out / "best"), EnvConfig("cartpole", "weaker"), episodes=5, seed=EVALUATION_SEED)
+    best = evaluate(
+        load_policy(out / "best"), EnvConfig("cartpole", "weaker"), episodes=5, seed=EVALUATION_SEED
+    )
     assert best.returns.mean == result["best"]["return"]
 
 
@@ -147,10 +176,16 @@ def test_tensorboard_gets_returns_and_losses(run):
     assert "train/value_loss" in events.Tags()["scalars"]
 
 
-def test_without_tensorboard_there_are_no_events_and_nothing_lies_anywhere_else(tmp_path, monkeypatch):
-    monkeypatch.setenv("SB3_LOGDIR", str(tmp_path / "theirs"))  # where Stable-Baselines3 would make a folder
+def test_without_tensorboard_there_are_no_events_and_nothing_lies_anywhere_else(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv(
+        "SB3_LOGDIR", str(tmp_path / "theirs")
+    )  # where Stable-Baselines3 would make a folder
     assert not (train(TINY, tmp_path / "run", tensorboard=False) / "tensorboard").exists()
-    monkeypatch.setattr("stable_baselines3.common.logger.SummaryWriter", None)  # as if it were not installed
+    monkeypatch.setattr(
+        "stable_baselines3.common.logger.SummaryWriter", None
+    )  # as if it were not installed
     assert (train(TINY, tmp_path / "other") / "result.json").exists()
     assert {path.name for path in tmp_path.iterdir()} == {"run", "other"}
 
@@ -192,8 +227,12 @@ def test_episodes_can_be_counted_instead_of_steps(tmp_path):
         (["tensorboard/mine"], False),
         (["best/policy.json"], False),
         (["policy.json"], False),
-        *((["notes.txt", theirs], False) for theirs in ("config.json", ".lock", "best", "tensorboard/events")),
-        # what a training has before it learned anything is a folder to begin in, but not with something else
+        *(
+            (["notes.txt", theirs], False)
+            for theirs in ("config.json", ".lock", "best", "tensorboard/events")
+        ),
+        # what a training has before it learned anything is a folder to begin in, but not with
+        # something else
         *(([theirs], True) for theirs in ("precious.txt", "best/policy.json", "policy.json")),
     ],
 )
@@ -229,7 +268,9 @@ def test_what_cannot_be_trained_is_refused_with_nothing_written(tmp_path, change
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_training_that_breaks_off_before_it_learned_anything_does_not_block_the_next(tmp_path, monkeypatch):
+def test_a_training_that_breaks_off_before_it_learned_anything_does_not_block_the_next(
+    tmp_path, monkeypatch
+):
     out, kept = tmp_path / "runs" / "run", tmp_path / "kept"
     kept.mkdir()
     with monkeypatch.context() as patch:
@@ -251,10 +292,15 @@ def test_weights_that_are_no_numbers_are_named_and_not_kept(tmp_path, monkeypatc
 
     monkeypatch.setattr(FastPPO, "train", diverging)
     often = dataclasses.replace(TINY, total_steps=1000, checkpoint_interval=256)
-    message = r"weights of ppo became no finite numbers by step 512: .* Lower agent\.learning_rate = 0\.001, or"
+    message = (
+        r"weights of ppo became no finite numbers by step 512: .* Lower agent\.learning_rate ="
+        r" 0\.001, or"
+    )
     with pytest.raises(FloatingPointError, match=message):
         train(often, tmp_path / "run")
-    assert [path.name[:17] for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["step-000000000256"]
+    assert [path.name[:17] for path in (tmp_path / "run" / "checkpoints").iterdir()] == [
+        "step-000000000256"
+    ]
 
 
 @pytest.mark.parametrize("line", ["train cartpole --out run", "train --resume run"])
@@ -286,6 +332,8 @@ def test_the_torque_error_of_compiled_episodes_is_that_of_all_their_steps(tmp_pa
         errors.append([float(row["torque_error"]) for row in read_csv(out / "progress.csv")])
     assert errors[0] == pytest.approx(errors[1], rel=1e-9)
     assert errors[0][0] > 0.1
-    drawn = dataclasses.replace(config.env, randomize={"motor.arm_radius": "choice(2.0)"})  # whose is it?
+    drawn = dataclasses.replace(
+        config.env, randomize={"motor.arm_radius": "choice(2.0)"}
+    )  # whose is it?
     out = train(dataclasses.replace(config, env=drawn, total_episodes=1), tmp_path / "drawn")
     assert all(row["torque_error"] == "nan" for row in read_csv(out / "progress.csv"))

@@ -21,23 +21,42 @@ FOR_THE_LOG, COPIED, DRAWN = {"_n_updates"}, {"env.observations"}, {"env.rejecte
 NUMPY, TORCH, ACTIONS = {"random.numpy", "random.numpy.key"}, {"random.torch"}, {"random.actions"}
 WITHOUT_EFFECT = {
     "ppo, an episode budget": FOR_THE_LOG | COPIED | DRAWN | ACTIONS | {"_episode_num"},
-    "ppo, state-dependent noise": FOR_THE_LOG
-    | COPIED
-    | ACTIONS
-    | {"_episode_num", "noise.exploration_mat", "noise.exploration_matrices"},  # a rollout draws its own
+    "ppo, state-dependent noise": (
+        FOR_THE_LOG
+        | COPIED
+        | ACTIONS
+        | {
+            "_episode_num",
+            "noise.exploration_mat",
+            "noise.exploration_matrices",
+        }
+    ),  # a rollout draws its own
     "ddpg": FOR_THE_LOG | COPIED | TORCH | {"_episode_num"},
-    "dqn, epsilon by episodes": FOR_THE_LOG | COPIED | DRAWN | TORCH | {"exploration_rate"},  # by _episode_num
-    "dqn, epsilon by steps": FOR_THE_LOG | COPIED | TORCH | {"_episode_num", "exploration_rate"},  # by num_timesteps
+    "dqn, epsilon by episodes": (
+        FOR_THE_LOG | COPIED | DRAWN | TORCH | {"exploration_rate"}
+    ),  # by _episode_num
+    "dqn, epsilon by steps": (
+        FOR_THE_LOG | COPIED | TORCH | {"_episode_num", "exploration_rate"}
+    ),  # by num_timesteps
     "td3": COPIED | {"_episode_num"},
     "sac, learned entropy coefficient": FOR_THE_LOG | COPIED | DRAWN | {"_episode_num"},
-    "sarsa": FOR_THE_LOG
-    | NUMPY
-    | TORCH
-    | ACTIONS
-    | {"exploration_rate", "last_obs", "env.ended", "env.lengths", "env.returns"},  # between two whole episodes
+    "sarsa": (
+        FOR_THE_LOG
+        | NUMPY
+        | TORCH
+        | ACTIONS
+        | {
+            "exploration_rate",
+            "last_obs",
+            "env.ended",
+            "env.lengths",
+            "env.returns",
+        }
+    ),  # between two whole episodes
 }
-"""For each case the entries that make no difference: counts that only the log has, generators that the agent does not
-draw from, and what can be computed from other entries."""
+"""For each case the entries that make no difference: counts that only the log has, generators that
+the agent does not draw from, and what can be computed from other entries.
+"""
 NETWORKS_ASKED = ("ppo, an episode budget", "ddpg")
 """Cases in which each tensor of networks and optimisers is asked for; the others restore theirs by the same lines."""
 
@@ -68,7 +87,11 @@ class Stretch(BaseCallback):
         for info in self.locals["infos"]:
             if "episode" in info:
                 self.episodes.append(
-                    (*info["terminal_observation"].tolist(), info["episode"]["r"], info["episode"]["l"])
+                    (
+                        *info["terminal_observation"].tolist(),
+                        info["episode"]["r"],
+                        info["episode"]["l"],
+                    )
                 )
         return True
 
@@ -87,14 +110,20 @@ class Learner:
         stretch = Stretch(start, end)
         with pytest.raises(LearningEnded):
             self.model.learn(10**6, callback=stretch, log_interval=None)
-        return stretch.reached, {**stretch.reached.arrays, **stretch.reached.facts, "episodes": stretch.episodes}
+        return stretch.reached, {
+            **stretch.reached.arrays,
+            **stretch.reached.facts,
+            "episodes": stretch.episodes,
+        }
 
 
 def quick(config):
     """The same with few gradient steps."""
     if "gradient_steps" not in {field.name for field in dataclasses.fields(config.agent)}:
         return config
-    return dataclasses.replace(config, agent=dataclasses.replace(config.agent, train_every=4, gradient_steps=2))
+    return dataclasses.replace(
+        config, agent=dataclasses.replace(config.agent, train_every=4, gradient_steps=2)
+    )
 
 
 def matters(learner, start, name, end, expected):
@@ -115,7 +144,9 @@ def another(name, value):
         return torch.Generator().manual_seed(1).get_state().numpy()
     if name.startswith("random") and isinstance(value, dict):
         inner = value["state"]
-        return value | {"state": {"pos": (inner["pos"] + 7) % 624} if "pos" in inner else inner | {"state": 1}}
+        return value | {
+            "state": {"pos": (inner["pos"] + 7) % 624} if "pos" in inner else inner | {"state": 1}
+        }
     if name == "buffer.actions" and value.dtype.kind == "i":
         return 1 - value  # of two
     if name.endswith(".groups"):
@@ -150,14 +181,19 @@ def test_every_entry_of_the_state_matters_and_none_may_be_missing(name):
     learner = Learner(config)
     length = {"ppo": 32, "dqn": 24 * config.num_envs}.get(config.agent.name, 8 * config.num_envs)
     mattered = set()
-    for begin in (20, 69 * config.num_envs):  # in the middle of episodes, before and after a buffer is learned from
+    for begin in (
+        20,
+        69 * config.num_envs,
+    ):  # in the middle of episodes, before and after a buffer is learned from
         start, _ = learner.learn(None, begin)
         end = start.facts["num_timesteps"] + length
         _, expected = learner.learn(start, end)
         _, repeated = learner.learn(start, end)
         assert [entry for entry in expected if not equal(expected[entry], repeated[entry])] == []
         found = {*start.arrays, *start.facts}
-        for entry in sorted(found - mattered):  # always in the same order: generators go on from one to the next
+        for entry in sorted(
+            found - mattered
+        ):  # always in the same order: generators go on from one to the next
             network = is_network(entry) and config.agent.name != "sarsa"
             if not network or (begin > 20 and name in NETWORKS_ASKED):
                 mattered |= {entry} if matters(learner, start, entry, end, expected) else set()
@@ -165,6 +201,8 @@ def test_every_entry_of_the_state_matters_and_none_may_be_missing(name):
                 mattered.add(entry)
     assert found - mattered == EVERYWHERE | WITHOUT_EFFECT[name]
     for entry in found:
-        arrays, facts = ({key: value for key, value in part.items() if key != entry} for part in start)
+        arrays, facts = (
+            {key: value for key, value in part.items() if key != entry} for part in start
+        )
         with pytest.raises(ValueError, match="of another configuration"):
             restore(learner.model, learner.envs, State(arrays, facts))

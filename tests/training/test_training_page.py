@@ -24,7 +24,9 @@ def elsewhere(tmp_path, monkeypatch):
     begin(Path("runs/mine"), TrainConfig(EnvConfig("cartpole")))
 
 
-@pytest.mark.parametrize("command", re.findall(r"^\$ codrl-mj (.*)$|`codrl-mj ([a-z]+ [^`A-Z]*)`", PAGE, re.MULTILINE))
+@pytest.mark.parametrize(
+    "command", re.findall(r"^\$ codrl-mj (.*)$|`codrl-mj ([a-z]+ [^`A-Z]*)`", PAGE, re.MULTILINE)
+)
 def test_the_commands_are_understood(command, monkeypatch):
     parsed = []
     for verb in cli.VERBS:
@@ -50,9 +52,13 @@ def test_the_configuration_file_says_what_it_seems_to():
 def test_the_python_example_runs_and_leaves_the_files_of_the_table():
     (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     exec(compile(block, "training.md", "exec"), {})
-    rows = re.findall(r"^\| (`.*?) \| .* \| .* \|$", PAGE.partition("## Configurations")[0], re.MULTILINE)
+    rows = re.findall(
+        r"^\| (`.*?) \| .* \| .* \|$", PAGE.partition("## Configurations")[0], re.MULTILINE
+    )
     named = {name.rstrip("/") for row in rows for name in re.findall(r"`(.*?)`", row)}
-    assert named == {path.name for path in Path("runs/sarsa").iterdir() if not path.name.startswith(".")}
+    assert named == {
+        path.name for path in Path("runs/sarsa").iterdir() if not path.name.startswith(".")
+    }
 
 
 def test_the_columns_that_may_differ_are_those_of_the_tests():

@@ -13,7 +13,15 @@ from codrl_mj.validation import convergence
 from codrl_mj.validation.compare import gymnasium_equations
 from codrl_mj.validation.convergence import free_run, solve
 from tests.reference import cartpole_accelerations
-from tests.validation.mutations import euler, failed, late_force, once, scaled, scaled_motor, wrong_model
+from tests.validation.mutations import (
+    euler,
+    failed,
+    late_force,
+    once,
+    scaled,
+    scaled_motor,
+    wrong_model,
+)
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
 
@@ -37,9 +45,13 @@ def failures(monkeypatch, task):
 
 MOTOR = {"inductance": 1.05, "resistance": 1.05, "torque_constant": 1.05, "back_emf_constant": -1.0}
 FAULTS = [
-    # task, its model's fault, and of the checks ideal, with the motor and rate: which fail, and which others may
+    # task, its model's fault, and of the checks ideal, with the motor and rate: which fail, and
+    # which others may
     *((task, scaled("body_mass", 1.01), "ideal motor rate", "") for task in TASKS),
-    *((task, scaled("actuator_gear", 1.01), "motor rate", "ideal") for task in ("pendulum", "acrobot")),
+    *(
+        (task, scaled("actuator_gear", 1.01), "motor rate", "ideal")
+        for task in ("pendulum", "acrobot")
+    ),
     *(("pendulum", scaled_motor(*one), "motor", "rate") for one in MOTOR.items()),
     ("acrobot", euler, "ideal", "motor rate"),
     ("pendulum", scaled("actuator_gear", 1e9), "ideal motor rate", ""),  # it diverges
@@ -50,7 +62,9 @@ FAULTS = [
 def test_a_wrong_model_fails_the_checks_that_see_it(monkeypatch, task, fault, seen_by, others):
     wrong_model(monkeypatch, fault)
     names = {"ideal": ideal(task), "motor": with_motor(task), "rate": {RATE}}
-    least, more = (set().union(*(names[one] for one in words.split())) for words in (seen_by, others))
+    least, more = (
+        set().union(*(names[one] for one in words.split())) for words in (seen_by, others)
+    )
     assert least <= failures(monkeypatch, task) <= least | more
 
 
@@ -63,7 +77,9 @@ def test_a_force_that_is_a_step_late_fails_every_check(monkeypatch, task):
 def test_a_wrong_force_on_the_analytic_physics_fails_every_check(monkeypatch):
     step = AnalyticPhysics.step
     monkeypatch.setattr(AnalyticPhysics, "step", lambda self, force: step(self, 1.01 * force))
-    assert ideal("cartpole") | with_motor("cartpole") <= failed(convergence.checks("cartpole", quick=True))
+    assert ideal("cartpole") | with_motor("cartpole") <= failed(
+        convergence.checks("cartpole", quick=True)
+    )
 
 
 # -- the oracle ---------------------------------------------------------------------------------------------
@@ -78,7 +94,9 @@ def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
         self.gravity *= 0.99
 
     monkeypatch.setattr(gymnasium.envs.classic_control.CartPoleEnv, "__init__", lighter)
-    checks = [check for check in convergence.checks("cartpole", quick=True) if "ideal" in check.name]
+    checks = [
+        check for check in convergence.checks("cartpole", quick=True) if "ideal" in check.name
+    ]
     assert checks
     for check in checks:
         assert not check.passed
@@ -92,10 +110,14 @@ def test_the_equations_are_the_textbooks():
     for _ in range(20):
         angle, speed, force = generator.uniform(-2, 2, 3)
         expected = [speed, 15.0 * np.sin(angle) + 3.0 * force]
-        np.testing.assert_allclose(pendulum(np.array([angle, speed]), force), expected, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(
+            pendulum(np.array([angle, speed]), force), expected, rtol=0, atol=1e-11
+        )
         accelerations = cartpole_accelerations(angle, speed, force)
         expected = [0.1, accelerations[0], speed, accelerations[1]]
-        np.testing.assert_allclose(cartpole(np.array([0.0, 0.1, angle, speed]), force), expected, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(
+            cartpole(np.array([0.0, 0.1, angle, speed]), force), expected, rtol=0, atol=1e-11
+        )
         x, v = generator.uniform(-0.9, 0.3), generator.uniform(-0.02, 0.02)
         expected = [v, 0.0015 * force / 2 - 0.0025 * np.cos(3 * x)]
         np.testing.assert_allclose(car(np.array([x, v]), force / 2), expected, rtol=0, atol=1e-14)
@@ -104,10 +126,14 @@ def test_the_equations_are_the_textbooks():
 def test_acrobots_equations_are_the_limit_of_its_steps():
     task = TASKS["acrobot"]
     equations, state = gymnasium_equations(task), np.array([0.3, -0.7, 0.9, -1.1])
-    physics = AnalyticPhysics(Plant(dataclasses.replace(task, step_duration=1e-4), [IDEAL], 1, "rk4"))
+    physics = AnalyticPhysics(
+        Plant(dataclasses.replace(task, step_duration=1e-4), [IDEAL], 1, "rk4")
+    )
     physics.reset(state)
     physics.step(1.0)
-    np.testing.assert_allclose((physics.state - state) / 1e-4, equations(state, 1.0), rtol=0, atol=2e-3)
+    np.testing.assert_allclose(
+        (physics.state - state) / 1e-4, equations(state, 1.0), rtol=0, atol=2e-3
+    )
 
 
 @pytest.mark.parametrize("motor", [False, True], ids=["ideal", "motor"])
@@ -118,7 +144,9 @@ def test_the_runs_stay_away_from_every_bound(task, motor):
     start, forces, _ = free_run(definition)
     actuators = convergence.analogues(definition) if motor else [IDEAL]
     states = [*solve(definition, gymnasium_equations(definition), start, forces, actuators)]
-    unbounded = dataclasses.replace(definition, step_duration=definition.step_duration / 128, constrain=None)
+    unbounded = dataclasses.replace(
+        definition, step_duration=definition.step_duration / 128, constrain=None
+    )
     physics = MujocoPhysics(Plant(unbounded, actuators, 1, definition.integrators[0]))
     physics.reset(start)
     for force in forces:
@@ -126,4 +154,6 @@ def test_the_runs_stay_away_from_every_bound(task, motor):
             physics.step(force)
             states.append(physics.state)
     entries = np.array(states).T
-    np.testing.assert_array_equal(definition.constrain(entries, definition.step_duration / 16), entries)
+    np.testing.assert_array_equal(
+        definition.constrain(entries, definition.step_duration / 16), entries
+    )

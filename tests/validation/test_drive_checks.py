@@ -10,7 +10,9 @@ from codrl_mj.actuators import Drive, GearMotor
 from codrl_mj.tasks import OURS, TASKS
 from codrl_mj.validation.drives import FITTED, Bench, Mechanics, drive_checks, fitted
 
-ROTOR = GearMotor(rotor_inertia=0.02, viscous_friction=0.3, coulomb_friction=0.4, gear_ratio=2.0, arm_radius=0.8)
+ROTOR = GearMotor(
+    rotor_inertia=0.02, viscous_friction=0.3, coulomb_friction=0.4, gear_ratio=2.0, arm_radius=0.8
+)
 ARMATURE, DAMPING, FRICTION = 0.02 * 6.25, 0.3 * 6.25, 0.4 * 2.5  # (n/r)^2 and n/r
 
 
@@ -42,7 +44,9 @@ def test_the_oracle_moves_as_mass_matrices_with_a_rotor_say(task, state, integra
     sliding = 0.6 - DAMPING * state[1] - math.copysign(FRICTION, state[1])
     implicit = step * DAMPING if integrator == "semi-implicit" else 0.0
     expected = accelerations(task, state, sliding, ARMATURE + implicit)
-    np.testing.assert_allclose((after[speeds] - np.array(state)[speeds]) / step, expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        (after[speeds] - np.array(state)[speeds]) / step, expected, rtol=1e-9
+    )
 
 
 def test_the_oracle_holds_what_is_less_than_the_friction():
@@ -63,7 +67,9 @@ def test_the_bench_settles_at_what_is_asked_or_at_ohm_s_law():
     assert torques[-1] == pytest.approx(0.05, rel=1e-9)
     stalled = [bench.torque(10.0, 100.0) for _ in range(3)]
     assert stalled[-1] == pytest.approx(0.042 * (24.0 - 0.042 * 100.0) / 8.4, rel=1e-9)
-    lossy = Bench(dataclasses.replace(one, motor=dataclasses.replace(one.motor, gear_efficiency=0.8)), 0.01)
+    lossy = Bench(
+        dataclasses.replace(one, motor=dataclasses.replace(one.motor, gear_efficiency=0.8)), 0.01
+    )
     assert [lossy.torque(0.05, 100.0) for _ in range(3)][-1] == pytest.approx(0.04, rel=1e-9)
 
 

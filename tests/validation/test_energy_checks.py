@@ -17,7 +17,11 @@ STEPS = "winding, step by step"
 
 
 def orders(task, *balances):
-    return {f"order, {balance} balance, {name}" for balance in balances for name in TASKS[task].integrators}
+    return {
+        f"order, {balance} balance, {name}"
+        for balance in balances
+        for name in TASKS[task].integrators
+    }
 
 
 def failures(monkeypatch, task):
@@ -68,7 +72,9 @@ def test_a_wrong_force_on_the_analytic_physics_fails(monkeypatch):
         self.twin = Stronger()
 
     monkeypatch.setattr(AnalyticPhysics, "__init__", stronger)
-    checks = {check.name: check for check in energy.checks("pendulum", quick=True) if not check.passed}
+    checks = {
+        check.name: check for check in energy.checks("pendulum", quick=True) if not check.passed
+    }
     assert checks.keys() == orders("pendulum", "mechanical", "whole")
     assert all(check.where.startswith("analytic") for check in checks.values())
 
@@ -92,10 +98,14 @@ def test_the_meter_reads_textbook_energies():
     for _ in range(10):
         x, v, angle, speed = generator.uniform(-2, 2, 4)
         expected = speed**2 / 6 + 5 * np.cos(angle)  # a rod of 1 kg and 1 m: I = 1/3
-        assert pendulum(np.array([angle, speed])) == pytest.approx(expected, abs=1e-4)  # 1e-5 kg*m^2 about its length
+        assert pendulum(np.array([angle, speed])) == pytest.approx(
+            expected, abs=1e-4
+        )  # 1e-5 kg*m^2 about its length
         kinetic = 0.55 * v**2 + 0.05 * v * speed * np.cos(angle) + (0.1 * 1.0 / 3) * speed**2 / 2
         difference = cartpole(np.array([x, v, angle, speed])) - cartpole(np.zeros(4))
-        assert difference == pytest.approx(kinetic + 0.1 * 9.8 * 0.5 * (np.cos(angle) - 1), abs=1e-12)
+        assert difference == pytest.approx(
+            kinetic + 0.1 * 9.8 * 0.5 * (np.cos(angle) - 1), abs=1e-12
+        )
 
 
 @pytest.mark.parametrize("task", HILL_TASKS)
@@ -110,7 +120,9 @@ def test_the_hills_potential_is_the_integral_of_gymnasiums_force(task):
 def test_a_loaded_spring_of_a_motor_pays_for_everything():
     """Signs: a motor that accelerates a load draws more than it heats; what it gives back is negative."""
     task = TASKS["mountain_car"]
-    ledger = keep(MujocoPhysics, task, task.paper, np.array([-0.5, 0.0]), np.ones(20), 20, "semi-implicit", 20)
+    ledger = keep(
+        MujocoPhysics, task, task.paper, np.array([-0.5, 0.0]), np.ones(20), 20, "semi-implicit", 20
+    )
     assert ledger.supplied[-1] > ledger.copper[-1] > 0
     assert ledger.magnetic[-1] > 0
     assert ledger.shaft[-1] > 0

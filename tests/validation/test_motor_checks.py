@@ -35,7 +35,15 @@ LOOP = {ORDER, LIMIT, SAMPLED, STEP, MAGNITUDE, PHASE}
 NATIVE = {MAP, SUB, FAST}
 COMPILED = {
     f"compiled advance: {kind}"
-    for kind in ("Actuator", "VoltageDriven", "Drive", "VoltageDrive", "Servo", "Lag", "TorqueSpeed")
+    for kind in (
+        "Actuator",
+        "VoltageDriven",
+        "Drive",
+        "VoltageDrive",
+        "Servo",
+        "Lag",
+        "TorqueSpeed",
+    )
 }
 DRIVES = {"drives, exact winding", "drives, closed form"}
 EVERY = LOOP | {VOLTAGE, LINE, NO_LOAD, RK4, GEM} | NATIVE | COMPILED | DRIVES
@@ -99,7 +107,10 @@ MUTATIONS = {
     "inductance + 0.1 %": (scaled("inductance", 1.001), LOOP | {MAP, SUB}),
     "resistance + 1 %": (scaled("resistance", 1.01), EVERY - {NO_LOAD}),
     "torque constant + 1 %": (scaled("torque_constant", 1.01), {VOLTAGE, LINE} | NATIVE | {GEM}),
-    "back-EMF reversed": (scaled("back_emf_constant", -1), {ORDER, LIMIT, SAMPLED, LINE, NO_LOAD, GEM} | NATIVE),
+    "back-EMF reversed": (
+        scaled("back_emf_constant", -1),
+        {ORDER, LIMIT, SAMPLED, LINE, NO_LOAD, GEM} | NATIVE,
+    ),
     "kp and ki swapped": (swapped, LOOP),
     "kp + 0.1 %": (scaled("kp", 1.001), LOOP),
     "ki + 1 %": (scaled("ki", 1.01), LOOP),
@@ -121,7 +132,9 @@ def test_a_wrong_motor_fails(monkeypatch, mutation):
 
 def test_every_family_is_compared_with_its_python():
     names = {f"compiled advance: {kind.__name__}" for kind in FAMILIES.values()}
-    assert names - COMPILED == {"compiled advance: Ideal"}, "the ideal actuator alone has no callback"
+    assert names - COMPILED == {"compiled advance: Ideal"}, (
+        "the ideal actuator alone has no callback"
+    )
 
 
 def test_every_check_is_failed_by_some_mutation():
@@ -133,7 +146,10 @@ def test_a_command_that_is_a_step_late_fails(monkeypatch):
 
     def late(model, data):
         _, command = waiting.get(id(data), (data, np.zeros_like(data.ctrl)))
-        waiting[id(data)] = data, data.ctrl.copy()  # which keeps the data: their id is not used again
+        waiting[id(data)] = (
+            data,
+            data.ctrl.copy(),
+        )  # which keeps the data: their id is not used again
         data.ctrl[:] = command
         step(model, data)
 
@@ -149,7 +165,9 @@ def test_a_task_has_its_own_loop_checked(monkeypatch):
 
 def test_a_motor_that_never_saturates_and_one_without_back_emf_have_their_own_checks():
     quiet = Actuator(Motor(back_emf_constant=0.0), CurrentLoop(max_voltage=math.inf))
-    names = {check.name: check for check in motor.checks_of({"mine": Loop(quiet, 0.01)}, quick=True)}
+    names = {
+        check.name: check for check in motor.checks_of({"mine": Loop(quiet, 0.01)}, quick=True)
+    }
     assert names.keys() == LOOP | {LINE}
     assert all(check.passed for check in names.values())
 
@@ -157,13 +175,21 @@ def test_a_motor_that_never_saturates_and_one_without_back_emf_have_their_own_ch
 @pytest.mark.parametrize("supply", [Supply(12.0), Supply(24.0, 0.5), Supply(np.inf, 0.5), None])
 def test_a_motor_behind_a_supply_is_held_to_the_torque_that_this_leaves(supply):
     actuator = Actuator(controller=CurrentLoop(kp=2.0, ki=5.0), supply=supply)
-    checks = {check.name: check for check in motor.checks_of({"mine": Loop(actuator, 0.01)}, quick=True)}
+    checks = {
+        check.name: check for check in motor.checks_of({"mine": Loop(actuator, 0.01)}, quick=True)
+    }
     assert checks["stall torque at the voltage limit"].passed
 
 
 def test_a_stiff_motor_passes_at_its_own_substeps():
     stiff = Actuator(
-        Motor(resistance=0.5, inductance=2e-4, torque_constant=0.05, back_emf_constant=0.05, arm_radius=0.02),
+        Motor(
+            resistance=0.5,
+            inductance=2e-4,
+            torque_constant=0.05,
+            back_emf_constant=0.05,
+            arm_radius=0.02,
+        ),
         CurrentLoop(kp=0.5, ki=800.0, substeps=40),
     )
     for check in motor.checks_of({"mine": Loop(stiff, 0.01)}, quick=True):
@@ -192,7 +218,10 @@ def test_the_sampled_oracles_are_the_papers_equations(name):
 
 def test_the_closed_form_solves_the_circuits_equations():
     """Against scipy's integrator, on the loop without a derivative."""
-    actuator = Actuator(Motor(inductance=0.05, back_emf_constant=0.7), CurrentLoop(kp=2, ki=5, bemf_compensation=False))
+    actuator = Actuator(
+        Motor(inductance=0.05, back_emf_constant=0.7),
+        CurrentLoop(kp=2, ki=5, bemf_compensation=False),
+    )
 
     def derivative(_, state):
         current, integral = state
@@ -200,7 +229,9 @@ def test_the_closed_form_solves_the_circuits_equations():
         return [(voltage - 0.7 * 0.4 - current) / 0.05, 1.0 - current]
 
     times = 0.02 * np.arange(1, 41)
-    solved = integrate.solve_ivp(derivative, (0, times[-1]), [0, 0], "DOP853", times, rtol=1e-12, atol=1e-12)
+    solved = integrate.solve_ivp(
+        derivative, (0, times[-1]), [0, 0], "DOP853", times, rtol=1e-12, atol=1e-12
+    )
     np.testing.assert_allclose(
         closed_form(actuator, 0.02, np.ones(40), 0.4),
         solved.y[0],

@@ -16,7 +16,11 @@ def check(errors, promised):
 
 
 def judged(family, promised):
-    return outcome(order("name", "oracle"), {}, [of_order(promised, [family], "title", "step [s]", "error [m]")])
+    return outcome(
+        order("name", "oracle"),
+        {},
+        [of_order(promised, [family], "title", "step [s]", "error [m]")],
+    )
 
 
 @pytest.mark.parametrize("power", [1.0, 4.0, -1.0])
@@ -30,12 +34,21 @@ def test_a_pure_power_has_its_exponent_and_no_interval(power):
 def test_the_interval_is_that_of_scipys_curve_fit():
     errors = STEPS * np.array([1.1, 0.9, 1.05, 0.97, 1.2])
     _, covariance = optimize.curve_fit(lambda x, a, b: a * x + b, np.log(STEPS), np.log(errors))
-    assert fit_slope(STEPS, errors)[1] == pytest.approx(3.182446 * math.sqrt(covariance[0, 0]), rel=1e-4)
+    assert fit_slope(STEPS, errors)[1] == pytest.approx(
+        3.182446 * math.sqrt(covariance[0, 0]), rel=1e-4
+    )
 
 
 @pytest.mark.parametrize(
     "errors",
-    [STEPS**2, STEPS + 0.02, np.full(5, 1e-3), [*STEPS[:4], math.nan], [*STEPS[:4], 0.0], [*STEPS[:4], math.inf]],
+    [
+        STEPS**2,
+        STEPS + 0.02,
+        np.full(5, 1e-3),
+        [*STEPS[:4], math.nan],
+        [*STEPS[:4], 0.0],
+        [*STEPS[:4], math.inf],
+    ],
     ids=["another order", "an offset", "constant", "nan", "zero", "infinite"],
 )
 def test_what_is_not_of_the_promised_order_fails(errors):
@@ -47,7 +60,11 @@ def test_what_is_not_of_the_promised_order_fails(errors):
     [
         ([1.2e-13, 7.5e-15, 2e-16, 1e-16, 3e-16], True, "exact to rounding"),  # two above it
         ([0.0, 0.0, 0.0, 0.0, 0.0], True, "exact to rounding"),
-        ([1e-11, 7.5e-16, 2e-16, 1e-16, 3e-16], False, "exact to rounding"),  # more than the order leaves
+        (
+            [1e-11, 7.5e-16, 2e-16, 1e-16, 3e-16],
+            False,
+            "exact to rounding",
+        ),  # more than the order leaves
         ([math.nan, 1e-16, 1e-16, 1e-16, 1e-16], False, "exact to rounding"),
         ([1.6e-10, 1e-11, 6.25e-13, 4e-14, 9e-16], True, "slope 3.99"),  # without the last
         ([1e-13, 9e-14, 8e-14, 7e-14, 6e-14], False, "slope 0.18"),

@@ -111,7 +111,10 @@ CASES = {
         (('timestep="0.001"', 'timestep="0.001" density="1000" viscosity="0.001"'),),
         {},
         {"convergence: order, rk4, ideal actuator"},
-        "textbook steps: slope .*, where 4 was promised: the run is too violent for these steps, or not smooth",
+        (
+            "textbook steps: slope .*, where 4 was promised: the run is too violent for these"
+            " steps, or not smooth"
+        ),
     ),
 }
 
@@ -122,7 +125,11 @@ def test_a_model_of_ones_own_fails_no_check_whose_conditions_it_does_not_meet(
 ):
     found = judged(furuta(tmp_path, changes, **fields))
     assert found.passed, [check.where for check in found.checks if not check.passed]
-    skips = {f"{one.group}: {one.name}": one.reason for one in found.skipped if "equations of motion" not in one.name}
+    skips = {
+        f"{one.group}: {one.name}": one.reason
+        for one in found.skipped
+        if "equations of motion" not in one.name
+    }
     assert skips.keys() == left_out
     for text in skips.values():
         with pytest.raises(ValueError, match=reason):
@@ -134,7 +141,10 @@ def test_a_fault_of_ours_is_still_found_in_somebodys_task_and_said_to_be_ours(tm
     with wrong_model(("timestep", None, 1.001)):
         found = judged(task)
     failed = {check.name: check.fault for check in found.checks if not check.passed}
-    assert "textbook steps of such sizes have this order: " + REPORT in failed["order, rk4, ideal actuator"]
+    assert (
+        "textbook steps of such sizes have this order: " + REPORT
+        in failed["order, rk4, ideal actuator"]
+    )
     assert "gentler run in Task.trials" in failed["order, mechanical balance, rk4"]
 
 
@@ -143,7 +153,14 @@ def test_an_unstable_motor_is_its_owners():
     model = codrl_mj.motorise(arm("implicitfast"), {".*": unstable}, allow_unstable=True).compile()
     found = validate_model(model, quick=True).checks
     failed = [one.fault for one in found if one.name.startswith("stable: ")]
-    assert failed == ["your model or motor is not stable at this step: shorten it, or slow down the motor's loop"] * 2
+    assert (
+        failed
+        == [
+            "your model or motor is not stable at this step: shorten it, or slow down the motor's"
+            " loop"
+        ]
+        * 2
+    )
 
 
 def test_of_our_tasks_nobody_else_is_to_blame():

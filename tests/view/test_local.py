@@ -35,7 +35,10 @@ def status(server, **headers):
 def connect(server, **options):
     port = server.get_port()
     return websockets.connect(
-        f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, **options
+        f"ws://127.0.0.1:{port}",
+        subprotocols=[f"viser-v{viser.__version__}"],
+        max_size=None,
+        **options,
     )
 
 
@@ -62,7 +65,9 @@ def test_only_its_own_pages_are_answered(server):
     assert status(server, Origin=f"http://127.0.0.1:{port}") == 200
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "https://127.0.0.1:{port}"])
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "http://127.0.0.1:1", "https://127.0.0.1:{port}"]
+)
 def test_pages_of_others_cannot_open_a_socket(server, origin):
     async def attempt():
         async with connect(server, origin=origin.format(port=server.get_port())):
@@ -73,7 +78,13 @@ def test_pages_of_others_cannot_open_a_socket(server, origin):
 
 
 def test_malformed_messages_and_clients_that_vanish_do_it_no_harm(server):
-    bad = [b"", b"\x00\xff\x13", b"\xc1", *map(msgspec.msgpack.encode, ({"type": "Nonsense"}, [1, 2])), "text"]
+    bad = [
+        b"",
+        b"\x00\xff\x13",
+        b"\xc1",
+        *map(msgspec.msgpack.encode, ({"type": "Nonsense"}, [1, 2])),
+        "text",
+    ]
 
     async def attempt():
         for message in bad:

@@ -19,7 +19,10 @@ POLE, MOTOR = "InvertedPendulum-v5", "maxon-re65"
 
 
 def session(motor=MOTOR, policies=(), **arguments):
-    made = Session(EnvConfig.from_mapping({"task": POLE, "actuator": {".*": motor}, **arguments}), dict(policies))
+    made = Session(
+        EnvConfig.from_mapping({"task": POLE, "actuator": {".*": motor}, **arguments}),
+        dict(policies),
+    )
     made.choose("zero")
     made.again = False
     return made
@@ -45,7 +48,9 @@ def test_a_push_is_a_force_at_the_bodys_centre_of_mass():
     model, data = made.model, mujoco.MjData(made.model)
     data.qpos[:], data.qvel[:] = made.data.qpos, made.data.qvel
     made.push("pole", 3.0)
-    lasts = int(np.ceil(PUSH_DURATION / model.opt.timestep / 2)) * 2  # whole environment steps of two integration steps
+    lasts = (
+        int(np.ceil(PUSH_DURATION / model.opt.timestep / 2)) * 2
+    )  # whole environment steps of two integration steps
     for step in range(10):
         assert made.step()
         for inner in range(2):
@@ -75,7 +80,9 @@ def test_a_setting_goes_into_the_simulation_and_the_motion_goes_on(motorised):
     motorised.choose("random")
     for _ in range(20):
         motorised.step()
-    voltages = [row[0, motorised.recorder.trace_names.index("voltage")] for _, row in motorised.signals]
+    voltages = [
+        row[0, motorised.recorder.trace_names.index("voltage")] for _, row in motorised.signals
+    ]
     assert np.abs(voltages).max() == pytest.approx(7.0)
     motorised.choose("zero")
     motorised.set_disturbance(("command_delay",), 0.04)
@@ -97,7 +104,9 @@ def test_what_is_unstable_is_said_and_not_simulated(motorised):
     assert motorised.step()
 
 
-@pytest.mark.parametrize("anew", [Session.reset, lambda made: made.set_disturbance(("command_delay",), 0.04)])
+@pytest.mark.parametrize(
+    "anew", [Session.reset, lambda made: made.set_disturbance(("command_delay",), 0.04)]
+)
 def test_a_simulation_that_left_the_numbers_waits_for_a_reset_or_another_setting(anew):
     made = session("ideal")
     assert made.step()
@@ -149,7 +158,9 @@ def test_controls_are_the_fields_with_their_bounds_and_units(motorised):
     for path, one in found.items():
         part = getattr(actuator, path[0]) if len(path) > 1 else actuator
         fields = {field.name: field for field in dataclasses.fields(part)}
-        for end in (one.low, one.high) if None not in (one.low, one.high) else ():  # both can be set
+        for end in (
+            (one.low, one.high) if None not in (one.low, one.high) else ()
+        ):  # both can be set
             holds, *_ = fields[path[-1]].metadata["bound"]
             assert holds(type(one.value)(one.parsed(end))), path
 
@@ -199,9 +210,29 @@ def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch
     assert main(["view", str(run), "--policies", str(run), str(other), "--actuator", "weaker"]) == 0
     shown = Shown.seen.pop()
     assert (shown.title, shown.done) == ("cartpole on weaker", ["asked to end: False", "closed"])
-    names = ["last", "runs/cartpole", "other/cartpole", "random"]  # none of its actions does nothing
+    names = [
+        "last",
+        "runs/cartpole",
+        "other/cartpole",
+        "random",
+    ]  # none of its actions does nothing
     assert (list(shown.session.policies), shown.session.chosen) == (names, "last")
     shown.session.choose("other/cartpole")
     assert shown.session.step()
-    assert main(["view", "cartpole", "--policies", str(run), "--env.action", "voltage", "--env.levels", "-5", "5"]) == 2
+    assert (
+        main(
+            [
+                "view",
+                "cartpole",
+                "--policies",
+                str(run),
+                "--env.action",
+                "voltage",
+                "--env.levels",
+                "-5",
+                "5",
+            ]
+        )
+        == 2
+    )
     assert "was trained with 'force'" in capsys.readouterr().err

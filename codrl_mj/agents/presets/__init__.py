@@ -1,8 +1,8 @@
 """Settings that suit an agent and a task: ours (`default`, `fast`), the paper's (`paper`), these mended (`repaired`).
 
-One TOML file an agent beside this module: a table for each task and name with the fields of `Preset`, where `"none"`
-stands for None, and `like` names the settings above that it starts from. What the numbers gave, in training and in
-test, is in docs/agents.md.
+One TOML file an agent beside this module: a table for each task and name with the fields of
+`Preset`, where `"none"` stands for None, and `like` names the settings above that it starts from.
+What the numbers gave, in training and in test, is in docs/agents.md.
 """
 
 import dataclasses
@@ -16,8 +16,9 @@ from codrl_mj.agents import AGENTS, AgentConfig, find_agent
 __all__ = ["ELSEWHERE", "PRESETS", "SETTINGS", "Preset", "find_preset"]
 
 SETTINGS = ("default", "paper", "repaired", "fast")
-"""Names that settings can have: ours, the paper's as printed, the paper's with what makes it fail changed, and ours for
-the least time."""
+"""Names that settings can have: ours, the paper's as printed, the paper's with what makes it fail
+changed, and ours for the least time.
+"""
 ELSEWHERE = "another's environment"
 """Instead of a task: any environment that is none of ours."""
 
@@ -48,8 +49,13 @@ def _read(agent: str) -> dict[str, dict[str, Preset]]:
         for name, table in named.items():
             like = table.pop("like", None)
             base = presets[task][like] if like else Preset(AGENTS[agent]())
-            fields = {key: None if value == "none" else value for key, value in table.pop("agent", {}).items()}
-            presets[task][name] = dataclasses.replace(base, agent=dataclasses.replace(base.agent, **fields), **table)
+            fields = {
+                key: None if value == "none" else value
+                for key, value in table.pop("agent", {}).items()
+            }
+            presets[task][name] = dataclasses.replace(
+                base, agent=dataclasses.replace(base.agent, **fields), **table
+            )
     return presets
 
 
@@ -75,8 +81,11 @@ def find_preset(agent: str, task: str, settings: str = "default") -> Preset:
     if settings == "default" and not named and not ours:
         return Preset(find_agent(agent)(), total_steps=200_000, num_envs=8)
     if settings not in named:
-        there = "; ".join(f"{other}: {', '.join(names)}" for (other, of), names in PRESETS.items() if of == task)
+        there = "; ".join(
+            f"{other}: {', '.join(names)}" for (other, of), names in PRESETS.items() if of == task
+        )
         raise ValueError(
-            f"settings = {settings!r}: {agent} on {task} has no such settings; those on {task} are {there or 'none'}"
+            f"settings = {settings!r}: {agent} on {task} has no such settings; those on {task} are"
+            f" {there or 'none'}"
         )
     return named[settings]

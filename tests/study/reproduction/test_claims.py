@@ -39,13 +39,17 @@ def test_an_arm_is_trained_as_the_papers_settings_say(arm):
     config = arm.training(7)
     preset = TrainConfig.preset(arm.task, config.agent.name, arm.settings, seed=7)
     assert (config.agent, config.seed, config.num_envs) == (preset.agent, 7, preset.num_envs)
-    assert (config.total_steps, config.total_episodes) == (preset.total_steps, preset.total_episodes)
+    assert (config.total_steps, config.total_episodes) == (
+        preset.total_steps,
+        preset.total_episodes,
+    )
     assert config.env == dataclasses.replace(preset.env, physics=arm.physics, actuator=arm.actuator)
     assert config.actuator == arm.actuator
     expected = {
         "paper gains": named_actuator("paper", arm.task),
         "fast gains": dataclasses.replace(
-            named_actuator("paper", "mountain_car"), controller=CurrentLoop(kp=2.0, ki=10.0, kd=1e-6)
+            named_actuator("paper", "mountain_car"),
+            controller=CurrentLoop(kp=2.0, ki=10.0, kd=1e-6),
         ),
         "ideal": IDEAL,
     }
@@ -67,7 +71,9 @@ def test_the_gains_are_those_that_the_paper_prints():
             kp, ki, kd, kff, radius = printed[arm.task, arm.motor]
             loop = arm.actuator.controller
             assert (loop.kp, loop.ki, loop.kd, loop.kff) == (kp, ki, kd, kff)
-            assert arm.actuator.motor == Motor(resistance=1.0, inductance=0.1, torque_constant=1.0, arm_radius=radius)
+            assert arm.actuator.motor == Motor(
+                resistance=1.0, inductance=0.1, torque_constant=1.0, arm_radius=radius
+            )
 
 
 def test_budgets_are_the_papers():
@@ -86,27 +92,41 @@ def test_every_experiment_is_there_ideal_and_actuated():
     assert len(TASKS) == 5
     for task in TASKS:
         assert {arm.motor for arm in ARMS if arm.task == task} >= {"ideal", "paper gains"}
-    assert {arm.task for arm in ARMS if arm.settings == "repaired"} == {"pendulum", "mountain_car_continuous"}
+    assert {arm.task for arm in ARMS if arm.settings == "repaired"} == {
+        "pendulum",
+        "mountain_car_continuous",
+    }
     assert {arm.task for arm in ARMS if arm.physics == "analytic"} == {"mountain_car", "cartpole"}
 
 
 def test_trying_out_cuts_trainings_off_and_changes_nothing_else():
     for arm in ARMS:
-        assert arm.cut_off(3) == dataclasses.replace(arm, config=dataclasses.replace(arm.config, total_episodes=3))
+        assert arm.cut_off(3) == dataclasses.replace(
+            arm, config=dataclasses.replace(arm.config, total_episodes=3)
+        )
 
 
 def test_every_claim_is_about_arms_that_there_are():
     for claim in CLAIMS:
         assert {ARM[name].task for name in claim.arms} == {claim.task}
-    of = [(claim.task, claim.settings, claim.source, claim.statement, claim.measure.text) for claim in CLAIMS]
+    of = [
+        (claim.task, claim.settings, claim.source, claim.statement, claim.measure.text)
+        for claim in CLAIMS
+    ]
     assert len(set(of)) == len(CLAIMS)
 
 
 def test_the_paper_makes_22_statements_each_counted_once():
-    counted = [(claim.task, claim.statement) for claim in CLAIMS if claim.source == PAPER_SAYS and claim.counted]
+    counted = [
+        (claim.task, claim.statement)
+        for claim in CLAIMS
+        if claim.source == PAPER_SAYS and claim.counted
+    ]
     assert len(counted) == len(set(counted)) == 22
     beside = [claim for claim in CLAIMS if not claim.counted]
-    assert sum(claim.settings == "paper" and claim.task != "mountain_car" for claim in beside) == 5  # as printed
+    assert (
+        sum(claim.settings == "paper" and claim.task != "mountain_car" for claim in beside) == 5
+    )  # as printed
     assert len(beside) == 5 + 2  # and the second look at who beats whom
 
 
@@ -162,14 +182,19 @@ def test_where_the_paper_is_not_right_its_claims_are_not_confirmed():
 def test_both_kinds_of_physics_are_compared_seed_by_seed():
     rows = world(OTHERS)
     (claim,) = [
-        claim for claim in CLAIMS if claim.source == PORT and claim.task == "cartpole" and "ideal" in claim.arms[0]
+        claim
+        for claim in CLAIMS
+        if claim.source == PORT and claim.task == "cartpole" and "ideal" in claim.arms[0]
     ]
     assert claim.judge(rows).reason == "no two values differ"
     mine, other = (rows[name] for name in claim.arms)
     shifted = [row | {"last_50": str(float(row["last_50"]) - 300)} for row in other]
     assert claim.judge(rows | {claim.arms[1]: shifted}).outcome == NOT_CONFIRMED
     assert claim.judge(rows | {claim.arms[1]: shifted[4:]}).outcome == NOT_TESTABLE
-    again = [*mine, mine[0] | {"run": "another", "last_50": "7"}]  # of a seed trained twice the first is the pair's
+    again = [
+        *mine,
+        mine[0] | {"run": "another", "last_50": "7"},
+    ]  # of a seed trained twice the first is the pair's
     assert claim.judge(rows | {claim.arms[0]: again}).reason == "no two values differ"
 
 
@@ -195,7 +220,9 @@ def test_a_training_replaces_its_own_row_and_stands_beside_one_with_other_packag
     assert not complete([row | {"times": ""}], {"times", "returns"})
 
 
-@pytest.mark.parametrize(("angle", "speed", "since"), [(0.19, 0.29, 0.0), (0.21, 0.0, None), (0.0, 0.31, None)])
+@pytest.mark.parametrize(
+    ("angle", "speed", "since"), [(0.19, 0.29, 0.0), (0.21, 0.0, None), (0.0, 0.31, None)]
+)
 def test_upright_is_what_full_torque_can_hold(angle, speed, since):
     """It just holds the rod at asin(2/5), of which 0.2 rad is half, and changes its speed by 0.3 rad/s in a step."""
     assert pytest.approx(np.arcsin(2 / 5) / 2, abs=0.01) == UPRIGHT_ANGLE

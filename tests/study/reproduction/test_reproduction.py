@@ -100,12 +100,19 @@ def test_the_page_has_every_statement_once_and_the_table_every_claim_with_its_ch
     _, findings, out, _, _ = done
     page = (out / PAGE).read_text()
     rows = list(csv.DictReader((out / FOLDER / "claims.csv").open(newline="", encoding="utf-8")))
-    judged = [claim for claim in CLAIMS if claim.task in ("mountain_car", "mountain_car_continuous")]
+    judged = [
+        claim for claim in CLAIMS if claim.task in ("mountain_car", "mountain_car_continuous")
+    ]
     assert len(rows) == len(judged)
     for claim, row in zip(judged, rows, strict=True):
         verdict = claim.judge(findings.runs)
-        assert (row["verdict"], row["why"], row["criterion"]) == (*verdict[:2], claim.check.criterion)
-        shown = [line for line in page.splitlines() if f"{claim.statement} | {claim.figure} | " in line]
+        assert (row["verdict"], row["why"], row["criterion"]) == (
+            *verdict[:2],
+            claim.check.criterion,
+        )
+        shown = [
+            line for line in page.splitlines() if f"{claim.statement} | {claim.figure} | " in line
+        ]
         if claim.source == PAPER_SAYS and claim.counted:
             assert any(verdict.outcome in line for line in shown)
     lines = [line for line in page.splitlines() if line.startswith("| ")]
@@ -132,7 +139,9 @@ def test_what_settings_as_printed_come_to_stands_beside_what_counts():
     line = next(line for line in table.splitlines() if "*Continuous Mountain Car*" in line)
     assert line.count("95 [94") == 2
     upright = next(line for line in table.splitlines() if "upright" in line)
-    assert "| 100 %, after 50 s | 100 %, after 50 s | 100 %, after 50 s | **confirmed** |" in upright
+    assert (
+        "| 100 %, after 50 s | 100 %, after 50 s | 100 %, after 50 s | **confirmed** |" in upright
+    )
 
 
 def test_p_is_corrected_for_all_comparisons_of_a_source():
@@ -169,7 +178,9 @@ def test_the_tables_are_the_findings(done):
     runs = list(csv.DictReader((out / FOLDER / "runs.csv").open()))
     assert runs == [row for rows in findings.runs.values() for row in rows]
     claims = list(csv.DictReader((out / FOLDER / "claims.csv").open()))
-    assert [row["verdict"] for row in claims] == [verdict.outcome for _, verdict in findings.verdicts]
+    assert [row["verdict"] for row in claims] == [
+        verdict.outcome for _, verdict in findings.verdicts
+    ]
     content = json.loads((out / FOLDER / "findings.json").read_text())
     assert content["missing"][BLOCKED.name] == [0, 1]
     assert [one["discount"] for one in content["value_iteration"]] == [0.85, 0.9, 0.95, 0.99, 0.999]
@@ -203,7 +214,9 @@ def test_rows_are_published_as_they_finish_and_stand_for_run_folders_that_are_go
 def test_written_again_from_the_run_folders_it_is_the_same(done, tmp_path):
     plan, _, out, files, _ = done
     again = write(dataclasses.replace(plan, out=tmp_path).findings(), tmp_path)
-    assert [path.relative_to(tmp_path) for path in again] == [path.relative_to(out) for path in files]
+    assert [path.relative_to(tmp_path) for path in again] == [
+        path.relative_to(out) for path in files
+    ]
     for path, other in zip(files, again, strict=True):
         assert path.read_bytes() == other.read_bytes(), path
 
@@ -226,10 +239,15 @@ def test_the_published_page_is_what_the_published_rows_say(tmp_path):
     (tmp_path / FOLDER / "claims.csv").unlink()
     files, failures = Reproduction(root=tmp_path / "none", out=tmp_path).write()
     assert not failures
-    assert {file.name for file in files} == {PAGE, *(file.name for file in (RESULTS / FOLDER).iterdir())}
+    assert {file.name for file in files} == {
+        PAGE,
+        *(file.name for file in (RESULTS / FOLDER).iterdir()),
+    }
     for file in files:
         if file.suffix in (".md", ".csv"):
-            assert file.read_bytes() == (RESULTS / file.relative_to(tmp_path)).read_bytes(), file.name
+            assert file.read_bytes() == (RESULTS / file.relative_to(tmp_path)).read_bytes(), (
+                file.name
+            )
 
 
 def test_a_stranger_recomputes_every_verdict_without_the_package():
@@ -237,7 +255,9 @@ def test_a_stranger_recomputes_every_verdict_without_the_package():
     example = RESULTS.parents[1] / "examples" / "recompute_reproduction.py"
     run = [sys.executable, "-I", "-S", str(example), str(RESULTS / FOLDER)]
     lines = subprocess.run(run, capture_output=True, text=True, check=True).stdout.splitlines()
-    claims = list(csv.DictReader((RESULTS / FOLDER / "claims.csv").open(newline="", encoding="utf-8")))
+    claims = list(
+        csv.DictReader((RESULTS / FOLDER / "claims.csv").open(newline="", encoding="utf-8"))
+    )
     assert [line.rsplit(": ", 1)[1] for line in lines] == [row["verdict"] for row in claims]
     assert len(claims) == len(CLAIMS)
 
@@ -247,7 +267,9 @@ def test_published_verdicts_are_of_the_claims_as_they_are():
     runs = {arm.name: [] for arm in ARMS}
     for of, found in rows.items():
         runs[", ".join(of[:-1])] += found
-    claims = list(csv.DictReader((RESULTS / FOLDER / "claims.csv").open(newline="", encoding="utf-8")))
+    claims = list(
+        csv.DictReader((RESULTS / FOLDER / "claims.csv").open(newline="", encoding="utf-8"))
+    )
     for claim, row in zip(CLAIMS, claims, strict=True):
         assert (row["statement"], row["verdict"]) == (claim.statement, claim.judge(runs).outcome)
 
@@ -256,7 +278,11 @@ def test_published_verdicts_are_of_the_claims_as_they_are():
 def test_finished_runs_are_not_trained_again(done):
     plan, _, _, _, _ = done
     hill = dataclasses.replace(plan, tasks=("mountain_car",), sarsa_seeds=1)
-    results = [folder / "result.json" for folder in hill.every.folders.values() if (folder / "result.json").is_file()]
+    results = [
+        folder / "result.json"
+        for folder in hill.every.folders.values()
+        if (folder / "result.json").is_file()
+    ]
     assert len(results) == 5
     before = [path.stat().st_mtime_ns for path in results]
     hill.grid.compute(Workers(jobs=1))
@@ -271,7 +297,11 @@ def test_costs_are_those_of_finished_runs_or_estimates(done):
     assert (half.finished, half.missing) == ((), (1,))
     assert (half.tests, half.left) == (1, HILL[0].seconds + TEST_SECONDS)
     none = by_arm[BLOCKED.name]
-    assert (none.finished, none.missing, none.left) == ((), (0, 1), 2 * (BLOCKED.seconds + TEST_SECONDS))
+    assert (none.finished, none.missing, none.left) == (
+        (),
+        (0, 1),
+        2 * (BLOCKED.seconds + TEST_SECONDS),
+    )
     took = {cost.arm.name: cost.seconds for cost in plan.every.costs()}
     assert took[HILL[0].name] == float(findings.runs[HILL[0].name][0]["seconds"])
 
@@ -294,9 +324,13 @@ def test_all_arms_first_seeds_are_trained_first_and_the_longest_before_the_other
 def test_as_many_seeds_are_trained_at_once_as_occupy_every_core(tmp_path, monkeypatch):
     at_once = []
     monkeypatch.setattr(
-        trials, "train_runs", lambda runs, *_, **__: at_once.append(sorted(c.seed for c in runs.values()))
+        trials,
+        "train_runs",
+        lambda runs, *_, **__: at_once.append(sorted(c.seed for c in runs.values())),
     )
-    plan = Reproduction(root=tmp_path, out=tmp_path, tasks=("pendulum",), settings=("paper",), seeds=5)
+    plan = Reproduction(
+        root=tmp_path, out=tmp_path, tasks=("pendulum",), settings=("paper",), seeds=5
+    )
     for jobs in (1, 2, 3):
         plan.every.compute(Workers(jobs=jobs))
     one_each, three = [[seed, seed] for seed in range(5)], [[0, 0, 1, 1], [2, 2, 3, 3], [4, 4]]
@@ -345,7 +379,9 @@ def made_up(arm, steps=30, inner_steps=3):
 def test_states_and_torques_are_drawn_of_every_task(task, tmp_path):
     arms = [arm for arm in ARMS if arm.task == task and arm.physics == "mujoco"]
     states = [row for arm in arms for row in state_rows(arm, made_up(arm))]
-    torques = [row for arm in arms if arm.actuator != IDEAL for row in torque_rows(arm, made_up(arm))]
+    torques = [
+        row for arm in arms if arm.actuator != IDEAL for row in torque_rows(arm, made_up(arm))
+    ]
     assert figures.draw_states(tmp_path / "states.svg", task, states)
     assert figures.draw_torque(tmp_path / "torque.svg", task, torques)
     for name in ("states", "torque"):
@@ -360,17 +396,24 @@ def test_of_a_torque_a_second_or_twenty_steps_are_shown():
         if arm.actuator != IDEAL:
             rows = torque_rows(arm, made_up(arm, steps=80, inner_steps=2))
             ends[arm.task] = float(rows[-1]["time"]) + find_task(arm.task).step_duration / 2
-    expected = {"pendulum": 1.0, "mountain_car": 20.0, "mountain_car_continuous": 20.0, "acrobot": 4.0, "cartpole": 1.0}
+    expected = {
+        "pendulum": 1.0,
+        "mountain_car": 20.0,
+        "mountain_car_continuous": 20.0,
+        "acrobot": 4.0,
+        "cartpole": 1.0,
+    }
     assert ends == pytest.approx(expected)
 
 
 def test_the_curves_are_what_the_paper_plots():
     """Acrobot hanging: -2; upright: 2. Pendulum upright: x = 1, y = 0."""
-    (height, *_) = figures.CURVES["acrobot"]
+    height, *_ = figures.CURVES["acrobot"]
     states = np.array([[0, 0, 0, 0], [np.pi, 0, 0, 0], [np.pi / 2, np.pi / 2, 0, 0]])
     assert height.values(states.T) == pytest.approx([-2.0, 2.0, 1.0])
     x, y, angle, speed = (
-        curve.values(np.array([[2 * np.pi, 3.0], [np.pi / 2, 0.0]]).T) for curve in figures.CURVES["pendulum"]
+        curve.values(np.array([[2 * np.pi, 3.0], [np.pi / 2, 0.0]]).T)
+        for curve in figures.CURVES["pendulum"]
     )
     assert (*x, *y) == pytest.approx((1.0, 0.0, 0.0, 1.0), abs=1e-12)
     assert angle == pytest.approx([0.0, np.pi / 2], abs=1e-12)
@@ -379,8 +422,12 @@ def test_the_curves_are_what_the_paper_plots():
 
 def test_epochs_are_drawn_below_one_another(tmp_path):
     arms = [arm for arm in ARMS if arm.task == "cartpole" and arm.physics == "mujoco"]
-    rows = [row for arm in arms for row in curve_rows(arm, {seed: trained(seed) for seed in range(3)})]
-    assert {(row["curve"], row["seeds"]) for row in rows} == {(name, "3") for name in ("lengths", "returns", "counts")}
+    rows = [
+        row for arm in arms for row in curve_rows(arm, {seed: trained(seed) for seed in range(3)})
+    ]
+    assert {(row["curve"], row["seeds"]) for row in rows} == {
+        (name, "3") for name in ("lengths", "returns", "counts")
+    }
     assert figures.draw_learning(tmp_path / "epochs.svg", "cartpole", rows)
     assert ElementTree.parse(tmp_path / "epochs.svg").getroot().tag.endswith("svg")
 
@@ -400,7 +447,14 @@ def test_a_dry_run_lists_and_makes_nothing(tmp_path, capsys):
 
 
 def test_a_page_can_be_written_of_nothing(tmp_path, capsys):
-    given = ["acrobot", "--only-page", "--root", str(tmp_path / "no"), "--out", str(tmp_path / "out")]
+    given = [
+        "acrobot",
+        "--only-page",
+        "--root",
+        str(tmp_path / "no"),
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main(Reproduction, given) == 0
     assert "\n0 trainings, " in (tmp_path / "out" / PAGE).read_text()
     assert "not testable" in capsys.readouterr().out
@@ -411,7 +465,12 @@ def test_a_page_can_be_written_of_nothing(tmp_path, capsys):
 def test_failures_show_in_the_exit_status(done, tmp_path, capsys):
     plan, _, _, _, _ = done
     given = ["mountain_car", "--only-page", "--root", str(plan.root), "--out", str(tmp_path)]
-    assert main(Reproduction, [*given, "--sarsa-seeds", "2", "--episodes", "2", "--test-episodes", "3"]) == 1
+    assert (
+        main(
+            Reproduction, [*given, "--sarsa-seeds", "2", "--episodes", "2", "--test-episodes", "3"]
+        )
+        == 1
+    )
     assert f"failed: {BLOCKED.name}, seed 0: " in capsys.readouterr().err
 
 

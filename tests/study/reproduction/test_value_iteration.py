@@ -35,7 +35,9 @@ def test_a_discount_that_does_not_converge_is_refused(discount):
         iterate(np.zeros((1, 1)), sparse.eye_array(1), discount)
 
 
-@pytest.mark.parametrize(("field", "value"), [("positions", 1), ("speeds", 0), ("forces", 4), ("forces", 1)])
+@pytest.mark.parametrize(
+    ("field", "value"), [("positions", 1), ("speeds", 0), ("forces", 4), ("forces", 1)]
+)
 def test_impossible_grids_are_refused(field, value):
     with pytest.raises(ValueError, match=f"Mesh.{field} = {value}: must be"):
         Mesh(**{field: value})
@@ -49,7 +51,9 @@ def test_interpolation_is_exact_for_what_is_bilinear():
         return 2.0 - 3.0 * x + 50.0 * v + 7.0 * x * v
 
     states = np.random.default_rng(0).uniform([-1.2, -0.07], [0.6, 0.07], (200, 2))
-    states = np.vstack([states, [[0.6, 0.07], [-1.2, -0.07], *np.stack([positions, speeds], -1).reshape(-1, 2)]])
+    states = np.vstack(
+        [states, [[0.6, 0.07], [-1.2, -0.07], *np.stack([positions, speeds], -1).reshape(-1, 2)]]
+    )
     weights = interpolation(grid, states)
     assert weights @ bilinear(positions, speeds).ravel() == pytest.approx(bilinear(*states.T))
     assert weights.sum(axis=1) == pytest.approx(1.0)
@@ -89,6 +93,8 @@ def test_at_a_larger_one_the_car_drives_and_earns_what_solves_the_task(model):
     assert driving.success == 1.0
     assert driving.returns.mean > gymnasium.spec("MountainCarContinuous-v0").reward_threshold
     steps = len(driving.episode.reward)
-    assert driving.episode.total == pytest.approx(100 - 0.1 * (driving.episode.action**2).sum(), abs=1e-4)
+    assert driving.episode.total == pytest.approx(
+        100 - 0.1 * (driving.episode.action**2).sum(), abs=1e-4
+    )
     # 100 discounted over the way, less at most 0.1 a step: bounds that need no value iteration
     assert 100 * 0.99 ** (steps + 5) - 10 < driving.value < 100 * 0.99 ** (steps - 5)

@@ -35,7 +35,9 @@ def test_the_prediction_interval_of_two_values_is_the_cauchy_distributions():
 
 def test_the_prediction_interval_covers_the_next_value_as_often_as_it_says():
     values = np.random.default_rng(0).normal(3.0, 2.0, (4000, 6))
-    inside = [low <= one[5] <= high for one in values for low, high in [prediction_interval(one[:5])]]
+    inside = [
+        low <= one[5] <= high for one in values for low, high in [prediction_interval(one[:5])]
+    ]
     assert np.mean(inside) == pytest.approx(0.95, abs=3 * math.sqrt(0.95 * 0.05 / 4000))
 
 
@@ -53,10 +55,14 @@ def test_welchs_interval_is_its_formula():
 def test_the_paired_interval_is_its_formula():
     values, others = np.array([1.0, 5.0, 9.0]), np.array([0.0, 3.0, 9.0])  # differences 1, 2, 0
     reach = stats.t.ppf(0.975, 2) * 1.0 / math.sqrt(3)
-    assert same(3.0, paired=True)(values, others).measured == pytest.approx((1.0, 1.0 - reach, 1.0 + reach))
+    assert same(3.0, paired=True)(values, others).measured == pytest.approx(
+        (1.0, 1.0 - reach, 1.0 + reach)
+    )
 
 
-@pytest.mark.parametrize(("others", "measured", "p"), [(499.0, (1.0, 1.0, 1.0), 0.0), (500.0, (0.0, 0.0, 0.0), 1.0)])
+@pytest.mark.parametrize(
+    ("others", "measured", "p"), [(499.0, (1.0, 1.0, 1.0), 0.0), (500.0, (0.0, 0.0, 0.0), 1.0)]
+)
 def test_values_without_spread_have_a_difference_without_spread(others, measured, p):
     verdict = higher(0.5)(np.full(3, 500.0), np.full(3, others))
     assert (verdict.measured, verdict.p) == (measured, p)
@@ -101,7 +107,9 @@ def test_outcomes_of_one_value_a_seed(check, values, outcome):
     assert verdict.reason
 
 
-@pytest.mark.parametrize("check", [within(0.0, 1.0), every_seed(1.0), one_run(1.0), one_episode(1.0)])
+@pytest.mark.parametrize(
+    "check", [within(0.0, 1.0), every_seed(1.0), one_run(1.0), one_episode(1.0)]
+)
 def test_without_runs_nothing_can_be_tested(check):
     verdict = check(NOTHING)
     assert (verdict.outcome, verdict.measured, verdict.samples) == (NOT_TESTABLE, None, 0)
@@ -128,7 +136,11 @@ def test_an_episode_is_like_ours_if_it_is_within_the_central_range():
 
 
 def test_episodes_that_do_not_arrive_are_told_and_take_no_time():
-    some = [np.array([1.0, math.inf, math.inf]), np.array([2.0, 3.0, 4.0]), np.array([math.inf, math.inf])]
+    some = [
+        np.array([1.0, math.inf, math.inf]),
+        np.array([2.0, 3.0, 4.0]),
+        np.array([math.inf, math.inf]),
+    ]
     assert one_episode(5.0)(some).outcome == NOT_CONFIRMED
     verdict = one_episode(4.0)(some)
     assert verdict.outcome == COMPATIBLE
@@ -168,4 +180,9 @@ def test_bounds_and_comparisons_have_one_rule():
 
 
 def test_numbers_as_text():
-    assert [number(value) for value in (-122.54, 4000.4, 0.11859, 100.0)] == ["-122.5", "4000", "0.119", "100"]
+    assert [number(value) for value in (-122.54, 4000.4, 0.11859, 100.0)] == [
+        "-122.5",
+        "4000",
+        "0.119",
+        "100",
+    ]

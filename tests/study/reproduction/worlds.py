@@ -11,7 +11,18 @@ SPREAD = np.array([-1.0, 0.0, 1.0, 0.5, -0.5])
 """Of five seeds around what they are said to be."""
 
 
-def made_up(arm, seed=0, last=0.0, test=0.0, success=1.0, tracking=1.0, largest=0.05, time=50.0, centre=0.96, epoch=33):
+def made_up(
+    arm,
+    seed=0,
+    last=0.0,
+    test=0.0,
+    success=1.0,
+    tracking=1.0,
+    largest=0.05,
+    time=50.0,
+    centre=0.96,
+    epoch=33,
+):
     """A row.
 
     Args:
@@ -31,7 +42,11 @@ def made_up(arm, seed=0, last=0.0, test=0.0, success=1.0, tracking=1.0, largest=
     arrived = round(success * len(times))
     row = {name: getattr(arm, name) for name in ("task", "settings", "motor", "gains", "physics")}
     row |= {"seed": seed, "run": "nowhere", "seconds": 60.0, "last_50": last + shift}
-    row |= {"returns": test + 0.5 * shift if test != 500 else 500.0, "success": success, "upright": success}
+    row |= {
+        "returns": test + 0.5 * shift if test != 500 else 500.0,
+        "success": success,
+        "upright": success,
+    }
     row |= {"tracking_percent": tracking, "tracking_max": largest, "centred": centre}
     row |= {
         "time_to_goal": float(np.median(times)),
@@ -53,10 +68,14 @@ def world(values, seeds=range(5)):
     """The rows of every arm, by its name.
 
     Args:
-        values: (task, settings, motor) -> arguments of `made_up`; each arm takes those of its task, settings and motor.
+        values: (task, settings, motor) -> arguments of `made_up`; each arm takes those of its task,
+            settings and motor.
         seeds: of every arm.
     """
-    return {arm.name: [made_up(arm, n, **values[arm.task, arm.settings, arm.motor]) for n in seeds] for arm in ARMS}
+    return {
+        arm.name: [made_up(arm, n, **values[arm.task, arm.settings, arm.motor]) for n in seeds]
+        for arm in ARMS
+    }
 
 
 PAPERS = {
@@ -65,8 +84,18 @@ PAPERS = {
         for settings in ("paper", "repaired")
         for motor in ("paper gains", "ideal")
     },
-    ("mountain_car", "paper", "paper gains"): {"last": -114, "test": -85, "tracking": 40.0, "time": 85.0},
-    ("mountain_car", "paper", "fast gains"): {"last": -120, "test": -100, "tracking": 1.0, "time": 100.0},
+    ("mountain_car", "paper", "paper gains"): {
+        "last": -114,
+        "test": -85,
+        "tracking": 40.0,
+        "time": 85.0,
+    },
+    ("mountain_car", "paper", "fast gains"): {
+        "last": -120,
+        "test": -100,
+        "tracking": 1.0,
+        "time": 100.0,
+    },
     ("mountain_car", "paper", "ideal"): {"last": -150, "test": -160, "time": 160.0},
     **{
         ("mountain_car_continuous", settings, motor): {"last": 95, "test": 95, "time": 75.0}
@@ -77,7 +106,10 @@ PAPERS = {
         ("acrobot", "paper", motor): {"last": -200, "test": -125, "time": 25.0, "tracking": 10.0}
         for motor in ("paper gains", "ideal")
     },
-    **{("cartpole", "paper", motor): {"test": 500, "epoch": 33, "largest": 0.09} for motor in ("paper gains", "ideal")},
+    **{
+        ("cartpole", "paper", motor): {"test": 500, "epoch": 33, "largest": 0.09}
+        for motor in ("paper gains", "ideal")
+    },
 }
 """What the paper reports."""
 
@@ -85,14 +117,34 @@ OTHERS = PAPERS | {
     ("pendulum", "paper", "paper gains"): {"last": -1400, "test": -1413, "success": 0.0},
     ("pendulum", "paper", "ideal"): {"last": -1400, "test": -1413, "success": 0.0},
     ("pendulum", "repaired", "paper gains"): {"last": -160, "test": -150, "time": 1.7},
-    ("mountain_car", "paper", "paper gains"): {"last": -122.5, "test": -120, "tracking": 40.0, "time": 120.0},
-    ("mountain_car", "paper", "fast gains"): {"last": -117.7, "test": -115, "tracking": 20.0, "time": 115.0},
+    ("mountain_car", "paper", "paper gains"): {
+        "last": -122.5,
+        "test": -120,
+        "tracking": 40.0,
+        "time": 120.0,
+    },
+    ("mountain_car", "paper", "fast gains"): {
+        "last": -117.7,
+        "test": -115,
+        "tracking": 20.0,
+        "time": 115.0,
+    },
     ("mountain_car", "paper", "ideal"): {"last": -118.5, "test": -115, "time": 115.0},
-    ("mountain_car_continuous", "paper", "paper gains"): {"last": -99.9, "test": -99.9, "success": 0.0},
+    ("mountain_car_continuous", "paper", "paper gains"): {
+        "last": -99.9,
+        "test": -99.9,
+        "success": 0.0,
+    },
     ("mountain_car_continuous", "paper", "ideal"): {"last": -99.9, "test": -99.9, "success": 0.0},
     ("mountain_car_continuous", "repaired", "paper gains"): {"last": 92, "test": 92, "time": 80.0},
     ("mountain_car_continuous", "repaired", "ideal"): {"last": 92, "test": 92, "time": 80.0},
-    ("acrobot", "paper", "paper gains"): {"last": -90, "test": -81, "success": 0.9, "time": 16.0, "tracking": 30.0},
+    ("acrobot", "paper", "paper gains"): {
+        "last": -90,
+        "test": -81,
+        "success": 0.9,
+        "time": 16.0,
+        "tracking": 30.0,
+    },
     ("acrobot", "paper", "ideal"): {"last": -90, "test": -81, "time": 16.0},
     ("cartpole", "paper", "paper gains"): {"test": 500, "epoch": 40, "largest": 0.119},
 }
