@@ -5,7 +5,7 @@ PACKAGE := .venv/.installed
 STAMP := .venv/.installed-dev
 DOCS := .venv/.installed-docs
 MUJOCO4 := .venv-mujoco4
-MUJOCO4_TESTS := tests/engine tests/physics tests/motorised tests/envs tests/tasks tests/foreign tests/test_kept.py
+MUJOCO4_TESTS := tests/engine tests/physics tests/add_motors tests/envs tests/tasks tests/external_envs tests/test_compile_cache.py
 INSTALL = $(BIN)/pip install --quiet --constraint constraints.txt --editable
 
 .PHONY: install demo test check mujoco4 browser lint bench soak results docs pictures clean
@@ -47,11 +47,11 @@ $(MUJOCO4)/.installed: pyproject.toml constraints.txt
 
 # Left out: what loads dm_control's models, and two tests of models that are saved as XML. MuJoCo 4.0.0 writes zeros for the
 # user data of an actuator that has a default class, and such a file is refused when it is read (docs/limitations.md).
-MUJOCO4_WITHOUT := --ignore tests/foreign/test_dm_control.py \
-	--deselect tests/foreign/test_divergence.py::test_dm_controls_environment_stops \
-	--deselect tests/motorised/test_ideal.py::test_there_are_enough_robots \
-	--deselect tests/motorised/test_round_trips.py::test_another_process_has_the_same_motors_and_imports_no_code_because_a_model_says_so \
-	--deselect "tests/motorised/test_joint_dynamics.py::test_kept_losses_brake_a_joint_and_replaced_ones_do_not[True]"
+MUJOCO4_WITHOUT := --ignore tests/external_envs/test_dm_control.py \
+	--deselect tests/external_envs/test_divergence.py::test_dm_controls_environment_stops \
+	--deselect tests/add_motors/test_ideal.py::test_there_are_enough_robots \
+	--deselect tests/add_motors/test_round_trips.py::test_another_process_has_the_same_motors_and_imports_no_code_because_a_model_says_so \
+	--deselect "tests/add_motors/test_joint_dynamics.py::test_kept_losses_brake_a_joint_and_replaced_ones_do_not[True]"
 
 mujoco4: $(MUJOCO4)/.installed  ## the engine's tests and the certificate on MuJoCo 4, which dm_control does not work with
 	@$(MUJOCO4)/bin/python -m pytest -m "not slow and not matrix and not browser" -n 2 --dist loadfile --no-loadscope-reorder \

@@ -18,8 +18,8 @@ from typing import Any
 __version__ = "0.1.0"
 
 _PUBLIC = {
-    "make": "codrl_mj.making",
-    "make_vec": "codrl_mj.making",
+    "make": "codrl_mj.factory",
+    "make_vec": "codrl_mj.factory",
     "EnvConfig": "codrl_mj.envs.config",
     "Uniform": "codrl_mj.envs.distributions",
     "LogUniform": "codrl_mj.envs.distributions",
@@ -27,12 +27,12 @@ _PUBLIC = {
     "Disturbances": "codrl_mj.disturbances",
     "Joint": "codrl_mj.disturbances",
     "make_sb3_vec_env": "codrl_mj.envs.sb3",
-    "make_dm_control": "codrl_mj.foreign.dm_control",
-    "motorise": "codrl_mj.engine.specs",
-    "motorised": "codrl_mj.foreign.building",
+    "make_dm_control": "codrl_mj.external_envs.dm_control",
+    "add_motors": "codrl_mj.engine.specs",
+    "motors_added": "codrl_mj.external_envs.building",
     "signals": "codrl_mj.engine.reading",
     "Task": "codrl_mj.tasks",
-    "World": "codrl_mj.envs.worlds",
+    "EnvSource": "codrl_mj.envs.worlds",
     "register": "codrl_mj.tasks",
     "TrainConfig": "codrl_mj.training",
     "train": "codrl_mj.training",

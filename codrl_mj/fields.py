@@ -239,7 +239,7 @@ def check_pattern(pattern: str) -> None:
 
 
 def check_joint_dynamics(value: Any) -> None:
-    """Refuse what `joint_dynamics` of `codrl_mj.motorise` cannot be."""
+    """Refuse what `joint_dynamics` of `codrl_mj.add_motors` cannot be."""
     if value not in (None, "keep", "replace"):
         raise ValueError(
             f"joint_dynamics = {value!r}: must be keep or replace; None keeps, and warns"

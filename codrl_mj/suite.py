@@ -19,7 +19,7 @@ from gymnasium import spaces
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
-from codrl_mj.foreign import check_dm_control
+from codrl_mj.external_envs import check_dm_control
 from codrl_mj.tasks import TASKS
 
 TASK_NAME = "gym"

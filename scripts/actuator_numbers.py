@@ -1,7 +1,7 @@
 """Writes docs/actuators_in_numbers.md and its two CSV files: what every actuator that has a name does on a bench.
 
 Torques and speeds are measured in the engine, on one hinge: blocked, turned slowly by a heavy load,
-or free. The loops of the catalogue's motors and their continuous torques are `codrl_mj.drives`'s.
+or free. The loops of the catalogue's motors and their continuous torques are `codrl_mj.sizing`'s.
 `make docs` runs it; a test compares the files with what it would write.
 """
 
@@ -21,11 +21,11 @@ import numpy as np
 import codrl_mj
 from codrl_mj.actuators import NAMED, Drive
 from codrl_mj.catalogue import motor_entry, motor_names
-from codrl_mj.drives import design, find_drive, torque_limits
 from codrl_mj.runs.files import writing
+from codrl_mj.sizing import design, find_drive, torque_limits
 from codrl_mj.study.bench import BLOCKED, on_bench
 from codrl_mj.tasks import OURS, named_actuator
-from codrl_mj.validation.drives import COLD
+from codrl_mj.validation.motor_catalogue import COLD
 
 FOLDER = Path(__file__).parent.parent / "docs"
 PAGE = "actuators_in_numbers.md"

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import identified_ranges, mapping_of
-from codrl_mj.drives.abilities import find_drive
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.identify import Log, identify, read_log
 from codrl_mj.identify.synthetic import Excitation, Sampler, Sensor, simulate, write_log
 from codrl_mj.runs.policies import load_policy
+from codrl_mj.sizing.abilities import find_drive
 from codrl_mj.training import TrainConfig, train
 
 TASK, EPISODES, TEST_SEED = "pendulum", 20, 3_000_000

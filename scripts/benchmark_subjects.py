@@ -14,11 +14,11 @@ from mujoco.batch import Batch
 import codrl_mj
 from codrl_mj import engine as callbacks
 from codrl_mj.actuators import IDEAL
-from codrl_mj.physics import Plant
+from codrl_mj.physics import SimulationConfig
 from codrl_mj.physics.mjcf import install_callbacks, task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.tasks import TASKS, named_actuator
-from codrl_mj.validation.drives import Bench, fitted
+from codrl_mj.validation.motor_catalogue import Bench, fitted
 
 ACTIONS = 1000
 """Actions drawn beforehand."""
@@ -56,7 +56,7 @@ def engine(task: str, actuator: str | None = "paper") -> Subject:
         one = one.replaced(
             {"controller.kp": bench.kp, "controller.ki": bench.ki * one.controller.sample_rate}
         )
-    model = task_model(Plant(definition, (one,), definition.motor_inner_steps))
+    model = task_model(SimulationConfig(definition, (one,), definition.motor_inner_steps))
     data = mujoco.MjData(model)
 
     def prepare() -> None:
@@ -85,12 +85,12 @@ def chain(motors: int, actuator: str | None, substeps: int = 10) -> Subject:
         )
         motor.set_to_motor()
     given: Any = {
-        "current_loop": codrl_mj.actuators.Actuator(
+        "current_loop": codrl_mj.actuators.DCMotorActuator(
             controller=codrl_mj.actuators.CurrentLoop(ki=1.0, substeps=substeps)
         )
     }
     if actuator is not None:
-        spec = codrl_mj.motorise(spec, {".*": given.get(actuator, actuator)})
+        spec = codrl_mj.add_motors(spec, {".*": given.get(actuator, actuator)})
     model = spec.compile()
     data = mujoco.MjData(model)
 
@@ -251,7 +251,7 @@ def envpool(env_id: str, num_envs: int, threads: int) -> Subject:
 
 def drawing(task: str, fast: bool) -> Subject:
     """Frames of 480 x 480 of the task's scene, with our fast visual settings or with MuJoCo's defaults."""
-    model = task_model(Plant(TASKS[task], (IDEAL,)))
+    model = task_model(SimulationConfig(TASKS[task], (IDEAL,)))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     if fast:

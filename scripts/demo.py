@@ -17,13 +17,13 @@ from codrl_mj.cli.train import training_bars
 from codrl_mj.cli.validate import print_checks
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes, summarize
-from codrl_mj.films.film import Panel, film
 from codrl_mj.runs import CONFIG
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.study.grid import failure_record, train_runs
 from codrl_mj.tasks import named_actuator
 from codrl_mj.training import TrainConfig, TrainingStoppedError, finished, load_config
 from codrl_mj.validation import validate
+from codrl_mj.viz.films.film import Panel, film
 
 TASK, REAL = "cartpole", "weaker"
 PAPER_REWARD = {

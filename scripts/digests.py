@@ -27,14 +27,14 @@ from safetensors.numpy import load_file
 
 import codrl_mj
 from codrl_mj import Uniform
-from codrl_mj.actuators import Actuator, CurrentLoop, Ideal, Motor, Supply
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Ideal, Motor, Supply
 from codrl_mj.agents import AGENTS
 from codrl_mj.agents.presets import SETTINGS
-from codrl_mj.drives import find_drive
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.identify import identify, read_log
 from codrl_mj.identify.synthetic import Excitation, Load, Sampler, Sensor, simulate
 from codrl_mj.runs.files import read_json, write_json
+from codrl_mj.sizing import find_drive
 from codrl_mj.tasks import OURS, find_task, named_actuator
 from codrl_mj.training import TrainConfig, train
 
@@ -92,7 +92,7 @@ _WINDING = Motor(
     resistance=1.3, inductance=0.2, torque_constant=0.9, back_emf_constant=0.8, arm_radius=0.7
 )
 _GAINS = CurrentLoop(kp=1.0, ki=2.0, kd=0.01, kff=0.5, bemf_compensation=False, substeps=3)
-CUSTOM = Actuator(
+CUSTOM = DCMotorActuator(
     _WINDING, dataclasses.replace(_GAINS, integral_leak=0.1, derivative_time_constant=0.02)
 )
 """An actuator none of whose fields is neutral."""

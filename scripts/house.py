@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[1]
-RECURRING = {"State", "Signals", "Options", "Twin"}
+RECURRING = {"State", "Signals", "Options", "ReferenceEnv"}
 """Names of classes that each family of actuators, or each task, has for itself."""
 SCREEN, FILE = 75, 570
 """Lines of 100 characters that a function, and a file, may have."""
-KINDS = r"\w*Config|\w*World|Task|MotorisedEnv|ActuatedEnv"
+KINDS = r"\w*Config|\w*EnvSource|Task|MotorsAddedEnv|ActuatedEnv"
 """Kinds of environments and configurations: what asks which of them something is, is a fork."""
 BLOCK = re.compile(r"(Args|Returns|Raises):")
 

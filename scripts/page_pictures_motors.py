@@ -15,9 +15,9 @@ from PIL import Image
 
 from codrl_mj.actuators import Drive, GearMotor, Lag, SampledLoop, Supply, TorqueSpeed
 from codrl_mj.cli import main
-from codrl_mj.pages.plots import Curve, Plot, save
 from codrl_mj.study.bench import BLOCKED, on_bench
 from codrl_mj.tasks import OURS, named_actuator
+from codrl_mj.viz.pages.plots import Curve, Plot, save
 
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -18,10 +18,10 @@ from PIL import Image
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
-from codrl_mj.films.film import Panel, film
 from codrl_mj.runs.files import writing
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, train
+from codrl_mj.viz.films.film import Panel, film
 
 DOCS = Path(__file__).parents[1] / "docs"
 WIDTH, HEIGHT = 320, 200

@@ -19,9 +19,9 @@ from PIL import Image
 
 import codrl_mj
 from codrl_mj.cli import main as command
-from codrl_mj.films.strip import draw_text
 from codrl_mj.runs.files import writing
 from codrl_mj.tasks import TASKS
+from codrl_mj.viz.films.strip import draw_text
 
 DOCS = Path(__file__).parents[1] / "docs"
 COLUMNS = "time=time:s,voltage=voltage:V,current=current:A,position=position:rad"

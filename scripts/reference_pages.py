@@ -37,19 +37,23 @@ ROOMS = (
         "catalogue",
         "deploy",
         "disturbances",
-        "drives",
+        "sizing",
         "engine",
         "envs",
         "evaluation",
         "identify",
     ),
-    *("physics", "replay", "study", "tasks", "training", "validation"),
+    *("physics", "study", "tasks", "training", "validation", "viz.replay"),
 )
 """Rooms with an `__all__`."""
 ALONE = {
-    "films": ("film.film", "film.Panel", "film.record"),
-    "foreign": ("building.motorised", "dm_control.make_dm_control", "world.GymnasiumWorld"),
-    "pages": (
+    "viz.films": ("film.film", "film.Panel", "film.record"),
+    "external_envs": (
+        "building.motors_added",
+        "dm_control.make_dm_control",
+        "world.GymnasiumEnvSource",
+    ),
+    "viz.pages": (
         *(
             "report.report",
             "report.replays",
@@ -67,7 +71,7 @@ ALONE = {
         ),
         *("summaries.compare", "files.writing"),
     ),
-    "view": ("session.Session",),
+    "viz.view": ("session.Session",),
 }
 """Rooms that are imported by their modules -> names for others."""
 

@@ -8,9 +8,9 @@ import dataclasses
 from pathlib import Path
 
 from codrl_mj.evaluation import run_episodes
-from codrl_mj.films.film import Panel, film
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import load_config
+from codrl_mj.viz.films.film import Panel, film
 
 
 def main() -> None:

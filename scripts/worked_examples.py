@@ -20,10 +20,10 @@ import yaml
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "examples"))  # where servo_arm is
 
-from codrl_mj.drives import Candidate, actuators_of, choose, demands_of  # noqa: E402
 from codrl_mj.evaluation import evaluate  # noqa: E402
 from codrl_mj.runs.files import writing  # noqa: E402
 from codrl_mj.runs.policies import load_policy  # noqa: E402
+from codrl_mj.sizing import Candidate, actuators_of, choose, demands_of  # noqa: E402
 from codrl_mj.training import TrainConfig, train  # noqa: E402
 
 SAC: dict[str, Any] = {

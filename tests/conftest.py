@@ -9,7 +9,7 @@ import pytest
 from gymnasium.envs.registration import registry
 
 from codrl_mj import engine
-from codrl_mj.actuators import Actuator
+from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.tasks import TASKS
 
 OURS = frozenset(TASKS)
@@ -56,7 +56,7 @@ def bare_engine():
 @pytest.fixture
 def installed(bare_engine):
     """MuJoCo with our motors' callbacks during the test, and without any after it."""
-    engine.load_family(Actuator)
+    engine.load_family(DCMotorActuator)
     engine.install()
 
 

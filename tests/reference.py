@@ -52,7 +52,7 @@ def paper_loop(
 
 
 def of_actuator(actuator, u_max=None):
-    """`paper_loop` with the parameters of an `Actuator` (of one substep), or under another voltage limit."""
+    """`paper_loop` with the parameters of an `DCMotorActuator` (of one substep), or under another voltage limit."""
     motor, loop = actuator.motor, actuator.controller
     return paper_loop(
         r=motor.resistance,

@@ -15,7 +15,7 @@ import yaml
 from hypothesis import strategies as st
 
 from codrl_mj import Choice, Disturbances, Joint, LogUniform, Uniform, make_sb3_vec_env, suite
-from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor, Supply, TorqueSpeed
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Lag, Motor, Supply, TorqueSpeed
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
 
@@ -89,7 +89,7 @@ ACTUATORS = (
     | st.builds(Lag, POSITIVE, POSITIVE)
     | st.builds(TorqueSpeed, POSITIVE, POSITIVE, POSITIVE)
     | st.builds(
-        Actuator,
+        DCMotorActuator,
         st.builds(Motor, POSITIVE),
         st.builds(CurrentLoop, kp=POSITIVE),
         st.builds(Supply, POSITIVE),
@@ -226,7 +226,7 @@ def test_numpys_numbers_are_numbers():
     def config(number, count, flag, levels):
         return EnvConfig(
             "cartpole",
-            Actuator(Motor(number(0.5))),
+            DCMotorActuator(Motor(number(0.5))),
             inner_steps=count(4),
             action="voltage",
             levels=levels,

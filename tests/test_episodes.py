@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from codrl_mj import Uniform
-from codrl_mj.actuators import IDEAL, Actuator, Ideal, Supply
+from codrl_mj.actuators import IDEAL, DCMotorActuator, Ideal, Supply
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation.episodes import RandomPolicy, load_episode, run_episodes, save_episode
 from codrl_mj.physics import signal_names, trace_names
@@ -84,7 +84,7 @@ def stepped(env, seed, policy):
 @pytest.mark.parametrize("actuator", ["ideal", "paper"])
 def test_episodes_are_those_of_stepping_one_environment_at_a_time(task, actuator):
     """Whatever their number and length: observations, states, rewards, signals, every integration step of the trace."""
-    definition, family = TASKS[task], {"ideal": Ideal, "paper": Actuator}[actuator]
+    definition, family = TASKS[task], {"ideal": Ideal, "paper": DCMotorActuator}[actuator]
     count = max(3, definition.motor_inner_steps)
     make = EnvConfig(task, actuator, inner_steps=count, max_episode_steps=60).make
     for seed, episode in enumerate(

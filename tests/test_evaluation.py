@@ -13,9 +13,9 @@ import pytest
 from codrl_mj import Uniform
 from codrl_mj.actuators import (
     IDEAL,
-    Actuator,
     ActuatorModel,
     CurrentLoop,
+    DCMotorActuator,
     Drive,
     GearMotor,
     Lag,
@@ -27,12 +27,12 @@ from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import MEASURES, Episode, RandomPolicy, evaluate, run_episodes, summarize
 from codrl_mj.fields import real
-from codrl_mj.films import strip
-from codrl_mj.pages.episode import Shown, _lines, _motor_plots
 from codrl_mj.physics import trace_names
 from codrl_mj.tasks import TASKS, named_actuator
+from codrl_mj.viz.films import strip
+from codrl_mj.viz.pages.episode import Shown, _lines, _motor_plots
 
-TRACE = trace_names(Actuator)
+TRACE = trace_names(DCMotorActuator)
 ROW = ("actual_force", "current", "voltage", "speed", "saturated")
 PEAKS = {"saturated_percent", "peak_voltage", "peak_current", "rms_current", "peak_speed"}
 ELECTRICAL = PEAKS | {"energy_drawn", "energy_returned", "copper_loss", "magnetic_energy"}
@@ -57,7 +57,7 @@ class Constant:
         return np.full((len(observation), 1), self.action, np.float32), None
 
 
-MOTOR = Actuator()
+MOTOR = DCMotorActuator()
 
 
 def made_up(
@@ -192,7 +192,7 @@ def pushing(*forces):
 
 def test_the_tracking_error_is_that_of_every_integration_step_in_torques_at_the_shaft():
     arm = 0.25
-    actuator = Actuator(Motor(arm_radius=arm))
+    actuator = DCMotorActuator(Motor(arm_radius=arm))
     # two environment steps of two integration steps each: 10 N, then -10 N are desired throughout;
     # and one more
     first = made_up(
@@ -347,7 +347,9 @@ def test_a_film_shows_the_voltage_of_every_family_that_has_one(monkeypatch):
 @pytest.mark.parametrize("max_voltage", [0.3, 0.6, 1.0, 24.0])
 def test_the_saturated_share_is_that_of_voltages_at_the_limit(max_voltage):
     weaker = named_actuator("weaker", "cartpole")
-    actuator = Actuator(weaker.motor, CurrentLoop(kp=0.2, ki=0.2, kff=0.5, max_voltage=max_voltage))
+    actuator = DCMotorActuator(
+        weaker.motor, CurrentLoop(kp=0.2, ki=0.2, kff=0.5, max_voltage=max_voltage)
+    )
     make = EnvConfig("cartpole", actuator, inner_steps=2).make
     episodes = run_episodes(Leaner(), make, episodes=3)
     voltages = np.concatenate([episode.trace["voltage"] for episode in episodes])
@@ -368,7 +370,7 @@ def test_a_stalled_motor_is_measured_as_its_closed_form_says():
         20,
     )
     env = EnvConfig(
-        "mountain_car_continuous", Actuator(motor), action="voltage", max_episode_steps=steps
+        "mountain_car_continuous", DCMotorActuator(motor), action="voltage", max_episode_steps=steps
     )
     result = evaluate(Constant(voltage), env, episodes=3)
     dt, n, final = 1.0 / count, steps * count, voltage / motor.resistance
@@ -403,7 +405,7 @@ def test_a_stalled_motor_is_measured_as_its_closed_form_says():
 @pytest.mark.parametrize("task", ["pendulum", "acrobot", "mountain_car"])
 def test_the_whole_energy_balance_closes_as_the_steps_shorten(task):
     """With kE = kT all that is drawn and not returned is heat, field or work, but for Euler's error of first order."""
-    gaps, actuator = [], Actuator(Motor(), CurrentLoop(kp=2.0, ki=2.0))
+    gaps, actuator = [], DCMotorActuator(Motor(), CurrentLoop(kp=2.0, ki=2.0))
     for timestep in (0.005, 0.0025, 0.00125):  # the winding's time constant is 0.1 s
         env = EnvConfig(task, actuator, timestep=timestep, max_episode_steps=8)
         result = evaluate(RandomPolicy(task), env, episodes=3)
@@ -444,7 +446,7 @@ def test_work_energies_and_peaks_are_those_of_the_shaft():
     ]
     states = [[0.0, -0.9, 0.0, 0.0]] * 5  # before the first step the cart moves at -0.9 m/s
     result = summarize(
-        "cartpole", [made_up(actuator=Actuator(motor), states=states, rows=rows)] * 2
+        "cartpole", [made_up(actuator=DCMotorActuator(motor), states=states, rows=rows)] * 2
     )
     dt = 0.02
     assert result.mechanical_work.mean == pytest.approx((3.0 * -0.2 + 1.0 * -0.15) * dt, rel=1e-12)

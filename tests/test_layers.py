@@ -15,18 +15,26 @@ ALLOWED = {
     # a layer: a room, a module at the top, or a module that stands lower than its room -> the
     # layers it may import
     "fields": set(),
-    "own_code": {"fields"},
-    "actuators": {"catalogue", "fields", "own_code"},
+    "user_code": {"fields"},
+    "actuators": {"catalogue", "fields", "user_code"},
     "disturbances": {"actuators", "fields"},
-    "tasks": {"actuators", "fields", "own_code"},
-    "catalogue": {"fields", "own_code"},
+    "tasks": {"actuators", "fields", "user_code"},
+    "catalogue": {"fields", "user_code"},
     "plugin": set(),
     "__init__": {"plugin", "tasks"},
-    "kept": set(),
-    "engine": {"actuators", "fields", "kept", "own_code", "plugin"},
-    "physics": {"actuators", "disturbances", "engine", "fields", "kept", "own_code", "tasks"},
+    "compile_cache": set(),
+    "engine": {"actuators", "fields", "compile_cache", "user_code", "plugin"},
+    "physics": {
+        "actuators",
+        "disturbances",
+        "engine",
+        "fields",
+        "compile_cache",
+        "user_code",
+        "tasks",
+    },
     "envs.distributions": {"fields"},
-    "envs.worlds": {"actuators", "engine", "own_code", "tasks"},
+    "envs.worlds": {"actuators", "engine", "user_code", "tasks"},
     "envs.config": {"actuators", "disturbances", "envs.distributions", "envs.worlds", "fields"},
     "envs": {
         *(
@@ -38,9 +46,9 @@ ALLOWED = {
             "envs.worlds",
             "fields",
         ),
-        *("kept", "own_code", "physics", "tasks"),
+        *("compile_cache", "user_code", "physics", "tasks"),
     },
-    "foreign": {
+    "external_envs": {
         *(
             "actuators",
             "disturbances",
@@ -51,11 +59,19 @@ ALLOWED = {
             "fields",
             "physics",
         ),
-        *("envs.worlds", "own_code", "tasks"),
+        *("envs.worlds", "user_code", "tasks"),
     },
-    "making": {"envs", "envs.config", "envs.worlds", "foreign"},
-    "suite": {"actuators", "envs", "envs.config", "foreign", "physics", "tasks"},
-    "agents": {"actuators", "envs", "envs.config", "fields", "kept", "own_code", "physics"},
+    "factory": {"envs", "envs.config", "envs.worlds", "external_envs"},
+    "suite": {"actuators", "envs", "envs.config", "external_envs", "physics", "tasks"},
+    "agents": {
+        "actuators",
+        "envs",
+        "envs.config",
+        "fields",
+        "compile_cache",
+        "user_code",
+        "physics",
+    },
     "runs": set(),
     "runs.files": set(),
     "runs.summaries": {"actuators", "envs.worlds", "fields", "runs.files", "runs", "tasks"},
@@ -75,12 +91,21 @@ ALLOWED = {
         *("runs.policies", "tasks"),
     },
     "deploy": {
-        *("actuators", "agents", "engine", "envs.config", "evaluation", "fields", "kept"),
-        *("runs.files", "runs.policies", "tasks", "own_code"),
+        *("actuators", "agents", "engine", "envs.config", "evaluation", "fields", "compile_cache"),
+        *("runs.files", "runs.policies", "tasks", "user_code"),
     },
-    "films": {"actuators", "envs", "envs.config", "evaluation", "physics", "runs.files", "tasks"},
-    "replay": {"envs", "envs.config", "evaluation", "runs.files"},
-    "view": {"actuators", "envs.config", "evaluation", "fields", "replay"},
+    "viz": set(),
+    "viz.films": {
+        "actuators",
+        "envs",
+        "envs.config",
+        "evaluation",
+        "physics",
+        "runs.files",
+        "tasks",
+    },
+    "viz.replay": {"envs", "envs.config", "evaluation", "runs.files"},
+    "viz.view": {"actuators", "envs.config", "evaluation", "fields", "viz.replay"},
     "training": {
         *(
             "actuators",
@@ -92,22 +117,30 @@ ALLOWED = {
             "runs.files",
             "runs",
         ),
-        *("runs.policies", "tasks", "own_code", "fields", "foreign", "pages.plots"),
+        *("runs.policies", "tasks", "user_code", "fields", "external_envs", "viz.pages.plots"),
     },
-    "drives": {
-        *("actuators", "catalogue", "engine", "envs.config", "evaluation", "fields", "foreign"),
+    "sizing": {
+        *(
+            "actuators",
+            "catalogue",
+            "engine",
+            "envs.config",
+            "evaluation",
+            "fields",
+            "external_envs",
+        ),
         *("runs.policies", "tasks", "training"),
     },
-    "pages.plots": {"runs.files"},
+    "viz.pages.plots": {"runs.files"},
     "validation": {
         "actuators",
         "catalogue",
         "engine",
-        "pages.plots",
+        "viz.pages.plots",
         "physics",
         "runs.files",
         "tasks",
-        "own_code",
+        "user_code",
     },
     "study": {
         *(
@@ -117,26 +150,26 @@ ALLOWED = {
             "evaluation",
             "evaluation.measures",
             "fields",
-            "films",
+            "viz.films",
         ),
-        *("drives", "engine", "runs.files", "runs.policies", "tasks", "training"),
+        *("sizing", "engine", "runs.files", "runs.policies", "tasks", "training"),
     },
     "rl_zoo3": set(),
-    "identify": {"actuators", "catalogue", "fields", "kept", "runs.files", "own_code"},
-    "pages": {
+    "identify": {"actuators", "catalogue", "fields", "compile_cache", "runs.files", "user_code"},
+    "viz.pages": {
         *(
             "__init__",
             "actuators",
             "catalogue",
-            "drives",
+            "sizing",
             "evaluation",
-            "films",
-            "foreign",
+            "viz.films",
+            "external_envs",
             "identify",
         ),
         *(
-            "pages.plots",
-            "replay",
+            "viz.pages.plots",
+            "viz.replay",
             "runs.files",
             "runs",
             "runs.policies",
@@ -156,51 +189,51 @@ ALLOWED = {
             "envs.worlds",
             "evaluation",
         ),
-        *("deploy", "evaluation.measures", "fields", "films", "kept", "own_code"),
+        *("deploy", "evaluation.measures", "fields", "viz.films", "compile_cache", "user_code"),
         *(
-            "foreign",
+            "external_envs",
             "identify",
-            "own_code",
-            "pages",
-            "pages.plots",
-            "replay",
+            "user_code",
+            "viz.pages",
+            "viz.pages.plots",
+            "viz.replay",
             "runs.files",
             "runs",
             "runs.policies",
             "runs.summaries",
-            "drives",
+            "sizing",
             "engine",
             "study",
             "tasks",
             "training",
             "validation",
-            "view",
+            "viz.view",
         ),
     },
     "__main__": {"cli"},
 }
-FOREIGN = {
+LIBRARIES = {
     # room or module: what it may import besides the standard library
     "fields": set(),
-    "own_code": {"numpy", "yaml"},
+    "user_code": {"numpy", "yaml"},
     "actuators": {"numpy"},
     "disturbances": {"numpy"},
     "tasks": {"numpy", "gymnasium", "mujoco"},
     "catalogue": {"pint"},
     "identify": {"numba", "numpy", "pooch", "scipy", "yaml"},
-    "pages.plots": {"matplotlib", "numpy"},
-    "pages": {"jinja2", "markupsafe", "numpy", "scipy"},
+    "viz.pages.plots": {"matplotlib", "numpy"},
+    "viz.pages": {"jinja2", "markupsafe", "numpy", "scipy"},
     "plugin": {"mujoco"},
-    "kept": {"mujoco", "numba", "llvmlite", "numpy", "platformdirs"},
+    "compile_cache": {"mujoco", "numba", "llvmlite", "numpy", "platformdirs"},
     "engine": {"mujoco", "numba", "llvmlite", "numpy"},
     "physics": {"mujoco", "numba", "numpy", "gymnasium", "pygame"},
-    "foreign": {"dm_control", "dm_env", "gymnasium", "mujoco", "numpy"},
+    "external_envs": {"dm_control", "dm_env", "gymnasium", "mujoco", "numpy"},
     "envs.distributions": {"numpy"},
     "envs.config": {"gymnasium", "numpy"},
     "envs": {"gymnasium", "numpy", "numba", "mujoco", "stable_baselines3"},
     "evaluation.measures": {"numpy", "scipy"},
-    "replay": {"mujoco", "numpy"},
-    "view": {"gymnasium", "mujoco", "numpy", "trimesh", "viser", "websockets"},
+    "viz.replay": {"mujoco", "numpy"},
+    "viz.view": {"gymnasium", "mujoco", "numpy", "trimesh", "viser", "websockets"},
     "runs.files": set(),
     "runs.summaries": set(),
 }
@@ -282,7 +315,7 @@ def test_no_layers_import_each_other_in_a_circle():
     assert set(TopologicalSorter(graph).static_order()) >= ALLOWED.keys()  # raises CycleError
 
 
-@pytest.mark.parametrize("layer", FOREIGN)
+@pytest.mark.parametrize("layer", LIBRARIES)
 def test_a_layer_imports_only_its_own_libraries(layer):
     for path in _files(layer):
         roots = (
@@ -290,7 +323,7 @@ def test_a_layer_imports_only_its_own_libraries(layer):
             - {"codrl_mj"}
             - set(sys.stdlib_module_names)
         )
-        assert roots <= FOREIGN[layer], path
+        assert roots <= LIBRARIES[layer], path
 
 
 def test_tasks_take_from_gymnasium_only_spaces_reset_bounds_and_its_registry():
@@ -322,6 +355,6 @@ def test_names_are_suggested_in_one_place():
 
 def test_only_the_engines_room_touches_raw_memory():
     for path in EVERY_FILE:
-        if "engine" not in path.parts and path.name != "kept.py":
+        if "engine" not in path.parts and path.name != "compile_cache.py":
             assert not re.search(r"\._address\b", path.read_text()), path  # of mjModel and mjData
             assert "llvmlite" not in path.read_text(), path

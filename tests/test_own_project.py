@@ -21,7 +21,7 @@ from codrl_mj.runs.summaries import read_run
 from codrl_mj.study.advice import measurement
 from codrl_mj.tasks import OURS, TASKS, find_task, reference_of
 from codrl_mj.tasks.attributes import Fixed
-from codrl_mj.tasks.twin import Trials
+from codrl_mj.tasks.twin import ReferenceStates
 from codrl_mj.training import TrainConfig, load_config
 from codrl_mj.validation import try_mutations, validate
 from tests.matrix import but
@@ -86,7 +86,7 @@ def test_the_family_runs_in_the_engine_as_in_python():
                 assert (torque, *signals) == tuple(row[motor, 1:-1])
 
 
-CURRENT_LOOP = codrl_mj.actuators.Actuator()
+CURRENT_LOOP = codrl_mj.actuators.DCMotorActuator()
 
 
 @pytest.mark.parametrize(
@@ -360,7 +360,7 @@ def test_a_hill_without_a_twin_has_no_ledger_and_says_so():
 
 
 def test_a_run_of_ones_own_is_taken():
-    trials = Trials(
+    trials = ReferenceStates(
         (math.pi,) * 4, ((0.0,),) * 4, start=(0.3, 0.1, 0.0, 0.0), steps=4, balanced_steps=2
     )
     other(trials=trials)

@@ -116,14 +116,17 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
     }
     assert len(models) >= 5
     pages = {
-        f"codrl_mj/pages/{name}"
+        f"codrl_mj/viz/pages/{name}"
         for name in ("page.html.jinja", "parts.html.jinja", "page.css", "page.js")
     }
     pages |= {
-        f"codrl_mj/pages/uplot/{name}" for name in ("uPlot.iife.min.js", "uPlot.min.css", "LICENSE")
+        f"codrl_mj/viz/pages/uplot/{name}"
+        for name in ("uPlot.iife.min.js", "uPlot.min.css", "LICENSE")
     }
-    pages |= {f"codrl_mj/replay/{name}" for name in ("page.html", "replay.css", "replay.js")}
-    pages |= {f"codrl_mj/replay/three/{name}" for name in ("three.min.js", "LICENSE", "README.md")}
+    pages |= {f"codrl_mj/viz/replay/{name}" for name in ("page.html", "replay.css", "replay.js")}
+    pages |= {
+        f"codrl_mj/viz/replay/three/{name}" for name in ("three.min.js", "LICENSE", "README.md")
+    }
     others = {
         "codrl_mj/py.typed",
         *(f"codrl_mj/_assets/study/{one}/runs.csv" for one in ("actuators", "insurance")),

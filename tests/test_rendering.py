@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from codrl_mj.actuators import IDEAL, Actuator, Drive, Motor
+from codrl_mj.actuators import IDEAL, DCMotorActuator, Drive, Motor
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import Episode, RandomPolicy, run_episodes
-from codrl_mj.films.film import Filmed, Panel, film
-from codrl_mj.films.strip import torque_label
-from codrl_mj.own_code import asset_path
-from codrl_mj.physics import Plant, signal_names
+from codrl_mj.physics import SimulationConfig, signal_names
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.tasks import TASKS, named_actuator
+from codrl_mj.user_code import asset_path
+from codrl_mj.viz.films.film import Filmed, Panel, film
+from codrl_mj.viz.films.strip import torque_label
 
 WIDTH, HEIGHT = 200, 120
 FRAME_HEIGHT = (
@@ -30,7 +30,7 @@ FRAME_HEIGHT = (
 PLOT_TOP = 40 + HEIGHT + 24
 DESIRED, ACTUAL, SATURATED, VOLTAGE = (0, 114, 178), (213, 94, 0), (204, 121, 167), (0, 158, 115)
 LIMITS = {"voltage": SATURATED, "current": (230, 159, 0), "temperature": (86, 180, 233)}
-SIGNALS = signal_names(Actuator)
+SIGNALS = signal_names(DCMotorActuator)
 
 
 def played(task="cartpole", actuator="weaker", steps=20, seed=1):
@@ -46,7 +46,7 @@ def made_up(desired, actual, *, saturated=False, arm=1.0, steps=40, terminated=F
     signals = {name: np.full(steps, value) for name, value in zip(SIGNALS, values, strict=True)}
     states = np.zeros((steps + 1, 4)) if states is None else states
     actuator, trace, time = (
-        Actuator(Motor(arm_radius=arm)),
+        DCMotorActuator(Motor(arm_radius=arm)),
         {"speed": np.zeros(steps)},
         0.02 * np.arange(1, steps + 1),
     )
@@ -225,7 +225,7 @@ def test_a_model_without_a_sky_is_drawn_on_ours(tmp_path):
     bare.write_text(re.sub(r'<texture name="sky".*?/>', "", asset_path("pendulum.xml").read_text()))
     images = []
     for task in (TASKS["pendulum"], dataclasses.replace(TASKS["pendulum"], asset=str(bare))):
-        model = task_model(Plant(task, (IDEAL,)))
+        model = task_model(SimulationConfig(task, (IDEAL,)))
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         images.append(OffscreenRenderer(model, WIDTH, HEIGHT).render(data))

@@ -8,15 +8,22 @@ from pathlib import Path
 
 import pytest
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor, actuator_over, mapping_of, resolve
+from codrl_mj.actuators import (
+    CurrentLoop,
+    DCMotorActuator,
+    Motor,
+    actuator_over,
+    mapping_of,
+    resolve,
+)
 from codrl_mj.cli import main
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.pages import report
 from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import SORT_KEYS, compare, find_runs, read_run, sort_runs
 from codrl_mj.tasks import named_actuator
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.training.folder import load_config
+from codrl_mj.viz.pages import report
 from tests.training.interruptions import begin
 
 PROGRESS = "steps,episodes,mean_return,steps_per_second,seconds\n"
@@ -105,8 +112,8 @@ def test_the_time_of_a_run_without_a_clock_follows_from_its_pace(tmp_path):
         ("paper", "acrobot", "paper"),
         ("open_loop", "pendulum", "open_loop"),
         (named_actuator("paper", "cartpole"), "pendulum", "custom"),  # named, but not on this task
-        (Actuator(Motor(resistance=7.0)), "pendulum", "custom"),
-        (Actuator(Motor(), CurrentLoop(max_voltage=float("inf"))), "pendulum", "custom"),
+        (DCMotorActuator(Motor(resistance=7.0)), "pendulum", "custom"),
+        (DCMotorActuator(Motor(), CurrentLoop(max_voltage=float("inf"))), "pendulum", "custom"),
         (GEARED, "cartpole", "kraken-x60"),  # known by its numbers, whatever its gear
         (OWN, "cartpole", "drive"),
     ],
@@ -244,7 +251,7 @@ def test_runs_are_sorted_by_any_key_with_those_that_lack_it_last(tmp_path):
 
 
 def test_a_comparison_has_the_settings_that_differ_and_every_result(tmp_path):
-    weak = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=0.2, ki=0.3))
+    weak = DCMotorActuator(Motor(arm_radius=0.15), CurrentLoop(kp=0.2, ki=0.3))
     runs = [
         read_run(make_run(tmp_path / "a", "weaker", seed=1)),
         read_run(make_run(tmp_path / "b", weak, seed=2, num_envs=8)),

@@ -8,12 +8,12 @@ import pytest
 from codrl_mj import fields
 from codrl_mj.agents import AGENTS
 from codrl_mj.cli import main
-from codrl_mj.drives import find_drive
-from codrl_mj.drives.loop import step
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy, check_episodes, run_episodes
 from codrl_mj.identify.plan import plan
 from codrl_mj.identify.synthetic import Excitation, Sampler, simulate
+from codrl_mj.sizing import find_drive
+from codrl_mj.sizing.loop import step
 
 MOTOR = "maxon-ec45-flat-50w"
 

@@ -15,7 +15,7 @@ from dm_control.suite.wrappers import pixels
 from dm_env import specs, test_utils
 
 from codrl_mj import suite
-from codrl_mj.actuators import IDEAL, NAMED, Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import IDEAL, NAMED, CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import TASKS, named_actuator
@@ -313,7 +313,7 @@ def test_dm_controls_own_reset_context(task):
 
 def test_a_diverging_simulation_raises_and_works_again_after_reset(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # the engine writes a log
-    wild = Actuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=float("inf")))
+    wild = DCMotorActuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=float("inf")))
     env = suite.load("pendulum", actuator=wild, allow_unstable=True)
     env.reset()
     with pytest.raises(SimulationDivergedError):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import codrl_mj
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks import named_actuator
 
 PATH = Path(__file__).parent.parent / "examples" / "the_whole_idea.py"
@@ -40,7 +40,7 @@ def ours(motor):
         motor.back_emf_constant,
         motor.arm,
     )
-    return Actuator(Motor(*numbers), CurrentLoop(**gains), None)
+    return DCMotorActuator(Motor(*numbers), CurrentLoop(**gains), None)
 
 
 def test_its_motors_are_the_papers_and_a_slow_one(idea):

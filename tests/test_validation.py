@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 
 import codrl_mj
-from codrl_mj.actuators import IDEAL, Actuator, Lag, TorqueSpeed
+from codrl_mj.actuators import IDEAL, DCMotorActuator, Lag, TorqueSpeed
 from codrl_mj.cli import main
-from codrl_mj.pages import certificate as page
 from codrl_mj.physics import (
     AnalyticPhysics,
     MujocoPhysics,
-    Plant,
+    SimulationConfig,
     SimulationDivergedError,
     needed_callbacks,
 )
@@ -44,14 +43,15 @@ from codrl_mj.validation.compare import differences
 from codrl_mj.validation.mutations import edited, unfailed, wrong_loop, wrong_model
 from codrl_mj.validation.table import TABLE, Case, outcome
 from codrl_mj.validation.trajectories import Growth
+from codrl_mj.viz.pages import certificate as page
+from tests.add_motors.models import ACTUATORS, INTEGRATORS, LOOP, arm, behind_plugin
 from tests.conftest import REPRESENTATIVES
 from tests.engine.models import FULL, add_motor, changed, controls, rotor, rotor_spec, trajectory
-from tests.motorised.models import ACTUATORS, INTEGRATORS, LOOP, arm, behind_plugin
-from tests.pages.parsed import Parsed, check_alone
 from tests.tasks.faces import REBUILT
 from tests.validation.test_convergence_checks import RATE, ideal, with_motor
 from tests.validation.test_energy_checks import STEPS, orders
 from tests.validation.test_motor_checks import EVERY
+from tests.viz.pages.parsed import Parsed, check_alone
 
 OWN = ("dynamics", "trajectories", "execution")
 
@@ -325,18 +325,18 @@ def test_a_fault_is_undone_after_an_error():
 
 def test_a_wrong_loop_is_undone_after_an_error(installed):
     model, inputs = rotor(), controls(20)
-    right, advance = trajectory(model, inputs), vars(Actuator)["advance"]
+    right, advance = trajectory(model, inputs), vars(DCMotorActuator)["advance"]
 
     def fail():
         with wrong_loop(("- parameters.resistance", "+ parameters.resistance"), everywhere=True):
             assert not np.array_equal(trajectory(model, inputs), right)
-            assert vars(Actuator)["advance"] is not advance
+            assert vars(DCMotorActuator)["advance"] is not advance
             raise KeyError
 
     with pytest.raises(KeyError):
         fail()
     np.testing.assert_array_equal(trajectory(model, inputs), right)
-    assert vars(Actuator)["advance"] is advance
+    assert vars(DCMotorActuator)["advance"] is advance
 
 
 def test_an_edit_whose_text_is_gone_is_an_error_and_not_a_passed_test():
@@ -470,7 +470,7 @@ def test_angles_are_compared_on_the_circle_only_where_both_were_wrapped():
 def test_the_growth_near_an_unstable_equilibrium_is_its_eigenvalue():
     """A pendulum upright: the semi-implicit map's larger eigenvalue, by hand."""
     task = TASKS["pendulum"]
-    run = AnalyticPhysics(Plant(task, [IDEAL], 1, "semi-implicit"))
+    run = AnalyticPhysics(SimulationConfig(task, [IDEAL], 1, "semi-implicit"))
     growth = Growth(task, run, seed=0)
     for _ in range(100):
         run.step(0.0)
@@ -675,7 +675,7 @@ def test_no_model_is_kept_from_a_mutation_nor_into_it():
 def test_a_model_without_a_motor_is_refused():
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
     with pytest.raises(
-        ValueError, match=r"no motor of codrl_mj among its 0 actuators.*codrl_mj.motorise"
+        ValueError, match=r"no motor of codrl_mj among its 0 actuators.*codrl_mj.add_motors"
     ):
         validate_model(model)
 
@@ -798,7 +798,7 @@ def test_the_command_prints_writes_and_exits_with_0(capsys, tmp_path):
 
 
 def test_the_command_takes_a_motorised_model(capsys, bare_engine, tmp_path):
-    spec = codrl_mj.motorise(mujoco.MjSpec.from_string(SERVO), {"servo": LOOP})
+    spec = codrl_mj.add_motors(mujoco.MjSpec.from_string(SERVO), {"servo": LOOP})
     spec.compile()
     (tmp_path / "servo.xml").write_text(spec.to_xml())
     assert main(["validate", "--model", str(tmp_path / "servo.xml"), "--quick"]) == 0

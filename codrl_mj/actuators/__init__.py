@@ -1,8 +1,8 @@
 """Actuators as mathematics: what one is, the families of them, stability, names. No MuJoCo."""
 
 from codrl_mj.actuators.current_loop import (
-    Actuator,
     CurrentLoop,
+    DCMotorActuator,
     Motor,
     Supply,
     VoltageDriven,
@@ -35,33 +35,33 @@ from codrl_mj.actuators.named import (
     identified_ranges,
     is_family,
     label_of,
-    labelled,
     mapping_of,
     name_of,
     named_mapping,
     names_together,
     resolve,
+    set_display_name,
 )
 from codrl_mj.actuators.parameters import (
     choices_of,
     field_paths,
     field_values,
+    from_array,
     parameter_paths,
     parameters_type,
-    unchecked,
 )
 from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
 from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
 from codrl_mj.actuators.torque_speed import TorqueSpeed
-from codrl_mj.own_code import trusting
+from codrl_mj.user_code import trusting
 
 __all__ = [
     "BUILT_IN",
     "FAMILIES",
     "IDEAL",
     "NAMED",
-    "Actuator",
+    "DCMotorActuator",
     "ActuatorModel",
     "Command",
     "CurrentLoop",
@@ -96,7 +96,7 @@ __all__ = [
     "identified_ranges",
     "is_family",
     "label_of",
-    "labelled",
+    "set_display_name",
     "mapping_of",
     "name_of",
     "named_mapping",
@@ -108,5 +108,5 @@ __all__ = [
     "spectral_radii",
     "spectral_radius",
     "trusting",
-    "unchecked",
+    "from_array",
 ]

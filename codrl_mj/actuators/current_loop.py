@@ -146,7 +146,7 @@ def advance(
     sags with the current at the electrical step's start.
 
     Args:
-        parameters: named as the fields of `Actuator` and its parts.
+        parameters: named as the fields of `DCMotorActuator` and its parts.
         timestep: mechanical step [s].
         state: current, integral and error.
         inputs: desired torque [N*m] and speed [rad/s] at the motor's shaft, time [s] and noise key.
@@ -248,7 +248,7 @@ _PAST_THE_CONTROLLER = ("max_voltage", "substeps", "current_bias", "current_nois
 
 
 @dataclasses.dataclass(frozen=True)
-class Actuator(ActuatorModel):
+class DCMotorActuator(ActuatorModel):
     """A motor and the current loop that drives it: what stands between a desired force and the force delivered."""
 
     family: ClassVar[str] = "current_loop"
@@ -367,7 +367,7 @@ class Actuator(ActuatorModel):
 
     def as_mapping(self) -> dict[str, Any]:
         """The nested mapping that `actuator_from_mapping` reads, without a family: it is the one that goes unsaid."""
-        return dataclasses.asdict(self) if type(self) is Actuator else super().as_mapping()
+        return dataclasses.asdict(self) if type(self) is DCMotorActuator else super().as_mapping()
 
 
 def _advance_driven(
@@ -391,7 +391,7 @@ def _observe_driven(
 
 
 @dataclasses.dataclass(frozen=True)
-class VoltageDriven(Actuator):
+class VoltageDriven(DCMotorActuator):
     """A motor under commanded voltage.
 
     With no feedback, a feed-forward gain of 1 V/A and no back-EMF compensation, the terminal

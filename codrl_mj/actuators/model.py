@@ -25,7 +25,7 @@ from codrl_mj.actuators.parameters import (
     parameters_type,
     value_at,
 )
-from codrl_mj.own_code import Form, call, check_form, place
+from codrl_mj.user_code import Form, call, check_form, place
 
 
 class Inputs(NamedTuple):

@@ -8,15 +8,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.actuators.current_loop import Actuator, CurrentLoop
+from codrl_mj.actuators.current_loop import CurrentLoop, DCMotorActuator
 from codrl_mj.actuators.drive import Drive
 from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name
 from codrl_mj.actuators.servo import Servo
-from codrl_mj.own_code import look_up, read_yaml, trusting_files
+from codrl_mj.user_code import look_up, read_yaml, trusting_files
 
-NAMED: dict[str, tuple[str, Callable[[Actuator], ActuatorModel]]] = {
+NAMED: dict[str, tuple[str, Callable[[DCMotorActuator], ActuatorModel]]] = {
     "ideal": ("force = desired force: no motor at all", lambda _: IDEAL),
     "paper": ("the paper's motor and gains for the task", lambda paper: paper),
     "weak": (
@@ -29,7 +29,7 @@ NAMED: dict[str, tuple[str, Callable[[Actuator], ActuatorModel]]] = {
     ),
     "open_loop": (
         "no feedback, u = R*i_ref + kE*omega, and a slow winding: L = 0.5 H",
-        lambda paper: Actuator(
+        lambda paper: DCMotorActuator(
             dataclasses.replace(paper.motor, inductance=0.5),
             CurrentLoop(kp=0.0, kff=paper.motor.resistance),
         ),
@@ -63,7 +63,7 @@ def actuator_from_mapping(mapping: Mapping[str, Any]) -> Any:
             f"motor = {str(motor)!r}: must be a mapping of a motor's fields; for a motor of the"
             f" catalogue or of a file write name = {str(motor)!r} beside the family"
         )
-    return find_family(fields.pop("family", Actuator.family)).from_mapping(fields)
+    return find_family(fields.pop("family", DCMotorActuator.family)).from_mapping(fields)
 
 
 def mapping_of(actuator: ActuatorModel) -> dict[str, Any] | None:
@@ -71,7 +71,7 @@ def mapping_of(actuator: ActuatorModel) -> dict[str, Any] | None:
     return None if actuator == IDEAL else actuator.as_mapping()
 
 
-def name_of(actuator: ActuatorModel, paper: Actuator | None = None) -> str:
+def name_of(actuator: ActuatorModel, paper: DCMotorActuator | None = None) -> str:
     """What to call an actuator wherever it is shown.
 
     What it was asked for by (`label_of`), or the motor of the catalogue that has its numbers but
@@ -79,17 +79,17 @@ def name_of(actuator: ActuatorModel, paper: Actuator | None = None) -> str:
     none; else its family.
     """
     kind, known = type(actuator), {}
-    if kind is Actuator:
+    if kind is DCMotorActuator:
         known = {name: vary(paper) for name, (_, vary) in NAMED.items()} if paper else {}
     elif kind is Drive and not label_of(actuator):
         known = _catalogue()
-    family = "custom" if kind is Actuator else family_name(kind)
+    family = "custom" if kind is DCMotorActuator else family_name(kind)
     same = (name for name, one in known.items() if one in (actuator, _own_numbers(actuator)))
     return label_of(actuator) or next(same, family)
 
 
 def names_together(
-    actuators: Iterable[ActuatorModel], papers: Iterable[Actuator] | None = None
+    actuators: Iterable[ActuatorModel], papers: Iterable[DCMotorActuator] | None = None
 ) -> str:
     """What to call several, each name once."""
     pairs = itertools.zip_longest(actuators, papers or ())
@@ -104,7 +104,7 @@ def label_of(actuator: ActuatorModel) -> str:
     return str(vars(actuator).get("_label", ""))
 
 
-def labelled(actuator: ActuatorModel, label: str) -> Any:
+def set_display_name(actuator: ActuatorModel, label: str) -> Any:
     """The very actuator, which must be nobody else's, called something from now on; but for the ideal one."""
     if label and actuator is not IDEAL:
         vars(actuator)["_label"] = str(label)
@@ -152,7 +152,7 @@ def named_mapping(actuator: ActuatorModel) -> Any:
     return {"label": name, **whole} if name else mapping_of(actuator)
 
 
-def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
+def resolve(given: Any, paper: DCMotorActuator | None, whose: str) -> Any:
     """Turn whatever a user may write for an actuator into an `ActuatorModel`.
 
     Args:
@@ -176,7 +176,7 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
         return given()
     if isinstance(given, Mapping) and "label" in given:
         rest = {name: value for name, value in given.items() if name != "label"}
-        return labelled(_unshared(resolve(rest, paper, whose)), given["label"])
+        return set_display_name(_unshared(resolve(rest, paper, whose)), given["label"])
     if isinstance(given, Mapping) and "name" in given:
         changes = {name: value for name, value in given.items() if name != "name"}
         return actuator_over(resolve(given["name"], paper, whose), changes)
@@ -203,7 +203,7 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     from codrl_mj.catalogue import motor_entry, motor_names
 
     if given in motor_names() or Path(given).suffix == ".toml":
-        return labelled(Drive.of(motor_entry(given).numbers), Path(given).stem)
+        return set_display_name(Drive.of(motor_entry(given).numbers), Path(given).stem)
     found = look_up(
         given,
         NAMED | FAMILIES,
@@ -213,7 +213,7 @@ def resolve(given: Any, paper: Actuator | None, whose: str) -> Any:
     if is_family(found):
         return resolve(found, paper, whose)
     if isinstance(found, ActuatorModel):
-        return labelled(_unshared(found), given)
+        return set_display_name(_unshared(found), given)
     raise ValueError(f"actuator = {given!r}: {found!r} is neither an actuator nor a family of them")
 
 
@@ -244,7 +244,7 @@ def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
     return fields, section
 
 
-def _from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
+def _from_file(path: Path, paper: DCMotorActuator | None, whose: str) -> Any:
     """An actuator from a YAML or JSON file that holds a mapping of its fields."""
     fields, _ = _read(path)
     try:
@@ -259,7 +259,7 @@ def _from_file(path: Path, paper: Actuator | None, whose: str) -> Any:
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
     stem = path.stem if path.stem not in ("actuator", "actuators") else path.absolute().parent.name
-    return made if label_of(made) else labelled(_unshared(made), stem)
+    return made if label_of(made) else set_display_name(_unshared(made), stem)
 
 
 def identified_ranges(path: Path | str) -> dict[str, str]:
@@ -330,7 +330,7 @@ def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
             "" if kind is Drive else f" {family}"
         )
     return (
-        labelled(made, label + _CHANGED * (_own_numbers(made) != _own_numbers(base)))
+        set_display_name(made, label + _CHANGED * (_own_numbers(made) != _own_numbers(base)))
         if label
         else made
     )

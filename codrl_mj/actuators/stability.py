@@ -51,7 +51,7 @@ def spectral_radii(family: Any, numbers: np.ndarray, timestep: float) -> np.ndar
     """`spectral_radius` of many actuators at once.
 
     Args:
-        family: `codrl_mj.actuators.Actuator`, or one with its fields.
+        family: `codrl_mj.actuators.DCMotorActuator`, or one with its fields.
         numbers: shape (m, p), rows as `ActuatorModel.numbers` has them.
         timestep: mechanical step [s].
 

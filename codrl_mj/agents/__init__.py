@@ -7,7 +7,7 @@ from codrl_mj.agents.base import AgentConfig, DeepAgentConfig
 from codrl_mj.agents.off_policy import DDPGConfig, DQNConfig, SACConfig, TD3Config
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.sarsa import SARSAConfig
-from codrl_mj.own_code import look_up
+from codrl_mj.user_code import look_up
 
 AGENTS: dict[str, type[AgentConfig]] = {
     config.name: config

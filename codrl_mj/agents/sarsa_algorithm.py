@@ -25,10 +25,10 @@ from codrl_mj.agents.tile_coding import (
     find_tiles,
     make_coder,
 )
+from codrl_mj.compile_cache import njit
 from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.compiled import bound, compiled_kernels
 from codrl_mj.envs.sb3 import ActuatedVecEnv
-from codrl_mj.kept import njit
 from codrl_mj.physics.streams import set_words, words_of
 
 FORGOTTEN = 1e-3

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.kept import njit
+from codrl_mj.compile_cache import njit
 
 LARGEST_TABLE = 2**24
 """Most tiles in all: 128 MiB of weights for every action."""

@@ -10,7 +10,7 @@ from typing import Any
 from codrl_mj.catalogue.derivation import MotorNumbers, derive
 from codrl_mj.catalogue.units import Kind, read
 from codrl_mj.fields import check_names, command
-from codrl_mj.own_code import asset_folder, read_text
+from codrl_mj.user_code import asset_folder, read_text
 
 
 def _printed(unit: str, example: str, power: int = 0, zero: bool = False, also: str = "") -> Any:

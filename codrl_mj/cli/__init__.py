@@ -24,8 +24,8 @@ import mujoco
 import codrl_mj
 from codrl_mj.cli.extras import missing_module_message
 from codrl_mj.cli.parsing import parse, understood
-from codrl_mj.own_code import FILES_TRUSTED
 from codrl_mj.runs.files import check_file, check_page, check_writable
+from codrl_mj.user_code import FILES_TRUSTED
 
 SAYS: dict[str, tuple[str, str]] = {
     # verb, or the word before several: what it does in a sentence, and an example

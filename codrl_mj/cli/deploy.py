@@ -176,7 +176,7 @@ class Test:
         if self.log is not None:
             check_file(self.log)
         if self.film is not None:
-            from codrl_mj.films.film import check_film
+            from codrl_mj.viz.films.film import check_film
 
             check_film(self.film, 640, 480)
         link = Link(
@@ -218,7 +218,7 @@ class Test:
             write_log(self.log, Contract.read(self.folder), done.on_board[0])
             print(f"wrote {self.log}; try: {command('board', 'check', self.folder, self.log)}")
         if self.film is not None:
-            from codrl_mj.films.film import film, record
+            from codrl_mj.viz.films.film import film, record
 
             with Board(
                 self.folder, self.target, link, self.seed, self.loop, self.actuator, self.trust
@@ -381,7 +381,7 @@ def _draw(found: Any, out: Path) -> None:
     import numpy as np
 
     from codrl_mj.cli.motor import save_plot
-    from codrl_mj.pages.plots import Curve, Plot
+    from codrl_mj.viz.pages.plots import Curve, Plot
 
     cut = found.simulated.copy()
     cut[found.starts[1:] - 1] = np.nan

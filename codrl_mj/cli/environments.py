@@ -14,7 +14,7 @@ import tyro
 from codrl_mj.actuators import (
     FAMILIES,
     NAMED,
-    Actuator,
+    DCMotorActuator,
     Ideal,
     Supply,
     actuator_over,
@@ -24,8 +24,8 @@ from codrl_mj.actuators import (
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.worlds import find_world, is_world
 from codrl_mj.fields import field_docs, parts
-from codrl_mj.own_code import read_yaml, trusting_files
 from codrl_mj.runs import CONFIG
+from codrl_mj.user_code import read_yaml, trusting_files
 
 
 def flags(
@@ -131,7 +131,7 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
         ],
         None,
     )
-    over = flags(Actuator if issubclass(family, Ideal) else family, adding=[as_family])
+    over = flags(DCMotorActuator if issubclass(family, Ideal) else family, adding=[as_family])
     return [
         ("actuators", Actuators, ()),
         (
@@ -166,12 +166,12 @@ def with_environment(verb: Any, arguments: Sequence[str]) -> Any:
     from codrl_mj.training.folder import load_config
 
     chosen = scan(arguments, "actuator", FAMILY)
-    known = EnvConfig("cartpole", Actuator())
+    known = EnvConfig("cartpole", DCMotorActuator())
     run = next((run for run in map(Path, arguments) if (run / CONFIG).is_file()), None)
     if run is not None:
         known = load_config(run, chosen.trust).evaluation_env
     elif chosen.task is not None:
-        known = EnvConfig(chosen.task, Actuator())
+        known = EnvConfig(chosen.task, DCMotorActuator())
     fields = environment_fields(known, chosen, known.task)
     made: Any = dataclasses.make_dataclass(verb.__name__, fields, bases=(verb,), frozen=True)
     made.__doc__, made.line = verb.__doc__, tuple(arguments)

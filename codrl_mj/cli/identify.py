@@ -87,10 +87,10 @@ class Identify:
 
     def run(self) -> tuple[int, Any]:
         """Check the logs, fit, print a table, write the files."""
-        from codrl_mj.drives import find_drive
         from codrl_mj.identify.identify import checked, foreseen, identify
         from codrl_mj.identify.reading import read_log
         from codrl_mj.identify.result import ACTUATOR
+        from codrl_mj.sizing import find_drive
 
         logs, held_out = (
             [read_log(path, self.columns) for path in paths] for paths in (self.logs, self.holdout)
@@ -129,7 +129,7 @@ class Identify:
                 print(f"wrote {path}")
             page = self.out / "report.html"
             try:  # where what draws it is installed: the numbers are written already
-                from codrl_mj.pages.identification import identification_page
+                from codrl_mj.viz.pages.identification import identification_page
 
                 identification_page(found, page)
                 print(f"wrote {page}")
@@ -224,9 +224,9 @@ class CheckLogs:
 
     def run(self) -> tuple[int, Any]:
         """Print a table for each log."""
-        from codrl_mj.drives import find_drive
         from codrl_mj.identify.checks import check
         from codrl_mj.identify.reading import read_log
+        from codrl_mj.sizing import find_drive
 
         motor = None if self.motor is None else find_drive(self.motor).motor
         if not self.logs:
@@ -286,8 +286,8 @@ class PlanExperiment:
 
     def run(self) -> tuple[int, Any]:
         """Print the options, the best one last."""
-        from codrl_mj.drives import find_drive, find_entry
         from codrl_mj.identify.plan import GOALS, plan, write_excitation
+        from codrl_mj.sizing import find_drive, find_entry
 
         sensing, entry = Sensing(**vars(self.sensing)), find_entry(self.name)
         bears = None if entry is None else entry.numbers.continuous_current
@@ -401,8 +401,8 @@ class SimulateLog:
     def run(self) -> int:
         """Write the log."""
         from codrl_mj.actuators import Supply
-        from codrl_mj.drives import find_drive
         from codrl_mj.identify.synthetic import Excitation, simulate, write_log
+        from codrl_mj.sizing import find_drive
 
         if not self.out.name.endswith((".csv", ".csv.gz")):
             raise ValueError(f"out = {self.out}: must end in .csv or .csv.gz")

@@ -46,7 +46,7 @@ class Changes:
 
     def drive(self, name: str) -> Any:
         """The named drive with these set over it."""
-        from codrl_mj.drives import find_drive
+        from codrl_mj.sizing import find_drive
 
         given: dict[str, Any] = dict(vars(self))
         if given.pop("not_delayed") == given["delayed"]:
@@ -91,8 +91,8 @@ class List:
         """Print the table."""
         from codrl_mj.catalogue.datasheet import KINDS
         from codrl_mj.catalogue.derivation import OTHER_NAMES
-        from codrl_mj.drives import catalogue_rows
-        from codrl_mj.drives.abilities import ABILITY_UNITS
+        from codrl_mj.sizing import catalogue_rows
+        from codrl_mj.sizing.abilities import ABILITY_UNITS
 
         rows = catalogue_rows(self.sort)
         columns = [f"{head}\n{unit}" for head, unit, _ in _LISTED.values()]
@@ -140,17 +140,17 @@ class Show:
 
     def run(self) -> tuple[int, Any]:
         """Print the tables, draw the diagram."""
-        from codrl_mj.drives import explain, find_entry, find_loop
+        from codrl_mj.sizing import explain, find_entry, find_loop
 
         drive, entry = self.changes.drive(self.name), find_entry(self.name)
         found = explain(drive, entry, find_loop(self.name))
         if self.out is not None:
-            from codrl_mj.pages.diagrams import torque_speed_diagram
+            from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
             figure = torque_speed_diagram(drive, entry and entry.numbers)
         _print_explained(f"{self.name}: {entry.title}" if entry else "", drive.voltage_limit, found)
         if self.html is not None:
-            from codrl_mj.pages.motor import motor_page
+            from codrl_mj.viz.pages.motor import motor_page
 
             motor_page(self.name, drive, entry, self.html)
             print(f"wrote {self.html}")
@@ -161,7 +161,7 @@ class Show:
 
 def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
     """What it can do first, then its numbers, then what to know of them."""
-    from codrl_mj.drives import unknown_in_words
+    from codrl_mj.sizing import unknown_in_words
 
     def show(title: str, part: str) -> None:
         rows = [(row["name"], number(row["value"], 4), row["unit"]) for row in found[part]]
@@ -242,7 +242,7 @@ class Design:
 
     def run(self) -> tuple[int, Any]:
         """Print the table, draw Bode's diagram."""
-        from codrl_mj.drives import LoopDesign, design, designs, sampled_too_seldom
+        from codrl_mj.sizing import LoopDesign, design, designs, sampled_too_seldom
 
         drive = self.changes.drive(self.name)
         own, every = design(drive), designs(drive)
@@ -277,7 +277,7 @@ class Design:
             drive.assumed,
         )
         if self.out is not None:
-            from codrl_mj.pages.diagrams import bode_diagram
+            from codrl_mj.viz.pages.diagrams import bode_diagram
 
             save_plot(bode_diagram(drive), self.out / "bode.png")
         others = [one for one in every.values() if isinstance(one, LoopDesign)]
@@ -304,7 +304,7 @@ class Step:
 
     def run(self) -> tuple[int, Any]:
         """Print the table, draw the responses."""
-        from codrl_mj.drives import sampled_too_seldom, step
+        from codrl_mj.sizing import sampled_too_seldom, step
 
         drive = self.changes.drive(self.name)
         steps = step(drive)
@@ -330,7 +330,7 @@ class Step:
         print_table("", columns, rows, right=columns[1:])
         say(sampled_too_seldom(drive), drive.assumed)
         if self.out is not None:
-            from codrl_mj.pages import diagrams
+            from codrl_mj.viz.pages import diagrams
 
             shown = [*diagrams.small_steps({"": (drive, None)}), *diagrams.recoveries(drive, steps)]
             save_plot(shown, self.out / "step.png")
@@ -372,7 +372,7 @@ class New:
 
 def save_plot(figure: Any, path: Path) -> None:
     """Write a figure, and say so."""
-    from codrl_mj.pages.plots import save
+    from codrl_mj.viz.pages.plots import save
 
     save(figure, path)
     print(f"wrote {path}")

@@ -64,8 +64,8 @@ class Feasible:
 
     def run(self) -> tuple[int, Any]:
         """Print the bounds, and the verdict last."""
-        from codrl_mj import drives
-        from codrl_mj.drives import (
+        from codrl_mj import sizing
+        from codrl_mj.sizing import (
             demand_of,
             feasibility,
             find_drive,
@@ -89,7 +89,7 @@ class Feasible:
                 for value in (bound.needed, bound.available)
             )
             mark = Text("holds", "green") if bound.holds else Text("fails", "red")
-            mark = Text("unknown", "yellow") if bound.verdict == drives.DEPENDS else mark
+            mark = Text("unknown", "yellow") if bound.verdict == sizing.DEPENDS else mark
             rows.append((bound.name, bound.formula, *numbers, bound.unit, mark, bound.verdict))
         print_table(
             title, ("bound", "of", "needs", "has", "unit", "", "says"), rows, right=("needs", "has")
@@ -97,7 +97,7 @@ class Feasible:
         asked, best = found.operation, geared(drive, demand, continuous)
         at_best, (low, high) = (
             feasibility(best, demand, continuous),
-            drives.equal_gears(best, demand, continuous),
+            sizing.equal_gears(best, demand, continuous),
         )
         say(
             f"{asked.energy_drawn:.3g} J drawn and {asked.copper_loss:.3g} J of heat in an episode,"
@@ -130,7 +130,7 @@ class Feasible:
             "gear_ratios_as_good": (low, high),
             "unknown": unknown,
         }
-        return int(found.verdict in (drives.HOPELESS, drives.SURELY_NOT)), content
+        return int(found.verdict in (sizing.HOPELESS, sizing.SURELY_NOT)), content
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,8 +182,8 @@ class Choose:
         """Print the ranking, or of several motors the best for each."""
         import yaml
 
-        from codrl_mj.drives import actuators_of, choose, demand_of, demands_of
         from codrl_mj.runs.files import writing
+        from codrl_mj.sizing import actuators_of, choose, demand_of, demands_of
 
         if self.top < 1:
             raise ValueError(f"--top {self.top}: must be >= 1")
@@ -372,8 +372,8 @@ def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
     """The torque-speed diagram with what the demand asks at the gear's output, the rotor's inertia included."""
     import numpy as np
 
-    from codrl_mj.drives.abilities import find_entry
-    from codrl_mj.pages.diagrams import torque_speed_diagram
+    from codrl_mj.sizing.abilities import find_entry
+    from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
     radius, entry = drive.motor.arm_radius, find_entry(name)
     torque = radius * (demand.torque + drive.additions.armature * demand.acceleration)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.text import Text
 
-from codrl_mj import kept
+from codrl_mj import compile_cache
 from codrl_mj.cli.parsing import AsJson
 from codrl_mj.cli.terminal import console, number, print_table, say
 from codrl_mj.runs import summaries
@@ -159,7 +159,7 @@ class Cache:
 
     def run(self) -> int:
         """Show or clear."""
-        place = kept.folder()
+        place = compile_cache.folder()
         if place is None:
             print("off: CODRL_MJ_CACHE says so")
             return 0
@@ -175,6 +175,10 @@ class Cache:
                 file.unlink(missing_ok=True)
         print(
             f"{place}: {told}"
-            + (", cleared" if self.clear and files else f"; at most {kept.MOST / 1e6:.0f} MB")
+            + (
+                ", cleared"
+                if self.clear and files
+                else f"; at most {compile_cache.MOST / 1e6:.0f} MB"
+            )
         )
         return 0

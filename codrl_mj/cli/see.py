@@ -70,7 +70,7 @@ class Render(OfEpisodes):
     def run(self: Any) -> int:
         """Run the episode and film it."""
         from codrl_mj.evaluation import save_episode
-        from codrl_mj.films.film import check_film, film, record
+        from codrl_mj.viz.films.film import check_film, film, record
 
         check_film(self.out, self.width, self.height)
         if self.trajectory is not None and self.trajectory.suffix != ".npz":
@@ -119,7 +119,7 @@ class Replay(OfEpisodes):
     def run(self: Any) -> int:
         """Run the episode and write it."""
         from codrl_mj.evaluation import run_episodes
-        from codrl_mj.replay import motion_of_episode, write_replay
+        from codrl_mj.viz.replay import motion_of_episode, write_replay
 
         policy, env, title = policy_and_environment(self)
         (episode,) = run_episodes(policy, env.make, 1, self.seed)
@@ -166,7 +166,7 @@ class LiveView(OfEpisodes):
     def run(self: Any) -> int:
         """Serve until Ctrl-C."""
         from codrl_mj.training.run import stopping
-        from codrl_mj.view.session import Session, run_native
+        from codrl_mj.viz.view.session import Session, run_native
 
         if not 1 <= self.port <= 65535:
             raise ValueError(f"--port {self.port}: must be from 1 to 65535")
@@ -181,7 +181,7 @@ class LiveView(OfEpisodes):
                 )
         else:
             try:
-                from codrl_mj.view.browser import Browser
+                from codrl_mj.viz.view.browser import Browser
             except ModuleNotFoundError as error:
                 if (error.name or "").split(".")[0] not in ("viser", "trimesh", "websockets"):
                     raise
@@ -256,7 +256,7 @@ class Report:
 
     def run(self) -> int:
         """Write the page."""
-        from codrl_mj.pages.report import replays, report
+        from codrl_mj.viz.pages.report import replays, report
 
         with progress_bar("") as bar:
             row = bar.add_task("reading", total=None)

@@ -69,7 +69,7 @@ class Validate:
         if caught:
             print_mutations(caught, blind)
         if self.out is not None:
-            from codrl_mj.pages.certificate import write
+            from codrl_mj.viz.pages.certificate import write
 
             for file in write(certificate, self.out, caught):
                 print(f"wrote {file}")

@@ -10,7 +10,7 @@ from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.network import Network
 from codrl_mj.deploy.tiles import Tiles
 from codrl_mj.fields import check_names
-from codrl_mj.own_code import asset_path
+from codrl_mj.user_code import asset_path
 
 FILES = ("controller.h", "controller.c", "main.c", "wire.h", "wire.c", "board.c", "board.ld")
 # name -> bytes of flash memory for a program, of RAM; whether an AVR: constants lie in RAM, a

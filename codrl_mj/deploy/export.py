@@ -94,7 +94,7 @@ def export(
 
     The C is `controller.h`, `controller.c` and `main.c`, which computes the golden commands again;
     the loops are in it where all motors have the same `codrl_mj.actuators.Drive`, `Servo` or the
-    paper's `Actuator`.
+    paper's `DCMotorActuator`.
 
     Args:
         policy: as `codrl_mj.runs.policies.load_policy` returns it, of PPO, SAC, TD3, DDPG, DQN

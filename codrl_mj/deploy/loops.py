@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import Actuator, Drive, Servo, sampled
+from codrl_mj.actuators import DCMotorActuator, Drive, Servo, sampled
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 from codrl_mj.envs.config import EnvConfig
 
@@ -14,12 +14,14 @@ def current_loop(env: EnvConfig) -> dict[str, Any] | None:
     """The numbers of the loop that all motors share; None where there is none to be computed on a board.
 
     Those of a `codrl_mj.actuators.Drive` at 25 degC, whose gains are computed as it computes them,
-    of a `Servo`, or of the paper's `Actuator`. Amperes for a command, limits [A] and [V], gains,
+    of a `Servo`, or of the paper's `DCMotorActuator`. Amperes for a command, limits [A] and [V], gains,
     and the rate of its samples [Hz].
     """
     first: Any = env.actuators[0]
     asked = ("position", "velocity") if type(first) is Servo else ("force", "current")
-    if type(first) not in (Drive, Servo, Actuator) or any(one != first for one in env.actuators):
+    if type(first) not in (Drive, Servo, DCMotorActuator) or any(
+        one != first for one in env.actuators
+    ):
         return None
     if env.action not in asked:
         return None
@@ -32,7 +34,7 @@ def current_loop(env: EnvConfig) -> dict[str, Any] | None:
         "voltage": min(first.voltage_limit, 1e30),
         "servo": None,
     }
-    if type(first) is Actuator:
+    if type(first) is DCMotorActuator:
         with contextlib.closing(env.make()) as made:
             model = getattr(made.unwrapped, "model", None)
         return (
@@ -61,7 +63,7 @@ def current_loop(env: EnvConfig) -> dict[str, Any] | None:
     }
 
 
-def _paper_loop(actuator: Actuator, period: float) -> dict[str, Any]:
+def _paper_loop(actuator: DCMotorActuator, period: float) -> dict[str, Any]:
     """The numbers of `codrl_mj.actuators.electrical_step` at its electrical step [s]; None: no limit."""
     loop, supply = actuator.controller, actuator.supply
     limits = {"voltage": actuator.voltage_limit, "most_voltage": loop.max_voltage}

@@ -1,7 +1,7 @@
 """The current loop of the exported C in the simulation's motor: each sample is asked of a process, the winding is here.
 
 A family's own step runs with one function of it replaced: where `Drive` and `Servo` compute samples
-of their loop, and the paper's `Actuator` its one, these ask for a voltage and bring it to the
+of their loop, and the paper's `DCMotorActuator` its one, these ask for a voltage and bring it to the
 winding. Nothing else of a motor changes. The loop's memory goes with each sample and comes back,
 since the engine may ask for a step twice.
 """
@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numba import types
 
-from codrl_mj.actuators import Actuator, Drive, Servo, current_loop, drive, servo, shaft
+from codrl_mj.actuators import DCMotorActuator, Drive, Servo, current_loop, drive, servo, shaft
 from codrl_mj.actuators.model import Family
 from codrl_mj.actuators.shaft import Winding
+from codrl_mj.compile_cache import external
 from codrl_mj.engine.families import replaced
 from codrl_mj.engine.memory import at, f64, symbol, u64
-from codrl_mj.kept import external
 
 WITHIN = 5000
 """Milliseconds after which a sample counts as not answered."""
@@ -149,7 +149,7 @@ vars(_shaft).update(vars(shaft), turn=_with(shaft.turn, run_over=run_over))
 _ADVANCE = {
     Drive: _with(drive.advance, _advance=_with(drive._advance, shaft=_shaft)),
     Servo: _with(servo.advance, shaft=_shaft),
-    Actuator: _with(current_loop.advance, electrical_step=electrical_step),
+    DCMotorActuator: _with(current_loop.advance, electrical_step=electrical_step),
 }
 
 
@@ -164,7 +164,7 @@ def loop_on_board(
     """Let motors of a family ask a process for the voltage of each sample, in a `with` block.
 
     Args:
-        family: `Drive`, `Servo` or `Actuator`.
+        family: `Drive`, `Servo` or `DCMotorActuator`.
         process: with pipes, of the program that `board.c` becomes with `BOARD_DRIVE`.
         amperes: what a command of one asks for [A].
         current_step: of the converter that measures the current [A]; 0 for none.

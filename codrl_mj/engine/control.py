@@ -14,6 +14,7 @@ from typing import Any
 import mujoco
 from numba import types
 
+from codrl_mj.compile_cache import cfunc
 from codrl_mj.engine.doors import command, inertia_at, is_disabled, user_of
 from codrl_mj.engine.families import (
     HEAD,
@@ -29,7 +30,6 @@ from codrl_mj.engine.families import (
 from codrl_mj.engine.hill import compiled_hill
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import at, callback, f64, internal
-from codrl_mj.kept import cfunc
 
 _USER_DYNAMICS, _USER_BIAS = int(mujoco.mjtDyn.mjDYN_USER), int(mujoco.mjtBias.mjBIAS_USER)
 _FIRST, _SECOND = SIGNATURE

@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 from numba import types
 
+from codrl_mj.compile_cache import cfunc
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import at, call, internal, on_stack, symbol, u64
-from codrl_mj.kept import cfunc
 
 _NO_CLAMP, _GROUPS, _LARGEST = (
     int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL),

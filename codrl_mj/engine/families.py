@@ -18,10 +18,10 @@ from numba.extending import register_jitable
 
 from codrl_mj.actuators import Family, Inputs, family_number, parameters_type, reference
 from codrl_mj.actuators.model import advance_form, check_family
+from codrl_mj.compile_cache import Note, cfunc
 from codrl_mj.engine.doors import load_inertia
 from codrl_mj.engine.memory import call, f64, i32, internal, read, symbol, tuple_of, u8, u64, write
-from codrl_mj.kept import Note, cfunc
-from codrl_mj.own_code import Form, check_form, not_compiled
+from codrl_mj.user_code import Form, check_form, not_compiled
 
 SIGNATURE = (250700.0, 268401.0)
 """First two numbers of the `user` data of every actuator and joint that is ours: the paper's arXiv

@@ -25,10 +25,10 @@ from typing import Any
 import mujoco
 from numba import types
 
+from codrl_mj.compile_cache import cfunc
 from codrl_mj.engine.families import SIGNATURE
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import at, callback, f64, internal
-from codrl_mj.kept import cfunc
 
 HILL_NAMES = ("signature_1", "signature_2", "gravity", "wavenumber", "height")
 """What the `user` entries of one of our slide joints hold, in order: the signature (two numbers),

@@ -25,8 +25,8 @@ from numba import types
 from numba.core.registry import cpu_target
 from numba.core.typing.ctypes_utils import from_ctypes
 
+from codrl_mj.compile_cache import external
 from codrl_mj.engine.memory import emitted, pointed
-from codrl_mj.kept import external
 from codrl_mj.plugin import LayoutError, library
 
 _SCALARS = {
@@ -127,7 +127,7 @@ def _live() -> dict[str, Any]:
     """A model and its data, of which every count has another value, by the names of their structures."""
     model = mujoco.MjSpec.from_string(
         _PROBE
-    ).compile()  # within `motorised`, which this is no model for
+    ).compile()  # within `motors_added`, which this is no model for
     data = mujoco.MjData(model)
     data.time = 4.56
     mujoco.mj_fwdPosition(model, data)  # uses the stack: `maxuse_stack` is no longer zero

@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from codrl_mj.kept import linked
+from codrl_mj.compile_cache import linked
 
 internal = functools.partial(
     numba.njit,

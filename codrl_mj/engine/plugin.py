@@ -17,6 +17,7 @@ import mujoco
 from numba import types
 
 from codrl_mj.actuators import BUILT_IN, Ideal, family_number, reference
+from codrl_mj.compile_cache import cfunc, external, njit
 from codrl_mj.engine.doors import clip, command, inertia_at, is_disabled, user_of
 from codrl_mj.engine.families import (
     HEAD,
@@ -36,7 +37,6 @@ from codrl_mj.engine.families import (
 )
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import at, f64, internal, symbol
-from codrl_mj.kept import cfunc, external, njit
 from codrl_mj.plugin import FAMILY, NAME, complain, library, registered
 
 PLUGIN_HEAD = HEAD + 1

@@ -1,4 +1,4 @@
-"""Puts actuators of ours into models of anybody's: `motorise`."""
+"""Puts actuators of ours into models of anybody's: `add_motors`."""
 
 import re
 import sys
@@ -40,7 +40,7 @@ class MotorWarning(UserWarning):
     """A model may contain its motors already, or move its joints past them."""
 
 
-class Mounted(NamedTuple):
+class AddedMotor(NamedTuple):
     """One motor, and the actuators of a model that ask it for a force."""
 
     pattern: str
@@ -49,7 +49,7 @@ class Mounted(NamedTuple):
     """Several drive the same joint; the first delivers the motor's force, and the others deliver none."""
 
 
-def motorise(
+def add_motors(
     spec: mujoco.MjSpec,
     actuators: Mapping[Any, Any],
     allow_unstable: bool = False,
@@ -62,7 +62,7 @@ def motorise(
     through the gear, to the joint.
 
         >>> spec = mujoco.MjSpec.from_file("half_cheetah.xml")
-        >>> model = codrl_mj.motorise(spec, {"b.*": my_motor, "f.*": "ideal"}).compile()
+        >>> model = codrl_mj.add_motors(spec, {"b.*": my_motor, "f.*": "ideal"}).compile()
 
     Args:
         spec: the model; it is not changed.
@@ -196,10 +196,10 @@ def matched_by(pattern: str, names: list[list[str]], needed: bool = True) -> lis
 
 def _chosen(
     spec: mujoco.MjSpec, model: mujoco.MjModel, actuators: Mapping[Any, Any]
-) -> list[Mounted]:
+) -> list[AddedMotor]:
     """The motors, in the order of their actuators."""
     taken: dict[int, str] = {}
-    found: list[Mounted] = []
+    found: list[AddedMotor] = []
     names = names_of(model)
     for pattern, actuator in resolve_patterns(actuators, f"the model {spec.modelname!r}").items():
         shafts: dict[str, list[int]] = {}
@@ -221,7 +221,7 @@ def _chosen(
                 indices,
                 key=lambda index: len(indices) > 1 and bool(model.actuator_forcelimited[index]),
             )
-            found.append(Mounted(pattern, actuator, tuple(ordered)))
+            found.append(AddedMotor(pattern, actuator, tuple(ordered)))
     return sorted(found, key=lambda each: min(each.indices))
 
 
@@ -339,7 +339,7 @@ def _refusal(
     return ""
 
 
-def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, mounted: Mounted) -> None:
+def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, mounted: AddedMotor) -> None:
     """Put a motor behind actuators of a spec.
 
     The old `model` is compiled: it has what defaults, `inheritrange` and automatic limits come to.
@@ -469,7 +469,7 @@ def doubled(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> list[
     return [f"{'; '.join(found.values())}. {remedy}"] if found else []
 
 
-def _past_motors(model: mujoco.MjModel, mounted: Sequence[Mounted]) -> list[str]:
+def _past_motors(model: mujoco.MjModel, mounted: Sequence[AddedMotor]) -> list[str]:
     """Describe what moves the joints of motors past these, and what motors do not share."""
     called = [model.actuator(index).name or str(index) for index in range(model.nactuator)]
     joints = [

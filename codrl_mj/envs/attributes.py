@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.disturbances import OFF
-from codrl_mj.envs.setup import Setup
+from codrl_mj.envs.setup import ResolvedEnv
 from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.variation import Variation, field_of, write_fields
 from codrl_mj.tasks import Task
@@ -27,7 +27,7 @@ def shared(attribute: Attribute) -> bool:
     return isinstance(attribute, Fixed | Setting)
 
 
-def read(name: str, setup: Setup, model: Any) -> Any:
+def read(name: str, setup: ResolvedEnv, model: Any) -> Any:
     """The value of an attribute of an environment, whose simulation has this `mjModel`; without one, the physics."""
     attribute = setup.task.attributes[name]
     if isinstance(attribute, Fixed):
@@ -44,7 +44,7 @@ def read(name: str, setup: Setup, model: Any) -> Any:
     return attribute.scale * float(_place(attribute, model)[0]) ** (-1 if attribute.inverse else 1)
 
 
-def written(name: str, value: Any, setup: Setup, model: Any) -> Setup:
+def written(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
     """Write an attribute; to be followed by `mj_setConst`.
 
     Returns:
@@ -121,7 +121,9 @@ def _number(value: Any, positive: bool) -> float:
     raise ValueError("must be a finite number" + " > 0" * positive)
 
 
-def _write_number(name: str, attribute: ModelNumber, value: Any, setup: Setup, model: Any) -> None:
+def _write_number(
+    name: str, attribute: ModelNumber, value: Any, setup: ResolvedEnv, model: Any
+) -> None:
     power, varies = -1 if attribute.inverse else 1, attribute.varies
     number = _number(value, positive=bool(varies))
     if not isinstance(model, mujoco.MjModel):
@@ -140,7 +142,7 @@ def _write_number(name: str, attribute: ModelNumber, value: Any, setup: Setup, m
     _place(attribute, model)[0] = (number / attribute.scale) ** power
 
 
-def _write_forces(value: Any, setup: Setup, model: Any, each: bool) -> Setup:
+def _write_forces(value: Any, setup: ResolvedEnv, model: Any, each: bool) -> ResolvedEnv:
     """The forces of the actions, each or the largest of them."""
     task = setup.task
     if setup.config.action != "force" or setup.config.disturbances != OFF or len(task.motors) > 1:
@@ -165,9 +167,9 @@ def _write_forces(value: Any, setup: Setup, model: Any, each: bool) -> Setup:
     )
 
 
-def _write_step(value: Any, setup: Setup, model: Any) -> Setup:
+def _write_step(value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
     duration = _number(value, positive=True)
-    if setup.plant.motorised or setup.config.disturbances != OFF:
+    if setup.plant.motors_added or setup.config.disturbances != OFF:
         raise AttributeError(
             "motor and disturbances were checked for this step: make an environment without them"
         )

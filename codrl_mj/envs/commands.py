@@ -95,7 +95,7 @@ class TaskCommands:
         if not all(limit is None or np.isfinite(limit) for limit in limits):
             raise ValueError(f"action = {name!r}: needs a finite controller.max_voltage, it is inf")
         self.holds = np.where([command.unit in POSITIONS for command in chosen], scales, 0.0)
-        """As `codrl_mj.physics.Plant.holds`."""
+        """As `codrl_mj.physics.SimulationConfig.holds`."""
         each = zip(limits, scales, task.max_forces, strict=True)
         self.max_forces = np.array(
             [most if limit is None else limit * scale for limit, scale, most in each]

@@ -32,10 +32,10 @@ import numpy as np
 from numba import types
 
 from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import f32, f64, floats, i64, internal, on_stack
-from codrl_mj.envs.setup import FIRST_OPTION, NEEDS_KEY, Setup
-from codrl_mj.kept import njit
+from codrl_mj.envs.setup import FIRST_OPTION, NEEDS_KEY, ResolvedEnv
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
 from codrl_mj.physics.rows import Lane, Rows, load, store
 from codrl_mj.physics.sharing import shared
@@ -62,7 +62,7 @@ class VectorStep(NamedTuple):
     limit: np.ndarray
     """Steps after which an episode is truncated, shape (1,)."""
     options: np.ndarray
-    """As `Setup.options`."""
+    """As `ResolvedEnv.options`."""
     signals: np.ndarray
     """The last row of the trace but for its ends, shape (columns, N, motors)."""
 
@@ -124,7 +124,7 @@ def compiled_env(env: Any) -> CompiledEnv | None:
     return CompiledEnv(*parts, setup.commands.action_forces, low, high)
 
 
-def bound(setup: Setup, physics: Any) -> tuple[int, np.ndarray]:
+def bound(setup: ResolvedEnv, physics: Any) -> tuple[int, np.ndarray]:
     """The address of a simulation whose steps are compiled, and the observation that they fill."""
     _, seen = physics.bound or (None, np.empty(setup.observation_space.shape or (), np.float32))
     physics.bound = options, seen = setup.options, seen
@@ -132,7 +132,7 @@ def bound(setup: Setup, physics: Any) -> tuple[int, np.ndarray]:
     return physics.where, seen
 
 
-def compiled_kernels(setup: Setup, physics: Any) -> Kernels:
+def compiled_kernels(setup: ResolvedEnv, physics: Any) -> Kernels:
     """The functions for environments of one kind, whose simulation's steps are compiled; compiled once a process."""
     task = setup.task
     sensors = len(setup.plant.family.OBSERVED) if setup.sensors else 0

@@ -14,7 +14,7 @@ import numpy as np
 from codrl_mj.actuators import ActuatorModel, mapping_of, names_together
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve
 from codrl_mj.envs.distributions import Distribution, paths_of
-from codrl_mj.envs.worlds import World, find_world, options_mapping
+from codrl_mj.envs.worlds import EnvSource, find_world, options_mapping
 from codrl_mj.fields import check_joint_dynamics, check_names
 
 
@@ -159,7 +159,7 @@ class EnvConfig:
         return dataclasses.replace(self, **fields), rest
 
     @property
-    def world(self) -> World:
+    def world(self) -> EnvSource:
         """What the environment is of."""
         return find_world(self.task)
 

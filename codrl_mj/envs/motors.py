@@ -17,8 +17,13 @@ from codrl_mj.engine.reading import Readout, bring_to_rest, sharing, slots
 from codrl_mj.engine.specs import matched_by, names_of
 from codrl_mj.envs.commands import ControlCommands, command_of
 from codrl_mj.envs.distributions import paths_of
-from codrl_mj.envs.randomization import Draws, Randomization, check_extremes, put_into
-from codrl_mj.physics.base import diverged, namer
+from codrl_mj.envs.randomization import (
+    Randomization,
+    RandomizationState,
+    apply_to_simulation,
+    check_extremes,
+)
+from codrl_mj.physics.base import diverged, make_info_reader
 from codrl_mj.physics.variation import without_motors, write_fields
 
 _POSITION = int(
@@ -41,7 +46,7 @@ class MotorSettings:
     disturbances: Disturbances = OFF
     """Of commands, and load pulses."""
     allow_unstable: bool = False
-    """As for `codrl_mj.motorise`."""
+    """As for `codrl_mj.add_motors`."""
     joint_dynamics: str | None = None
     """Likewise."""
 
@@ -59,7 +64,7 @@ class MotorSettings:
         return {pattern: command.actuator for pattern, command in self.commands.items()}
 
 
-class Motors:
+class ActuatorBank:
     """The motors in one simulation, of a model that was built with them; every face of others' environments has one."""
 
     def __init__(
@@ -99,8 +104,8 @@ class Motors:
         )
         if not settings.allow_unstable:
             check_extremes(randomization, nominal, model)
-        self.draws = Draws(
-            randomization, [list(nominal.values())], functools.partial(put_into, self)
+        self.draws = RandomizationState(
+            randomization, [list(nominal.values())], functools.partial(apply_to_simulation, self)
         )
         drawn = settings.disturbances.random or randomization.random
         self._random = drawn or any(one.random for one in nominal.values())
@@ -139,7 +144,7 @@ class Motors:
     def signals(self) -> dict[str, Any]:
         """The motors' signals after the last step, as `info` has them, units as `Readout` has them."""
         table, alone = self.readout.table(self.data), len(self.present) == 1
-        return namer(self.readout.names)(table[:, 0].tolist() if alone else table)
+        return make_info_reader(self.readout.names)(table[:, 0].tolist() if alone else table)
 
     def seen(self) -> np.ndarray:
         """What the sensors say now, shape (k,), float64, entries as in `sensors`."""

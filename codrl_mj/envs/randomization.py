@@ -11,16 +11,16 @@ import numpy as np
 
 from codrl_mj.actuators import (
     BUILT_IN,
-    Actuator,
     ActuatorModel,
+    DCMotorActuator,
     Family,
     Ideal,
     UnstableError,
     choices_of,
     field_paths,
     field_values,
+    from_array,
     parameter_paths,
-    unchecked,
 )
 from codrl_mj.engine.reading import check_shafts, sharing
 from codrl_mj.engine.specs import matched_by, names_of
@@ -106,7 +106,7 @@ class Randomization:
         """Whether motors may need an episode's key of random numbers for what is drawn of them."""
 
 
-class Draws:
+class RandomizationState:
     """The drawn values of N simulations, as arrays, and their way into these; a single environment has one.
 
     Where nothing is drawn, it has nothing to say and nothing to keep.
@@ -116,7 +116,7 @@ class Draws:
         self,
         randomization: Randomization,
         motors: Sequence[Sequence[ActuatorModel]],
-        put: "Callable[[Draws, np.ndarray], None]",
+        put: "Callable[[RandomizationState, np.ndarray], None]",
     ) -> None:
         """Begin with nothing drawn for simulations with these nominal motors.
 
@@ -217,7 +217,7 @@ class Draws:
         if self.randomization.mounting:
             each = zip(*(one.tolist() for one in fields), strict=True)
             arms, additions = mounting_of(
-                [list(map(unchecked, families, values)) for values in each]
+                [list(map(from_array, families, values)) for values in each]
             )
         return list(map(numbers_of, families, fields)), arms, additions
 
@@ -299,7 +299,10 @@ def check_extremes(
         one.MOTION or type(one) not in BUILT_IN for one in motors.values()
     ):
         return
-    draws, model = Draws(randomization, [list(motors.values())], lambda *_: None), copy.copy(model)
+    draws, model = (
+        RandomizationState(randomization, [list(motors.values())], lambda *_: None),
+        copy.copy(model),
+    )
     data, bounds = (
         mujoco.MjData(model),
         [sorted(one.extremes) for one in randomization.distributions.values()],
@@ -332,15 +335,15 @@ def check_extremes(
             raise ValueError(f"randomize: {drawn}: {error}; or narrow the bounds") from None
 
 
-def put_into(simulation: Any, draws: Draws, rows: np.ndarray) -> None:
-    """Give the only simulation, of a `Physics` or of `Motors`, what was drawn."""
+def apply_to_simulation(simulation: Any, draws: RandomizationState, rows: np.ndarray) -> None:
+    """Give the only simulation, of a `Physics` or of `ActuatorBank`, what was drawn."""
     if draws.randomization.draws_actuator:
         simulation.set_actuators(draws.motors())
     if draws.randomization.variation is not None:
         simulation.set_model(draws.model_fields(rows, shown=True))
 
 
-def put_into_batch(physics: Any, draws: Draws, rows: np.ndarray) -> None:
+def apply_to_batch(physics: Any, draws: RandomizationState, rows: np.ndarray) -> None:
     """Give simulations of a `MujocoBatchPhysics`, whose motors are of one family, what they were drawn with."""
     numbers, arms, additions = draws.parameters(rows)
     if draws.randomization.draws_actuator:
@@ -407,7 +410,9 @@ def _check_known(
     field: str, motors: Sequence[ActuatorModel], varied: Sequence[str], whose: str
 ) -> None:
     """Refuse a name that is no field of all these motors, nor of the model."""
-    families: list[Family] = [Actuator if isinstance(one, Ideal) else type(one) for one in motors]
+    families: list[Family] = [
+        DCMotorActuator if isinstance(one, Ideal) else type(one) for one in motors
+    ]
     of_each = [field_paths(family) for family in families]
     known = [
         path for path in (of_each[0] if of_each else ()) if all(path in paths for paths in of_each)
@@ -475,6 +480,6 @@ def _follows(of: Callable[[ActuatorModel], Any], motor: ActuatorModel, path: str
     fields, field = field_paths(family), split_path(path)[1]
     for values in (field_values(motor), (2.0,) * len(fields)):
         other = [value + (name == field) for name, value in zip(fields, values, strict=True)]
-        if of(unchecked(family, values)) != of(unchecked(family, other)):
+        if of(from_array(family, values)) != of(from_array(family, other)):
             return True
     return False

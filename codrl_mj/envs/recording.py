@@ -5,17 +5,19 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from codrl_mj.envs.motors import Motors
+from codrl_mj.envs.motors import ActuatorBank
 from codrl_mj.envs.setup import alone
 
 
-class StepWatch:
+class SubstepRecorder:
     """Sees each integration step of an environment that calls `mujoco.mj_step`; of others the end of their steps.
 
     What it has is what an `ActuatedEnv` has by the same names, states and speeds being the model's.
     """
 
-    def __init__(self, motors: Motors, command: str, step_duration: float | None = None) -> None:
+    def __init__(
+        self, motors: ActuatorBank, command: str, step_duration: float | None = None
+    ) -> None:
         """Look at their simulation, in which the agent gives a command; steps take that long [s], if it is known."""
         self._motors, self._data, model = motors, motors.data, motors.data.model
         self._rows: list[np.ndarray] = []

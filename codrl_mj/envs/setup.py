@@ -16,20 +16,20 @@ from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.motors import longer, sensor_names
 from codrl_mj.envs.randomization import Randomization, check_extremes
-from codrl_mj.own_code import look_up
-from codrl_mj.physics import PHYSICS, Physics, Plant, Signals, trace_names
-from codrl_mj.physics.base import namer
+from codrl_mj.physics import PHYSICS, Physics, Signals, SimulationConfig, trace_names
+from codrl_mj.physics.base import make_info_reader
 from codrl_mj.physics.compiled_task import Outcomes, compiled_outcomes
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.variation import bare_model
 from codrl_mj.tasks import Task, find_task
+from codrl_mj.user_code import look_up
 
 NEEDS_KEY, FIRST_OPTION = 0, 1
-"""In `Setup.options`: whether an episode's disturbances or sensors need a key, and the first of the task's options."""
+"""In `ResolvedEnv.options`: whether an episode needs a key, and the first of the task's options."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Setup:
+class ResolvedEnv:
     """An environment of a task as its configuration says; made by `build`.
 
     It holds nothing twice: what follows from the fields is computed where it is first asked for.
@@ -44,7 +44,7 @@ class Setup:
     """Integration steps per environment step."""
 
     @classmethod
-    def build(cls, config: EnvConfig) -> "Setup":
+    def build(cls, config: EnvConfig) -> "ResolvedEnv":
         """The set-up of a configuration, checked for what its fields do not show one by one."""
         task = find_task(config.task)
         made = cls(
@@ -85,11 +85,13 @@ class Setup:
         )
 
     @functools.cached_property
-    def plant(self) -> Plant:
+    def plant(self) -> SimulationConfig:
         """What is simulated."""
         integrator, commands = self.task.integrator(self.config.integrator), self.commands
         between = commands.max_forces, self.config.disturbances, self.config.joint, commands.holds
-        return Plant(self.task, commands.simulated, self.inner_steps, integrator, *between)
+        return SimulationConfig(
+            self.task, commands.simulated, self.inner_steps, integrator, *between
+        )
 
     @functools.cached_property
     def randomization(self) -> Randomization:
@@ -201,7 +203,7 @@ class Setup:
 
     @functools.cached_property
     def _named(self) -> Callable[[Any], Signals]:
-        return namer(trace_names(self.plant.family)[:-1])
+        return make_info_reader(trace_names(self.plant.family)[:-1])
 
     def __getstate__(self) -> dict[str, Any]:
         return {
@@ -233,10 +235,10 @@ def one_for_each(actuator: Any, task: str) -> bool:
 
 def set_up_many(
     num_envs: int, task: str, actuator: Any, arguments: Mapping[str, Any]
-) -> tuple[Setup, list[tuple[ActuatorModel, ...]]]:
+) -> tuple[ResolvedEnv, list[tuple[ActuatorModel, ...]]]:
     """The set-up that many environments share, and the actuators to simulate, a tuple for each environment."""
     if not one_for_each(actuator, task):
-        setup = Setup.build(EnvConfig.of(task, actuator, arguments))
+        setup = ResolvedEnv.build(EnvConfig.of(task, actuator, arguments))
         return setup, [setup.commands.simulated] * num_envs
     if len(actuator) != num_envs:
         raise ValueError(
@@ -247,14 +249,14 @@ def set_up_many(
         raise ValueError(
             f"action = {arguments['action']!r}: with an actuator for each environment only 'force'"
         )
-    setups: dict[Any, Setup] = {}
+    setups: dict[Any, ResolvedEnv] = {}
     every: list[tuple[ActuatorModel, ...]] = []
     for index, one in enumerate(actuator):
         try:
             config = EnvConfig.of(task, one, arguments)
             every.append(config.actuators)
             if every[-1] not in setups:
-                setups[every[-1]] = Setup.build(config)
+                setups[every[-1]] = ResolvedEnv.build(config)
         except ValueError as error:
             raise ValueError(f"actuator[{index}]: {error}") from None
         if isinstance(every[-1][0], Ideal):

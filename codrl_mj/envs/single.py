@@ -11,10 +11,10 @@ from codrl_mj.actuators import IDEAL
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, written
 from codrl_mj.envs.compiled import bound, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.randomization import Draws, put_into
-from codrl_mj.envs.setup import Setup, alone
-from codrl_mj.envs.snapshots import check_snapshot, generator_of, letters
-from codrl_mj.physics import MujocoPhysics, Plant, signal_names, trace_names
+from codrl_mj.envs.randomization import RandomizationState, apply_to_simulation
+from codrl_mj.envs.setup import ResolvedEnv, alone
+from codrl_mj.envs.snapshots import check_snapshot, encode_name, generator_of
+from codrl_mj.physics import MujocoPhysics, SimulationConfig, signal_names, trace_names
 from codrl_mj.physics.offscreen import OffscreenRenderer, Window, check_view
 from codrl_mj.physics.streams import words_of
 from codrl_mj.tasks import Task
@@ -76,10 +76,12 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
         config = EnvConfig.of(task, actuator, {"physics": physics, **arguments})
-        self.setup = Setup.build(config)
+        self.setup = ResolvedEnv.build(config)
         self.physics = self.setup.simulate()
-        into = functools.partial(put_into, self.physics)
-        self._draws = Draws(self.setup.randomization, [self.setup.plant.actuators], into)
+        into = functools.partial(apply_to_simulation, self.physics)
+        self._draws = RandomizationState(
+            self.setup.randomization, [self.setup.plant.actuators], into
+        )
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
@@ -256,7 +258,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         The generators of the spaces, and what wrappers count, are theirs.
         """
         everything = {
-            "task": letters(self.task.name),
+            "task": encode_name(self.task.name),
             "physics": self.physics.snapshot(),
             "generator": words_of(self.np_random),
         }
@@ -315,7 +317,9 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         if self.physics.scene is not None:
             return self.physics
         if self._shown is None:
-            self._shown = MujocoPhysics(Plant(self.task, [IDEAL] * len(self.task.motors)))
+            self._shown = MujocoPhysics(
+                SimulationConfig(self.task, [IDEAL] * len(self.task.motors))
+            )
         return self._shown
 
     def close(self) -> None:

@@ -37,7 +37,7 @@ def set_elapsed_steps(env: "gymnasium.Env[Any, Any]", elapsed: np.ndarray) -> No
         limit._elapsed_steps = None if steps < 0 else steps
 
 
-def letters(name: str) -> np.ndarray:
+def encode_name(name: str) -> np.ndarray:
     """What an environment is called, as an array."""
     return np.frombuffer(name.encode(), dtype=np.uint8).copy()
 
@@ -54,7 +54,7 @@ def check_snapshot(
 ) -> None:
     """Refuse a snapshot of other entries, shapes or types than those of the environment's own, `expected`.
 
-    The entry of a `name`, if there is one, has the `letters` of what it is of.
+    The entry of a `name`, if there is one, has the `encode_name` of what it is of.
     """
     for entry in [*expected, *(one for one in snapshot if one not in expected)]:
         found, wanted = (

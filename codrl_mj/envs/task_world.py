@@ -13,17 +13,24 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.envs.worlds import COMMON, World, described, options_mapping, patterns_of, world_of
+from codrl_mj.envs.worlds import (
+    COMMON,
+    EnvSource,
+    described,
+    options_mapping,
+    patterns_of,
+    world_of,
+)
 from codrl_mj.fields import check_pattern, did_you_mean, field_docs
-from codrl_mj.own_code import asset_path
 from codrl_mj.tasks import TASKS, Task, find_task, reference_of, register, resolve_actuators
+from codrl_mj.user_code import asset_path
 
 
 class UnknownOptionError(ValueError, TypeError):
     """A keyword that the environment does not have; a TypeError too, as Python's own is, and as TorchRL expects."""
 
 
-class TaskWorld(World):
+class TaskEnvSource(EnvSource):
     """The world of one task, ours or anybody's."""
 
     fields = (*COMMON, "physics", "integrator", "inner_steps", "timestep", "levels", "joint")
@@ -216,9 +223,9 @@ class TaskWorld(World):
     def interface(self, config: Any) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """By the task's names, and the units of its state and of the actuators' signals and commands."""
         from codrl_mj.envs.commands import command_of
-        from codrl_mj.envs.setup import Setup
+        from codrl_mj.envs.setup import ResolvedEnv
 
-        setup, motors = Setup.build(config), config.actuators
+        setup, motors = ResolvedEnv.build(config), config.actuators
         of_sensors = [motors[0].SIGNAL_UNITS.get(name.rpartition(".")[2]) for name in setup.sensors]
         seen = described(
             setup.observation_names,
@@ -254,12 +261,12 @@ def claims(name: str) -> bool:
     return name in TASKS or any(name == task.env_id for task in TASKS.values())
 
 
-def find(name: Any) -> TaskWorld:
+def find(name: Any) -> TaskEnvSource:
     """The world of the task of that name."""
     ours = {task.env_id: task for task in TASKS.values()}
-    return TaskWorld(ours[name] if name in ours else find_task(name))
+    return TaskEnvSource(ours[name] if name in ours else find_task(name))
 
 
 @world_of.register
-def _(task: Task) -> TaskWorld:
-    return TaskWorld(register(task))
+def _(task: Task) -> TaskEnvSource:
+    return TaskEnvSource(register(task))

@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 
 from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, shared, written
 from codrl_mj.envs.compiled import Kernels, VectorStep, compiled_kernels
-from codrl_mj.envs.randomization import Draws, put_into_batch
+from codrl_mj.envs.randomization import RandomizationState, apply_to_batch
 from codrl_mj.envs.setup import set_up_many
 from codrl_mj.envs.snapshots import check_snapshot
 from codrl_mj.fields import free_memory
@@ -119,8 +119,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self.arm_radii = np.array([one.arm_radius for one in self.setup.config.actuators])
         """Of the motors of an environment [m], shape (motors,)."""
         self._streams = Streams(self.num_envs)
-        self._draws = Draws(
-            self.setup.randomization, actuators, functools.partial(put_into_batch, self.physics)
+        self._draws = RandomizationState(
+            self.setup.randomization, actuators, functools.partial(apply_to_batch, self.physics)
         )
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)

@@ -1,7 +1,7 @@
 """Worlds: what environments are of, before motors are in them. Tasks of ours, anybody's environments, and one's own.
 
 An `EnvConfig` names its world and asks it for everything in which worlds differ. One's own is an
-instance of a subclass of `World`, found as `module:NAME`; no file of ours needs to know of it.
+instance of a subclass of `EnvSource`, found as `module:NAME`; no file of ours needs to know of it.
 """
 
 import abc
@@ -20,8 +20,8 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import IDEAL, ActuatorModel, is_family
-from codrl_mj.own_code import load_object
 from codrl_mj.tasks import TASKS, reference_of
+from codrl_mj.user_code import load_object
 
 EVERY = ".*"
 """The pattern of all motors."""
@@ -32,7 +32,7 @@ COMMON = (
 """Fields of an `EnvConfig` that every world has."""
 VECTOR_ARGUMENTS = ("num_threads", "autoreset_mode")
 """Keyword arguments of vectors of environments that a single environment does not have."""
-_KINDS = ("codrl_mj.envs.task_world", "codrl_mj.foreign.world")
+_KINDS = ("codrl_mj.envs.task_world", "codrl_mj.external_envs.world")
 """Our kinds of worlds, a module each with `claims(name)`, `find(name)`: which names, and what is called so."""
 _UNITS = (
     (("m",) * 3 + ("1",) * 4, ("m/s",) * 3 + ("rad/s",) * 3),  # free
@@ -43,7 +43,7 @@ _UNITS = (
 """Of the entries of `qpos`, quaternions among them, and of `qvel`, by the kind of joint."""
 
 
-class World(abc.ABC):
+class EnvSource(abc.ABC):
     """What environments are of. One's own has a name, makes environments, and overrides what it knows better.
 
     What it makes are environments of Gymnasium's whose motors can be read, as `codrl_mj.make` makes
@@ -298,7 +298,7 @@ class World(abc.ABC):
 def described(
     names: Sequence[str], box: spaces.Box, units: Sequence[str | None] | None = None
 ) -> list[dict[str, Any]]:
-    """Entries of a box of vectors, as `World.interface` has them."""
+    """Entries of a box of vectors, as `EnvSource.interface` has them."""
     ends = (
         [float(end) if np.isfinite(end) else None for end in side] for side in (box.low, box.high)
     )
@@ -320,7 +320,7 @@ def options_mapping(options: Any) -> dict[str, Any]:
 
 
 @functools.cache
-def _own_actions(world: World, options: str) -> "spaces.Space[Any]":
+def _own_actions(world: EnvSource, options: str) -> "spaces.Space[Any]":
     config = importlib.import_module("codrl_mj.envs.config").EnvConfig(
         world.reference, options=json.loads(options)
     )
@@ -373,7 +373,7 @@ def is_world(word: str) -> bool:
     )
 
 
-def find_world(name: Any) -> World:
+def find_world(name: Any) -> EnvSource:
     """The world called `name`: a task's name, an environment's id, or `module:NAME` of a world or a task."""
     if isinstance(name, str):
         for kind in map(importlib.import_module, _KINDS):
@@ -385,7 +385,7 @@ def find_world(name: Any) -> World:
 
 
 @functools.singledispatch
-def world_of(thing: Any) -> World:
+def world_of(thing: Any) -> EnvSource:
     """The world of what stands at `module:NAME`."""
     if isinstance(thing, type):
         raise ValueError(
@@ -395,7 +395,7 @@ def world_of(thing: Any) -> World:
 
 
 @world_of.register
-def _(world: World) -> World:
+def _(world: EnvSource) -> EnvSource:
     if not isinstance(getattr(world, "name", None), str):
         raise ValueError(
             f"{type(world).__qualname__}: must have a `name`, a text, which messages call it by"

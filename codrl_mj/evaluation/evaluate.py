@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Drive, Ideal, shaft
-from codrl_mj.envs.worlds import World, find_world
+from codrl_mj.envs.worlds import EnvSource, find_world
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import (
     Interval,
@@ -220,7 +220,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     )
 
 
-def _time_to_goal(world: World, episode: Episode) -> float | None:
+def _time_to_goal(world: EnvSource, episode: Episode) -> float | None:
     """Time from which an episode that succeeded was at the goal [s]; None if it did not succeed."""
     step, at_goal = float(episode.time[0]), world.at_goal(episode)
     if at_goal is None:

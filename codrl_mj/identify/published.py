@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from codrl_mj.fields import did_you_mean
-from codrl_mj.own_code import asset_path
+from codrl_mj.user_code import asset_path
 
 LAYOUT = "bench_logs"  # where in a folder of data the sets are
 

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from codrl_mj.actuators import shaft
-from codrl_mj.kept import njit
+from codrl_mj.compile_cache import njit
 
 LONGEST_SUBSTEP = 1e-3  # longer intervals between rows are cut into pieces of at most this [s]
 

@@ -10,8 +10,8 @@ from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.base import (
     PHYSICS,
     Physics,
-    Plant,
     Signals,
+    SimulationConfig,
     SimulationDivergedError,
     signal_names,
     trace_names,
@@ -22,12 +22,12 @@ from codrl_mj.physics.mujoco_single import MujocoPhysics
 PHYSICS.update(mujoco=MujocoPhysics, analytic=AnalyticPhysics)
 
 
-def register_physics(name: str, make: Callable[[Plant], Physics]) -> None:
+def register_physics(name: str, make: Callable[[SimulationConfig], Physics]) -> None:
     """Make a physics of one's own known: every face but the batched one takes its name as `physics`.
 
     Args:
         name: what to call it.
-        make: (`codrl_mj.physics.Plant`) -> a simulation of it, a `codrl_mj.physics.Physics`.
+        make: (`codrl_mj.physics.SimulationConfig`) -> a simulation of it, a `codrl_mj.physics.Physics`.
 
     Raises:
         ValueError: the name is taken by another.
@@ -43,7 +43,7 @@ __all__ = [
     "AnalyticPhysics",
     "MujocoPhysics",
     "Physics",
-    "Plant",
+    "SimulationConfig",
     "Signals",
     "SimulationDivergedError",
     "hills",

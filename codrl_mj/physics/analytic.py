@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Inputs, parameters_type
-from codrl_mj.physics.base import Physics, Plant
+from codrl_mj.physics.base import Physics, SimulationConfig
 
 
 class AnalyticPhysics(Physics):
     """A task on Gymnasium's own equations."""
 
-    def __init__(self, plant: Plant) -> None:
+    def __init__(self, plant: SimulationConfig) -> None:
         """Make the Gymnasium environment.
 
         Raises:

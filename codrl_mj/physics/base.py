@@ -36,7 +36,7 @@ def signal_names(family: Family) -> tuple[str, ...]:
 
 
 @functools.cache
-def namer(names: tuple[str, ...]) -> Callable[[Any], Signals]:
+def make_info_reader(names: tuple[str, ...]) -> Callable[[Any], Signals]:
     """What names the first columns, numbers of one actuator or arrays of several; `saturated`, a flag, is the last.
 
     It is false, in the columns' shape, of a family that has none. Written out, as `namedtuple` is:
@@ -58,7 +58,7 @@ forces. A diverging motor need not reach infinity there.
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Plant:
+class SimulationConfig:
     """What is simulated: a task and its actuators, and how finely; every physics is made of one.
 
     Raises:
@@ -98,7 +98,7 @@ class Plant:
         return type(self.actuators[0])
 
     @property
-    def motorised(self) -> bool:
+    def motors_added(self) -> bool:
         """Whether the actuators are any but the ideal one."""
         return not issubclass(self.family, Ideal)
 
@@ -137,7 +137,7 @@ class Physics(abc.ABC):
     time: float
     """Since the start of the episode [s]."""
 
-    def __init__(self, plant: Plant) -> None:
+    def __init__(self, plant: SimulationConfig) -> None:
         """Take what is simulated, and make what one of it needs on any physics."""
         self.plant = plant
         """What is simulated."""
@@ -238,7 +238,7 @@ class Physics(abc.ABC):
         del state  # without a scene
 
 
-PHYSICS: dict[str, Callable[[Plant], Any]] = {}
+PHYSICS: dict[str, Callable[[SimulationConfig], Any]] = {}
 """The physics that an environment can be built on, by name: what makes a simulation of a plant."""
 
 

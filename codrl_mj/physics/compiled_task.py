@@ -13,9 +13,9 @@ import numpy as np
 from numba import types
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
+from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import entries_type, floats, internal, row_as, tuple_of
-from codrl_mj.kept import njit
 from codrl_mj.physics.base import LARGEST
 from codrl_mj.tasks import Task
 

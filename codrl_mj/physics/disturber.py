@@ -6,6 +6,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from codrl_mj.actuators.noise import philox, unit
+from codrl_mj.compile_cache import njit
 from codrl_mj.disturbances import (
     KEY,
     OFF,
@@ -18,7 +19,6 @@ from codrl_mj.disturbances import (
     whole_and_fraction,
 )
 from codrl_mj.engine.memory import internal, row_as
-from codrl_mj.kept import njit
 
 for _function in (delayed, quantised, rate_limited, philox, unit):
     register_jitable(_function)

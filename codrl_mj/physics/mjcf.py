@@ -7,9 +7,9 @@ from codrl_mj.actuators import ActuatorModel, Ideal, JointAdditions
 from codrl_mj.engine import HILL_NAMES
 from codrl_mj.engine.families import SIGNATURE, slot_size, user_head
 from codrl_mj.engine.reading import motors
-from codrl_mj.own_code import asset_path
-from codrl_mj.physics.base import Plant
+from codrl_mj.physics.base import SimulationConfig
 from codrl_mj.tasks.base import INTEGRATORS
+from codrl_mj.user_code import asset_path
 
 
 def drive(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float | None) -> None:
@@ -85,7 +85,7 @@ def install_callbacks(model: mujoco.MjModel) -> None:
         engine.install(*parts)
 
 
-def task_model(plant: Plant) -> mujoco.MjModel:
+def task_model(plant: SimulationConfig) -> mujoco.MjModel:
     """Compile a plant's model.
 
     A diverging simulation is left to diverge, so that it can be reported, instead of being reset by

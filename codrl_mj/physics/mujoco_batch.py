@@ -9,7 +9,7 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import HEAD
-from codrl_mj.physics.base import LARGEST, Plant, SimulationDivergedError
+from codrl_mj.physics.base import LARGEST, SimulationConfig, SimulationDivergedError
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.physics.mjcf import flags_with_friction
 from codrl_mj.physics.mujoco_single import MujocoPhysics
@@ -32,7 +32,10 @@ class MujocoBatchPhysics:
     """
 
     def __init__(
-        self, plant: Plant, actuators: Sequence[Sequence[ActuatorModel]], num_threads: int = 0
+        self,
+        plant: SimulationConfig,
+        actuators: Sequence[Sequence[ActuatorModel]],
+        num_threads: int = 0,
     ) -> None:
         """Compile the model and make the rows, one for each of N tuples of `actuators` in place of the plant's.
 
@@ -110,7 +113,7 @@ class MujocoBatchPhysics:
 
         What they add to their joints is the models': see `set_model`.
         """
-        if not self.plant.motorised:
+        if not self.plant.motors_added:
             return
         user, gear, limits = map(
             self.field, ("actuator_user", "actuator_gear", "actuator_ctrlrange")
@@ -157,7 +160,7 @@ class MujocoBatchPhysics:
         self._nominal.install()  # raises if somebody replaced ours since the last episodes
         self._states[rows] = self._rest
         self._qpos[rows], self._qvel[rows] = states[:, self._positions], states[:, self._velocities]
-        if self.plant.motorised:
+        if self.plant.motors_added:
             for at, one in enumerate(self._wiring):
                 self._act[rows, int(one.act) + NOISE_KEY] = keys + at
         if self._disturber.on:

@@ -9,7 +9,7 @@ import numpy as np
 from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import HEAD
-from codrl_mj.physics.base import Physics, Plant
+from codrl_mj.physics.base import Physics, SimulationConfig
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
 from codrl_mj.physics.stepping import Wiring, compiled_stepping, places_of
 from codrl_mj.physics.variation import write_fields
@@ -26,7 +26,7 @@ class MujocoPhysics(Physics):
     inside them after every integration step.
     """
 
-    def __init__(self, plant: Plant) -> None:
+    def __init__(self, plant: SimulationConfig) -> None:
         """Compile the model and install the callbacks that it needs."""
         super().__init__(plant)
         self.model = task_model(plant)
@@ -107,7 +107,7 @@ class MujocoPhysics(Physics):
 
         What they add to their joints is the model's: see `set_model`.
         """
-        if not self.plant.motorised:
+        if not self.plant.motors_added:
             return
         for row, (one, limit) in enumerate(zip(actuators, self.plant.max_forces, strict=True)):
             index, arm, numbers = int(self.wiring[row].actuator), one.arm_radius, one.numbers

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from codrl_mj.compile_cache import njit
 from codrl_mj.engine.layout import address_of, addresses, engine_function
 from codrl_mj.engine.memory import copy_bytes, f64, internal
-from codrl_mj.kept import njit
 from codrl_mj.physics.mujoco_single import ARM, MujocoPhysics
 from codrl_mj.physics.sharing import apart
 from codrl_mj.physics.stepping import Places

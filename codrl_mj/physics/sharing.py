@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numba import types
 
+from codrl_mj.compile_cache import external, njit
 from codrl_mj.engine.memory import count_on, internal, look
-from codrl_mj.kept import external, njit
 from codrl_mj.physics.compiled_task import Compiled
 
 _WORTH_WAKING = 64

@@ -16,13 +16,13 @@ from numba import types
 from numba.extending import overload
 
 from codrl_mj.actuators import Family
+from codrl_mj.compile_cache import njit
 from codrl_mj.disturbances import OFF
 from codrl_mj.engine.doors import user_of
 from codrl_mj.engine.families import HEAD, Slot, compiled_observe, load_family, signals_at
 from codrl_mj.engine.layout import DATA, MODEL, addresses, engine_function
 from codrl_mj.engine.memory import f64, i64, internal, on_stack, row_as
-from codrl_mj.kept import njit
-from codrl_mj.physics.base import Plant
+from codrl_mj.physics.base import SimulationConfig
 from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_fine
 from codrl_mj.physics.disturber import KEY_COLUMN, Numbers, disturb
 
@@ -108,15 +108,15 @@ class Stepping(NamedTuple):
     """(row of trace (n, c), seen (n, k), where) -> nothing: fills `seen` with what the sensors say at present."""
 
 
-def compiled_stepping(plant: Plant) -> Stepping:
+def compiled_stepping(plant: SimulationConfig) -> Stepping:
     """The functions for simulations of a plant; compiled as they are used, once a process."""
     task, disturbed = plant.task, plant.disturbances != OFF
-    if plant.motorised:
+    if plant.motors_added:
         load_family(plant.family)
     order, explicit = (task.qpos, task.qvel), plant.integrator == "euler"
     kept = compiled_constrain(task.constrain, task.state_names, *order)
     return _stepping(
-        kept, compiled_reader(*order), *order, explicit, disturbed, plant.family, plant.motorised
+        kept, compiled_reader(*order), *order, explicit, disturbed, plant.family, plant.motors_added
     )
 
 
@@ -141,7 +141,7 @@ def _stepping(
     explicit: bool,
     disturbed: bool,
     family: Family,
-    motorised: bool,
+    motors_added: bool,
 ) -> Stepping:
     engine_step, engine_reset = engine_function("mj_step"), engine_function("mj_resetData")
     size, moving = len(positions) + len(velocities), len(positions)
@@ -177,7 +177,7 @@ def _stepping(
             for actuator in range(len(settings)):
                 wiring = row_as(settings[actuator], Wiring)
                 row = trace[inner, actuator]
-                if motorised:
+                if motors_added:
                     own = int(wiring.act)
                     row[1] = act[own + TORQUE] / wiring.arm
                     for entry in range(count):
@@ -198,7 +198,7 @@ def _stepping(
         for entry in range(len(velocities)):
             qvel[entry] = state[velocities[entry]]
         for actuator in range(len(settings)):
-            if motorised:
+            if motors_added:
                 DATA.act(data)[int(row_as(settings[actuator], Wiring).act) + NOISE_KEY] = (
                     key + actuator
                 )

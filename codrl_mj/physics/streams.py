@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from numba import types
 
-from codrl_mj.kept import external, njit
+from codrl_mj.compile_cache import external, njit
 
 WORDS = 6
 """Numbers that hold one generator's state: PCG64's state and increment (two words each), and its spare 32 bits."""

@@ -11,7 +11,7 @@ import numpy as np
 from codrl_mj.actuators import IDEAL, ActuatorModel
 from codrl_mj.disturbances import PLAIN, Joint
 from codrl_mj.engine.hill import GRAVITY
-from codrl_mj.physics.base import Plant
+from codrl_mj.physics.base import SimulationConfig
 from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
 
@@ -29,7 +29,7 @@ VARIED = tuple(
 """Fields that the dynamics depend on."""
 
 
-class Mount(NamedTuple):
+class JointAddress(NamedTuple):
     """Where a motor's share of one entry of its `JointAdditions` is in a model."""
 
     field: str
@@ -40,31 +40,38 @@ class Mount(NamedTuple):
     """The model's number is that many times the motor's."""
 
 
-def mounts_of(model: mujoco.MjModel, index: int) -> tuple[Mount | None, ...]:
+def mounts_of(model: mujoco.MjModel, index: int) -> tuple[JointAddress | None, ...]:
     """Where an actuator's additions go, entries as in `JointAdditions`; None where the model has no place for them.
 
     Those of a motor in the control callback are its joint's; a plugin keeps gear, inertia and
     damping to itself.
     """
     kind, driven = mujoco.mjtTrn(model.actuator_trntype[index]), int(model.actuator_trnid[index, 0])
-    rubs: Mount | None = None
+    rubs: JointAddress | None = None
     scale = abs(float(model.actuator_gear[model.actuator_outadr[index], 0]))
     if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
         dof = int(model.jnt_dofadr[driven])
         if model.actuator_plugin[index] < 0:
             return tuple(
-                Mount(f"dof_{name}", dof, 1.0) for name in ("armature", "damping", "frictionloss")
+                JointAddress(f"dof_{name}", dof, 1.0)
+                for name in ("armature", "damping", "frictionloss")
             )
-        rubs = Mount("dof_frictionloss", dof, scale)
+        rubs = JointAddress("dof_frictionloss", dof, scale)
     elif kind == mujoco.mjtTrn.mjTRN_TENDON:
-        rubs = Mount("tendon_frictionloss", driven, scale)
-    return Mount("actuator_armature", index, 1.0), Mount("actuator_damping", index, 1.0), rubs
+        rubs = JointAddress("tendon_frictionloss", driven, scale)
+    return (
+        JointAddress("actuator_armature", index, 1.0),
+        JointAddress("actuator_damping", index, 1.0),
+        rubs,
+    )
 
 
 @functools.cache
 def bare_model(task: str, joint: Joint = PLAIN) -> mujoco.MjModel:
     """The model of the task of a name, with nothing on its actuated joints but what is given; read only."""
-    return task_model(Plant(TASKS[task], (IDEAL,) * len(TASKS[task].motors), joint=joint))
+    return task_model(
+        SimulationConfig(TASKS[task], (IDEAL,) * len(TASKS[task].motors), joint=joint)
+    )
 
 
 def without_motors(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -> mujoco.MjModel:

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import Actuator, Drive, GearMotor, SampledLoop, Supply
-from codrl_mj.engine.specs import motorise
+from codrl_mj.actuators import DCMotorActuator, Drive, GearMotor, SampledLoop, Supply
+from codrl_mj.engine.specs import add_motors
 from codrl_mj.study.doses import REFERENCE_SPEEDS, noise, timestep
 from codrl_mj.study.grid import check_chosen
 from codrl_mj.tasks import find_task
@@ -29,7 +29,7 @@ def on_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., np
     body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
     body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
     spec.add_actuator(target="hinge", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
-    model = motorise(spec, {"hinge": actuator}).compile()
+    model = add_motors(spec, {"hinge": actuator}).compile()
     data, moved = mujoco.MjData(model), inertia + actuator.additions.armature
 
     def run(torque: float, duration: float, speed: float = 0.0) -> np.ndarray:
@@ -180,7 +180,7 @@ def commanded(actuator: Any, task: str, found: Delivery) -> Delivery | None:
 
 def redesign(actuator: Any, task: str) -> Drive | None:
     """The same motor and supply under a designed loop; None if it has one, or no loop that could be designed."""
-    if isinstance(actuator, Actuator):  # what a sensor gets wrong no loop makes right
+    if isinstance(actuator, DCMotorActuator):  # what a sensor gets wrong no loop makes right
         wrong = actuator.controller.current_noise or actuator.controller.current_bias
         return None if wrong else redesigned(actuator, task)
     if isinstance(actuator, Drive):
@@ -193,7 +193,7 @@ def redesign(actuator: Any, task: str) -> Drive | None:
     return None
 
 
-def redesigned(actuator: Actuator, task: str) -> Drive:
+def redesigned(actuator: DCMotorActuator, task: str) -> Drive:
     """The motor and supply of a current loop under a designed one: pole-zero cancellation, anti-windup, a limit."""
     motor, voltage = actuator.motor, actuator.controller.max_voltage
     if actuator.supply is not None:

@@ -12,8 +12,8 @@ from typing import Any
 
 from codrl_mj.actuators import (
     IDEAL,
-    Actuator,
     CurrentLoop,
+    DCMotorActuator,
     Drive,
     GearMotor,
     Lag,
@@ -141,7 +141,7 @@ def noise(task: str, dose: float) -> EnvConfig:
         max_voltage=100.0 * needed_voltage(task),
         current_noise=dose * largest,
     )
-    return posed(task, Actuator(Motor(1.0, inductance, constant, constant), loop))
+    return posed(task, DCMotorActuator(Motor(1.0, inductance, constant, constant), loop))
 
 
 _LOOPS = {"weaker": "weaker", "paper": "paper"}

@@ -14,7 +14,7 @@ from codrl_mj.tasks import (
 )
 from codrl_mj.tasks.base import Task
 from codrl_mj.tasks.registration import TASKS, find_task, reference_of, register
-from codrl_mj.tasks.twin import Twin
+from codrl_mj.tasks.twin import ReferenceEnv
 
 OURS = tuple(
     register(each.TASK)
@@ -73,7 +73,7 @@ __all__ = [
     "OURS",
     "TASKS",
     "Task",
-    "Twin",
+    "ReferenceEnv",
     "find_task",
     "named_actuator",
     "reference_of",

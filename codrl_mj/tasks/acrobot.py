@@ -51,10 +51,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks.attributes import Fixed, ModelNumber, Setting, centre, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import GymnasiumTwin, Trials, around
+from codrl_mj.tasks.twin import GymnasiumReferenceEnv, ReferenceStates, around
 
 # Gymnasium's Acrobot-v1
 TORQUE = 1.0  # N*m
@@ -117,7 +117,7 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any
 _HIGH = np.array([1.0, 1.0, 1.0, 1.0, MAX_SPEED_1, MAX_SPEED_2], dtype=np.float32)
 
 
-class Twin(GymnasiumTwin):
+class ReferenceEnv(GymnasiumReferenceEnv):
     """`AcrobotEnv`: the torques to choose from and the time step are attributes."""
 
     env_id = "Acrobot-v1"
@@ -150,7 +150,7 @@ TASK = Task(
     reward_threshold=-100.0,
     agent="dqn",
     gymnasium_id="Acrobot-v1",
-    twin=Twin,
+    twin=ReferenceEnv,
     asset="acrobot.xml",
     step_duration=0.2,
     motor_inner_steps=10,
@@ -176,7 +176,7 @@ TASK = Task(
     constrain=constrain,
     goal=terminated,
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
-    paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)),),
+    paper=(DCMotorActuator(Motor(), CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)),),
     wrapped=(0, 1),
     attributes={
         "dt": Setting.STEP,
@@ -201,7 +201,7 @@ TASK = Task(
         "torque_noise_max": Fixed(0.0, "make an environment with disturbances"),
         "book_or_nips": Fixed("book", "the MuJoCo model has no such thing"),
     },
-    trials=Trials(
+    trials=ReferenceStates(
         # at the task's limits, twice as fast, one RK4 step of Gymnasium amplifies rounding to 1e-12
         bounds=(np.pi, np.pi, 2 * np.pi, 4 * np.pi),
         # on the cut of the angles, and faster than the first link may turn after the step

@@ -13,11 +13,11 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj import fields
-from codrl_mj.actuators import Actuator, ActuatorModel, Ideal
-from codrl_mj.own_code import asset_path
+from codrl_mj.actuators import ActuatorModel, DCMotorActuator, Ideal
 from codrl_mj.tasks.attributes import Attribute
 from codrl_mj.tasks.checks import check_fields, check_functions, check_layout
-from codrl_mj.tasks.twin import Trials, Twin
+from codrl_mj.tasks.twin import ReferenceEnv, ReferenceStates
+from codrl_mj.user_code import asset_path
 
 
 class NoOptions(NamedTuple):
@@ -133,13 +133,13 @@ class Task(fields.Checked):
     """Id of the environment that this task rebuilds, with the same spaces, starts, rewards and
     ends; None if it is none of Gymnasium's.
     """
-    twin: Callable[[], Twin] | None = None
+    twin: Callable[[], ReferenceEnv] | None = None
     """Makes that environment, or the equations of motion in closed form, to be driven by any force:
     the analytic physics, and the oracle of the certificate.
     """
     ideal_inner_steps: int = fields.integer(1, least=1)
     """Integration steps per environment step when the actuator is ideal: Gymnasium's."""
-    paper: tuple[Actuator, ...] = ()
+    paper: tuple[DCMotorActuator, ...] = ()
     """The paper's actuators, one for each motor, of which other named actuators are variations;
     none where there are none.
     """
@@ -149,7 +149,7 @@ class Task(fields.Checked):
     """State entries that `constrain` wraps to [-pi, pi]: a rounding error at the cut is one, and not a whole turn."""
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     """Numbers that environments of the task have as attributes, by their names, and where they live."""
-    trials: Trials | None = None
+    trials: ReferenceStates | None = None
     """What the certificate tries the task in; without it, the checks that need states of the task's are left out."""
 
     def __post_init__(self) -> None:

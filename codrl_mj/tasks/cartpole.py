@@ -49,10 +49,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks.attributes import GRAVITY, Fixed, Follows, Setting, centre, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import GymnasiumTwin, Trials, around
+from codrl_mj.tasks.twin import GymnasiumReferenceEnv, ReferenceStates, around
 
 # Gymnasium's CartPole-v1
 FORCE = 10.0  # N
@@ -101,7 +101,7 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Options) ->
 _HIGH = np.array([X_LIMIT * 2, np.inf, ANGLE_LIMIT * 2, np.inf], dtype=np.float32)
 
 
-class Twin(GymnasiumTwin):
+class ReferenceEnv(GymnasiumReferenceEnv):
     """`CartPoleEnv`: the force magnitude, the time step and the integrator are attributes."""
 
     env_id = "CartPole-v1"
@@ -125,7 +125,7 @@ TASK = Task(
     reward_threshold=475.0,
     agent="ppo",
     gymnasium_id="CartPole-v1",
-    twin=Twin,
+    twin=ReferenceEnv,
     asset="cartpole.xml",
     step_duration=0.02,
     motor_inner_steps=1,
@@ -144,7 +144,7 @@ TASK = Task(
     reward=reward,
     terminated=terminated,
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
-    paper=(Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6)),),
+    paper=(DCMotorActuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6)),),
     attributes={
         "gravity": GRAVITY,
         "masscart": mass("cart"),
@@ -158,7 +158,7 @@ TASK = Task(
         "theta_threshold_radians": Fixed(ANGLE_LIMIT),
         "x_threshold": Fixed(X_LIMIT),
     },
-    trials=Trials(
+    trials=ReferenceStates(
         # beyond what an episode can reach: all angles, and speeds of a falling pole
         bounds=(4.8, 10.0, np.pi, 10.0),
         edges=(

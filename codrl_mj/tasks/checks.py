@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.own_code import call, check_form, place
+from codrl_mj.user_code import call, check_form, place
 
 _TEXTS = ("name", "env_id", "asset", "actuator", "agent")
 _NAMES = ("state_names", "observation_names", "motors", "integrators")

@@ -91,7 +91,7 @@ from gymnasium.envs.classic_control import utils
 
 from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, centre, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import Trials, around
+from codrl_mj.tasks.twin import ReferenceStates, around
 
 MAX_TORQUE = 0.084  # N*m: 2 A, the amplifier's peak current, times kT = 0.042 N*m/A
 ARM_LIMIT = 2.0  # rad
@@ -138,7 +138,7 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any
     return 0.5 * (1.0 + np.cos(next_state[1])) * (1.0 - 0.5 * (off * off) - 0.1 * (share * share))
 
 
-class Twin:
+class ReferenceEnv:
     """The equations of motion in closed form, of numbers of its own: nothing is read from the MJCF.
 
     With the inertias J of arm and hub about the shaft, I of the rod about its hinge and Z along it,
@@ -205,7 +205,7 @@ TASK = Task(
     name="furuta",
     env_id="codrl_mj/Furuta-v0",
     max_episode_steps=250,
-    twin=Twin,
+    twin=ReferenceEnv,
     asset="furuta.xml",
     step_duration=0.02,
     motor_inner_steps=10,
@@ -233,7 +233,7 @@ TASK = Task(
         "rod_mass": mass("rod"),
         "rod_length": centre("rod", 2.0),
     },
-    trials=Trials(
+    trials=ReferenceStates(
         bounds=(ARM_LIMIT, math.pi, 25.0, 35.0),
         edges=(
             (*around(ARM_LIMIT), 0.0),

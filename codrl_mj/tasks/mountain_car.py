@@ -42,10 +42,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks.attributes import Attribute, Fixed, ModelNumber, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import GymnasiumTwin, Trials, around, gymnasium_env
+from codrl_mj.tasks.twin import GymnasiumReferenceEnv, ReferenceStates, around, gymnasium_env
 
 # Gymnasium's MountainCar-v0 and, but for the goal, its MountainCarContinuous-v0
 FORCE = 1.0  # N
@@ -91,7 +91,7 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any
 _LOW, _HIGH = np.array([[MIN_POSITION, -MAX_SPEED], [MAX_POSITION, MAX_SPEED]], dtype=np.float32)
 
 
-class Twin(GymnasiumTwin):
+class ReferenceEnv(GymnasiumReferenceEnv):
     """`MountainCarEnv`: its step has no duration, but force, gravity and speed limit are attributes.
 
     One step is v += force - gravity cos(3 x), x += v. With w = v dt for its v, and force and
@@ -140,7 +140,7 @@ TASK = Task(
     reward_threshold=-110.0,
     agent="sarsa",
     gymnasium_id="MountainCar-v0",
-    twin=Twin,
+    twin=ReferenceEnv,
     asset="mountain_car.xml",
     step_duration=1.0,
     motor_inner_steps=20,
@@ -159,9 +159,9 @@ TASK = Task(
     constrain=constrain,
     goal=terminated,
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
-    paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=1.0, kd=1e-2)),),
+    paper=(DCMotorActuator(Motor(), CurrentLoop(kp=1.0, ki=1.0, kd=1e-2)),),
     attributes={**attributes(GOAL, "force"), "gravity": ModelNumber("jnt_user", "slider", 2)},
-    trials=Trials(
+    trials=ReferenceStates(
         bounds=(1.2, MAX_SPEED),
         edges=(
             (-1.2, -1.2 + 1e-9, -1.19, -0.5, 0.0, 0.5, 0.59, 0.6),

@@ -44,7 +44,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks import mountain_car
 from codrl_mj.tasks.attributes import Fixed
 from codrl_mj.tasks.base import Entries
@@ -74,7 +74,7 @@ TASK = dataclasses.replace(
     gymnasium_id="MountainCarContinuous-v0",
     # its own equations are the same, but written so that they cannot be scaled (its gravity is no
     # attribute), and it rounds its state to float32
-    twin=functools.partial(mountain_car.Twin, "MountainCarContinuous-v0", "power"),
+    twin=functools.partial(mountain_car.ReferenceEnv, "MountainCarContinuous-v0", "power"),
     asset="mountain_car_continuous.xml",
     max_force=FORCE,
     forces=None,
@@ -83,7 +83,7 @@ TASK = dataclasses.replace(
     terminated=terminated,
     goal=terminated,
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
-    paper=(Actuator(Motor(), CurrentLoop(kp=0.1, ki=10.0, kd=1e-3)),),
+    paper=(DCMotorActuator(Motor(), CurrentLoop(kp=0.1, ki=10.0, kd=1e-3)),),
     attributes={
         **mountain_car.attributes(GOAL, "power"),
         "min_action": Fixed(-FORCE),

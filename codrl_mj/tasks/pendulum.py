@@ -48,10 +48,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, centre, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import GymnasiumTwin, Trials, around
+from codrl_mj.tasks.twin import GymnasiumReferenceEnv, ReferenceStates, around
 
 # Gymnasium's Pendulum-v1
 MAX_TORQUE = 2.0  # N*m
@@ -114,7 +114,7 @@ def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any
 _HIGH = np.array([1.0, 1.0, MAX_SPEED], dtype=np.float32)
 
 
-class Twin(GymnasiumTwin):
+class ReferenceEnv(GymnasiumReferenceEnv):
     """`PendulumEnv`: the torque limit and the time step are attributes, the action is the torque."""
 
     env_id = "Pendulum-v1"
@@ -133,7 +133,7 @@ TASK = Task(
     max_episode_steps=200,
     agent="ddpg",
     gymnasium_id="Pendulum-v1",
-    twin=Twin,
+    twin=ReferenceEnv,
     asset="pendulum.xml",
     step_duration=0.05,
     motor_inner_steps=1,
@@ -152,7 +152,7 @@ TASK = Task(
     goal=goal,
     goal_hold=GOAL_HOLD,
     # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
-    paper=(Actuator(Motor(), CurrentLoop(kp=1.0, ki=20.0, kd=1e-6)),),
+    paper=(DCMotorActuator(Motor(), CurrentLoop(kp=1.0, ki=20.0, kd=1e-6)),),
     attributes={
         "max_speed": Fixed(MAX_SPEED),
         "max_torque": Setting.LARGEST_FORCE,
@@ -161,7 +161,7 @@ TASK = Task(
         "m": mass("rod"),
         "l": centre("rod", 2.0),
     },
-    trials=Trials(
+    trials=ReferenceStates(
         bounds=(2 * np.pi, MAX_SPEED),
         edges=((*around(math.pi), 0.0, math.pi / 2, -2 * math.pi), (*around(MAX_SPEED), 0.0)),
         # swings below 8 rad/s

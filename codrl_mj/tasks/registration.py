@@ -7,8 +7,8 @@ from typing import Any
 from gymnasium.envs.registration import register as register_with_gymnasium
 from gymnasium.envs.registration import registry
 
-from codrl_mj.own_code import look_up
 from codrl_mj.tasks.base import Task
+from codrl_mj.user_code import look_up
 
 TASKS: dict[str, Task] = {}
 """Every task by its name on the command line."""

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 
-class Twin(Protocol):
+class ReferenceEnv(Protocol):
     """Drives an environment that is not ours by one integration step at a time. Made without arguments.
 
     Where it has the environment as `env`, this one's numbers can be read and written through the
@@ -31,7 +31,7 @@ class Twin(Protocol):
         """
 
 
-class GymnasiumTwin:
+class GymnasiumReferenceEnv:
     """What drives one of Gymnasium's environments: a subclass says which, and how a force gets into its `step`."""
 
     env_id: str
@@ -61,7 +61,7 @@ def gymnasium_env(env_id: str) -> Any:
     return gymnasium.make(env_id, disable_env_checker=True).unwrapped
 
 
-class Trials(NamedTuple):
+class ReferenceStates(NamedTuple):
     """What the certificate tries a task in; in the units of the task's state."""
 
     bounds: tuple[float, ...]

@@ -11,7 +11,7 @@ from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, find_preset
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import Checked, check_names, integer
-from codrl_mj.own_code import read_yaml
+from codrl_mj.user_code import read_yaml
 
 EVALUATION_SEED = 1_000_000
 """Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""

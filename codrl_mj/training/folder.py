@@ -13,7 +13,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from codrl_mj.actuators import label_of, labelled, trusting
+from codrl_mj.actuators import label_of, set_display_name, trusting
 from codrl_mj.fields import command, differing
 from codrl_mj.runs import (
     BEST,
@@ -67,7 +67,7 @@ def load_config(run: Path, trust: bool = False) -> TrainConfig:
         with trusting(trust):
             config = TrainConfig.from_mapping(content["train"], whole=True)
         for actuator, label in zip(config.actuators, content.get("labels", ()), strict=False):
-            labelled(actuator, label)
+            set_display_name(actuator, label)
         return config
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{run / CONFIG}: not a run configuration: {error}") from None
@@ -196,7 +196,7 @@ def provenance(config: TrainConfig) -> dict[str, Any]:
 @functools.cache
 def _code_digest(*others: str | Path) -> str:
     """SHA-256 over the package's Python files and models, and those modules and model files that are none of these."""
-    from codrl_mj.own_code import asset_folder
+    from codrl_mj.user_code import asset_folder
 
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from codrl_mj.pages.plots import Curve, Plot, save
 from codrl_mj.runs.files import writing
+from codrl_mj.viz.pages.plots import Curve, Plot, save
 
 WINDOW = 100
 """Training episodes that means are taken over."""

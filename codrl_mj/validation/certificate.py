@@ -123,7 +123,7 @@ Progress = Callable[[int, int, str], object]
 """(parts done, parts in all, the part that begins) -> what nobody looks at."""
 
 
-def unheard(*_: object) -> None:
+def ignore_progress(*_: object) -> None:
     """What is called where nobody listens."""
 
 
@@ -194,7 +194,7 @@ def validate(
     *,
     quick: bool = False,
     groups: Sequence[str] | None = None,
-    on_part: Progress = unheard,
+    on_part: Progress = ignore_progress,
 ) -> Certificate:
     """Check that the port is right.
 
@@ -245,7 +245,7 @@ def validate_model(
     name: str = "model",
     *,
     quick: bool = False,
-    on_part: Progress = unheard,
+    on_part: Progress = ignore_progress,
 ) -> Certificate:
     """Put a model of your own, with any number of our motors, through the checks that apply to it.
 
@@ -262,7 +262,7 @@ def validate_model(
     if not motors(model):
         raise ValueError(
             f"the model has no motor of codrl_mj among its {model.nactuator} actuators: put some in"
-            " with codrl_mj.motorise"
+            " with codrl_mj.add_motors"
         )
     subject = copy.copy(model)
     subject.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # it is left to diverge

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, spectral_radius
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant
+from codrl_mj.actuators import ActuatorModel, CurrentLoop, DCMotorActuator, spectral_radius
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationConfig
 from codrl_mj.tasks import Task, resolve_actuators
 
 NO_TWIN = (
@@ -53,8 +53,8 @@ def both(
     steps = task.steps_within(actuator, None, None)
     limits = task.max_forces if max_force is None else np.array([max_force])
     return (
-        MujocoPhysics(Plant(task, [actuator], steps, integrator, limits)),
-        AnalyticPhysics(Plant(task, [actuator], steps, integrator)),
+        MujocoPhysics(SimulationConfig(task, [actuator], steps, integrator, limits)),
+        AnalyticPhysics(SimulationConfig(task, [actuator], steps, integrator)),
     )
 
 
@@ -67,13 +67,15 @@ def actuators_named(name: str, task: Task) -> tuple[Any, ...]:
     """One actuator for each motor of a task: a named one, or `STAND_IN`, sampled as often as it needs to be stable."""
     if name != STAND_IN:
         return resolve_actuators(name, task)
-    timestep, actuator = task.step_duration / task.motor_inner_steps, Actuator()
+    timestep, actuator = task.step_duration / task.motor_inner_steps, DCMotorActuator()
     while not spectral_radius(actuator, timestep) < 1.0:
-        actuator = Actuator(controller=CurrentLoop(substeps=2 * actuator.controller.substeps))
+        actuator = DCMotorActuator(
+            controller=CurrentLoop(substeps=2 * actuator.controller.substeps)
+        )
     return (actuator,) * len(task.motors)
 
 
-def actuators_of(task: Task) -> tuple[Actuator, ...]:
+def actuators_of(task: Task) -> tuple[DCMotorActuator, ...]:
     """The paper's actuators of a task, one for each motor; of a task that has none, those that stand in for them."""
     return task.paper or actuators_named(STAND_IN, task)
 

@@ -26,8 +26,13 @@ import numpy as np
 from gymnasium.envs.classic_control.acrobot import rk4
 from scipy import integrate
 
-from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, Motor
-from codrl_mj.physics import MujocoPhysics, Plant, SimulationDivergedError, install_callbacks
+from codrl_mj.actuators import ActuatorModel, CurrentLoop, DCMotorActuator, Motor
+from codrl_mj.physics import (
+    MujocoPhysics,
+    SimulationConfig,
+    SimulationDivergedError,
+    install_callbacks,
+)
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.tasks import OURS, Task, find_task
 from codrl_mj.validation.compare import (
@@ -74,7 +79,7 @@ def obstacle(task: Task) -> str:
         return ""
     start, forces, _ = free_run(task)
     free = dataclasses.replace(task, step_duration=task.step_duration / 16, constrain=None)
-    physics = MujocoPhysics(Plant(free, actuators_named("ideal", task)))
+    physics = MujocoPhysics(SimulationConfig(free, actuators_named("ideal", task)))
     physics.reset(start)
     for force in forces.repeat(16, axis=0):
         try:
@@ -98,7 +103,7 @@ def _states(
 ) -> np.ndarray:
     """Mechanical states after each environment step of the task's free run."""
     start, forces, _ = free_run(task)
-    physics = kind(Plant(task, actuators, inner_steps, integrator))
+    physics = kind(SimulationConfig(task, actuators, inner_steps, integrator))
     physics.reset(start)
     rows = []
     for force in forces:
@@ -118,7 +123,9 @@ def _error(states: np.ndarray, solution: np.ndarray) -> float:
 def engine_equations(task: Task) -> Equations:
     """The accelerations that MuJoCo's `mj_forward` finds, whatever its integrator makes of them."""
     model = task_model(
-        Plant(task, actuators_named("ideal", task), max_forces=np.full(len(task.motors), 1e9))
+        SimulationConfig(
+            task, actuators_named("ideal", task), max_forces=np.full(len(task.motors), 1e9)
+        )
     )
     install_callbacks(model)
     data, qpos, qvel = mujoco.MjData(model), list(task.qpos), list(task.qvel)
@@ -152,7 +159,7 @@ def solve(
     kE*omega - R*i, u = kP*e + kI*I + kFF*i_ref (+ kE*omega), dI/dt = e, torque = kT*i; such a loop
     has no derivative gain and no filter, is never saturated, and starts at rest.
     """
-    size, motors = len(start), [one for one in actuators if isinstance(one, Actuator)]
+    size, motors = len(start), [one for one in actuators if isinstance(one, DCMotorActuator)]
 
     def derivative(_: float, state: np.ndarray, desired: np.ndarray) -> np.ndarray:
         delivered, electrical = [*desired], []
@@ -192,7 +199,7 @@ def solve(
     return np.array(rows)
 
 
-def analogues(task: Task) -> tuple[Actuator, ...]:
+def analogues(task: Task) -> tuple[DCMotorActuator, ...]:
     """The task's actuators without derivative, limit and back-EMF compensation: their loops have a smooth limit.
 
     The paper's kD is a difference of two samples, whose limit is an impulse wherever the command
@@ -302,7 +309,7 @@ def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
             loop = CurrentLoop(
                 kp=kp, ki=kp * motors[0].resistance / motors[0].inductance, max_voltage=math.inf
             )
-            actuators = [Actuator(motor, loop) for motor in motors]
+            actuators = [DCMotorActuator(motor, loop) for motor in motors]
             ideal = _states(physics[-1][1], task, actuators_named("ideal", task), count, integrator)
             for label, kind in physics:
                 errors[label].append(
@@ -351,7 +358,10 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
         ("motor in the loop", analogues(task)),
     ):
         solved = functools.partial(solve, task, equations, start, forces, actuators)
-        solution, motors = solved(), [one.motor for one in actuators if isinstance(one, Actuator)]
+        solution, motors = (
+            solved(),
+            [one.motor for one in actuators if isinstance(one, DCMotorActuator)],
+        )
         said = whose if case == "ideal actuator" else f"{whose} and of the motor"
         for integrator in task.integrators:
             fourth = integrator == "rk4" and not motors

@@ -13,7 +13,7 @@ import numpy as np
 from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.tasks.twin import Trials
+from codrl_mj.tasks.twin import ReferenceStates
 from codrl_mj.validation.compare import both, differences, gymnasium_equations, without_oracle
 from codrl_mj.validation.table import Case, Check, Skipped, check
 
@@ -88,7 +88,7 @@ def _stepped(
     ),
 )
 def one_step(
-    task: Task, trials: Trials, integrator: str, quick: bool
+    task: Task, trials: ReferenceStates, integrator: str, quick: bool
 ) -> Iterator[tuple[Case, ...]]:
     """One integration step with an ideal actuator: from random states under random forces.
 
@@ -111,7 +111,7 @@ def one_step(
 
 
 @check("dynamics", Check("accelerations", "{task.oracle}", TOLERANCE))
-def accelerations(task: Task, trials: Trials, points: int) -> Iterator[Case]:
+def accelerations(task: Task, trials: ReferenceStates, points: int) -> Iterator[Case]:
     """MuJoCo's `qacc` over a dense grid of states, under no, half, full and extreme forces."""
     states, forces = _crossed(
         grid(trials.bounds, points), task.max_force * np.array([-EXTREME, -1.0, 0.0, 0.5, EXTREME])

@@ -29,11 +29,10 @@ from collections.abc import Callable, Iterator, Sequence
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import Actuator, ActuatorModel, Motor
-from codrl_mj.own_code import asset_path
-from codrl_mj.pages.plots import Curve, Plot
-from codrl_mj.physics import Plant, SimulationDivergedError, hills, trace_names
+from codrl_mj.actuators import ActuatorModel, DCMotorActuator, Motor
+from codrl_mj.physics import SimulationConfig, SimulationDivergedError, hills, trace_names
 from codrl_mj.tasks import Task, find_task
+from codrl_mj.user_code import asset_path
 from codrl_mj.validation.compare import (
     STAND_IN,
     actuators_named,
@@ -50,6 +49,7 @@ from codrl_mj.validation.convergence import (
     refined,
 )
 from codrl_mj.validation.table import Case, Check, Family, Skipped, check, of_order, order
+from codrl_mj.viz.pages.plots import Curve, Plot
 
 ACTUATORS = ("paper", "weak", "weaker", "open_loop")
 """Whose runs are balanced step by step."""
@@ -177,7 +177,9 @@ def keep(
     # an environment step of one integration step shows each of them, and leaves the motor as it is
     # in between
     physics = kind(
-        Plant(dataclasses.replace(task, step_duration=timestep), actuators, 1, integrator)
+        SimulationConfig(
+            dataclasses.replace(task, step_duration=timestep), actuators, 1, integrator
+        )
     )
     physics.reset(start)
     traces, states = [], [start]
@@ -191,7 +193,8 @@ def keep(
     current, state = np.vstack([np.zeros_like(current[:1]), current]), np.array(states)
 
     motors = [
-        actuator.motor if isinstance(actuator, Actuator) else Motor() for actuator in actuators
+        actuator.motor if isinstance(actuator, DCMotorActuator) else Motor()
+        for actuator in actuators
     ]
     resistance, inductance, constant, arm = (
         np.array([getattr(motor, name) for motor in motors])

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from codrl_mj.physics import MujocoPhysics, Plant, install_callbacks, motors
+from codrl_mj.physics import MujocoPhysics, SimulationConfig, install_callbacks, motors
 from codrl_mj.tasks import Task, find_task
 from codrl_mj.validation.compare import actuators_of, forces_of
 from codrl_mj.validation.table import Case, Check, check
@@ -159,7 +159,9 @@ def _simulation(
     task: Task, integrator: str, seed: int, steps: int
 ) -> tuple[MujocoPhysics, np.ndarray, np.ndarray]:
     generator = np.random.default_rng(seed)
-    physics = MujocoPhysics(Plant(task, actuators_of(task), task.motor_inner_steps, integrator))
+    physics = MujocoPhysics(
+        SimulationConfig(task, actuators_of(task), task.motor_inner_steps, integrator)
+    )
     initial = task.initial(generator, None)
     physics.reset(initial)
     return physics, initial, forces_of(task, generator.uniform(-1.0, 1.0, steps * len(task.motors)))

@@ -37,9 +37,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from codrl_mj.actuators import Actuator, Motor
-from codrl_mj.pages.plots import Curve, Plot
-from codrl_mj.validation.drives import drive_checks
+from codrl_mj.actuators import DCMotorActuator, Motor
+from codrl_mj.validation.motor_catalogue import drive_checks
 from codrl_mj.validation.motor_loops import analogue, sampled_checks
 from codrl_mj.validation.own_model import compiled_checks
 from codrl_mj.validation.rotors import (
@@ -55,6 +54,7 @@ from codrl_mj.validation.rotors import (
     standard_loops,
 )
 from codrl_mj.validation.table import Case, Check, Family, Skipped, check, of_order, order
+from codrl_mj.viz.pages.plots import Curve, Plot
 
 MOTORS: dict[str, Motor] = {
     "paper": Motor(),
@@ -70,7 +70,7 @@ _ON: tuple[tuple[Rotor, str], ...] = (
 )
 
 
-def exact(motor: Motor, timestep: float) -> Actuator:
+def exact(motor: Motor, timestep: float) -> DCMotorActuator:
     """A motor of ours under a voltage, whose inductance makes its Euler step the exact one of the given motor."""
     decay = 1.0 - math.exp(-timestep * motor.resistance / motor.inductance)
     return driven_by_voltage(
@@ -81,7 +81,7 @@ def exact(motor: Motor, timestep: float) -> Actuator:
 def _both(
     rotor: Rotor,
     motor: Motor,
-    actuator: Actuator,
+    actuator: DCMotorActuator,
     timestep: float,
     hold: int,
     count: int,

@@ -12,16 +12,16 @@ import control
 import numpy as np
 from scipy import linalg, signal
 
-from codrl_mj.actuators import Actuator
-from codrl_mj.pages.plots import Curve, Plot
+from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.validation.rotors import HELD, Loop, drive, motors_on, run, unlimited
 from codrl_mj.validation.table import Case, Check, Family, check, of_order, order
+from codrl_mj.viz.pages.plots import Curve, Plot
 
 # -- The analogue loop that it samples ------------------------------------------------------------------------
 
 
 def closed_form(
-    actuator: Actuator, timestep: float, torques: np.ndarray, speed: float
+    actuator: DCMotorActuator, timestep: float, torques: np.ndarray, speed: float
 ) -> np.ndarray:
     """Joint torque [N*m] of the analogue loop after each step [s], from rest: the matrix exponential.
 
@@ -92,7 +92,7 @@ def analogue(loops: Mapping[str, Loop], quick: bool) -> Iterator[tuple[Case, ...
 # -- The sampled loop as a state-space system ----------------------------------------------------------------
 
 
-def sampled_system(actuator: Actuator, timestep: float) -> Any:
+def sampled_system(actuator: DCMotorActuator, timestep: float) -> Any:
     """The loop sampled at its electrical step: inputs (i_ref, shaft speed), output the next current; a `dlti`."""
     motor, loop = actuator.motor, actuator.controller
     dt = timestep / loop.substeps
@@ -151,7 +151,7 @@ def random_torques(loops: Mapping[str, Loop], steps: int) -> Iterator[Case]:
 # -- The sampled loop as blocks -------------------------------------------------------------------------------
 
 
-def closed_loop(actuator: Actuator, timestep: float) -> Any:
+def closed_loop(actuator: DCMotorActuator, timestep: float) -> Any:
     """python-control's system from desired torque to kT times the current at the step's start, sampled at `timestep`.
 
     The winding is python-control's forward-Euler sampling of 1/(L s + R), the integral its
@@ -244,13 +244,13 @@ def frequency_response(loops: Mapping[str, Loop], frequencies: int) -> Iterator[
         yield tuple(cases)
 
 
-def _electrical(loop: Loop) -> tuple[float, Actuator]:
+def _electrical(loop: Loop) -> tuple[float, DCMotorActuator]:
     """The loop at its electrical step: the step, and the actuator with one of them to a mechanical step."""
     return loop.timestep / loop.actuator.controller.substeps, unlimited(loop, 1)
 
 
 def _measured_response(
-    actuator: Actuator, step: float, frequencies: np.ndarray, slowest: float
+    actuator: DCMotorActuator, step: float, frequencies: np.ndarray, slowest: float
 ) -> np.ndarray:
     """Complex amplitudes of the torques in MuJoCo under cosines of 1 N m; the slowest pole says how long to wait."""
     settle = math.ceil(math.log(1e-10) / math.log(min(max(slowest, 0.5), 0.9999)))

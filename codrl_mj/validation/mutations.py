@@ -27,7 +27,13 @@ from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import MujocoPhysics, compiled_task, mjcf
 from codrl_mj.physics.variation import bare_model
 from codrl_mj.tasks import OURS, find_task
-from codrl_mj.validation.certificate import WITHOUT_TASK, Certificate, Progress, unheard, validate
+from codrl_mj.validation.certificate import (
+    WITHOUT_TASK,
+    Certificate,
+    Progress,
+    ignore_progress,
+    validate,
+)
 from codrl_mj.validation.table import Check
 
 Fault = contextlib.AbstractContextManager[object]
@@ -389,7 +395,7 @@ def faulty(tasks: str | Sequence[str] | None = None) -> list[str]:
 def try_mutations(
     tasks: str | Sequence[str] | None = None,
     mutations: Sequence[Mutation] = MUTATIONS,
-    on_part: Progress = unheard,
+    on_part: Progress = ignore_progress,
 ) -> list[Caught]:
     """Make each fault in turn and see which checks of the quick certificate fail.
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from codrl_mj.actuators import (
     FAMILIES,
-    Actuator,
     ActuatorModel,
+    DCMotorActuator,
     Drive,
     Family,
     GearMotor,
@@ -35,7 +35,7 @@ from codrl_mj.engine.doors import shaft_inertia
 from codrl_mj.engine.families import SLOT, Slot, slot_size
 from codrl_mj.engine.reading import sharing, slots
 from codrl_mj.engine.specs import doubled
-from codrl_mj.physics import Plant, install_callbacks, motors
+from codrl_mj.physics import SimulationConfig, install_callbacks, motors
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.variation import without_motors
 from codrl_mj.tasks import find_task, resolve_actuators
@@ -150,7 +150,7 @@ BELOW_ONE = float(np.nextafter(1.0, 0.0))
 def stable(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
     """What the family says of its parameters; of a loop, of which that is infinite from 1 on, the spectral radius."""
     found = float(actuator.instability(np.array([actuator.numbers]), timestep)[0])
-    radius = spectral_radius(actuator, timestep) if isinstance(actuator, Actuator) else found
+    radius = spectral_radius(actuator, timestep) if isinstance(actuator, DCMotorActuator) else found
     yield Case(max(found, radius) if radius < 1.0 else radius, f"at a step of {timestep:g} s")
 
 
@@ -203,7 +203,7 @@ def motor_checks(model: mujoco.MjModel, quick: bool) -> Iterator[Check | Skipped
         yield from motor_steps(running[at], *found, motor=named[at])
     loops = {}
     for at, actuator in ours.items():
-        if not isinstance(actuator, Actuator):
+        if not isinstance(actuator, DCMotorActuator):
             yield Skipped(
                 f"responses of {named[at]}", "it is no current loop: there is no oracle for it"
             )
@@ -225,7 +225,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     actuators = (
         actuators_of(task) if task.actuator == "ideal" else resolve_actuators("default", task)
     )
-    model = task_model(Plant(task, actuators, task.motor_inner_steps))
+    model = task_model(SimulationConfig(task, actuators, task.motor_inner_steps))
     install_callbacks(model)
     yield from motor_checks(model, quick)
 
@@ -234,7 +234,7 @@ _LOOP = dataclasses.replace(
     EVERY_FEATURE.actuator.controller, max_voltage=1.5, current_bias=0.02, current_noise=0.05
 )
 EXAMPLES: tuple[ActuatorModel, ...] = (
-    Actuator(EVERY_FEATURE.actuator.motor, _LOOP, Supply(voltage=1.6, resistance=0.5)),
+    DCMotorActuator(EVERY_FEATURE.actuator.motor, _LOOP, Supply(voltage=1.6, resistance=0.5)),
     Lag(time_constant=0.03, delay=0.013),
     TorqueSpeed(stall_torque=0.2, no_load_speed=1.0, max_torque=0.2),
     Drive(GearMotor(gear_ratio=3.0), SampledLoop(sample_rate=10e3, max_current=4.0), Supply(6.0)),

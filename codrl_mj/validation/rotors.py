@@ -8,7 +8,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import Actuator, ActuatorModel, CurrentLoop, Motor
+from codrl_mj.actuators import ActuatorModel, CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.engine.families import signals_at, slot_size
 from codrl_mj.physics import install_callbacks, mjcf
 from codrl_mj.tasks import OURS
@@ -86,9 +86,9 @@ def motors_on(
     return model
 
 
-def driven_by_voltage(motor: Motor, substeps: int = 1) -> Actuator:
+def driven_by_voltage(motor: Motor, substeps: int = 1) -> DCMotorActuator:
     """A motor of ours whose control is its terminal voltage: a feed-forward of kT*i_ref, which is the control."""
-    return Actuator(
+    return DCMotorActuator(
         motor,
         CurrentLoop(
             kp=0.0,
@@ -108,7 +108,9 @@ def drive(model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None
     """
     data = mujoco.MjData(model)
     entry = (
-        signals_at(Actuator) if model.na == model.nactuator * slot_size(Actuator) else 0
+        signals_at(DCMotorActuator)
+        if model.na == model.nactuator * slot_size(DCMotorActuator)
+        else 0
     )  # current comes first
     currents = np.asarray(model.actuator_actadr) + entry
     rows = np.empty((len(controls), 4, model.nv))
@@ -134,14 +136,14 @@ def drive(model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None
 class Loop(NamedTuple):
     """A motor under its current loop, and the step at which it is sampled."""
 
-    actuator: Actuator
+    actuator: DCMotorActuator
     """Motor and gains."""
     timestep: float
     """Mechanical step [s]."""
 
 
 EVERY_FEATURE = Loop(
-    Actuator(
+    DCMotorActuator(
         Motor(
             resistance=1.2,
             inductance=0.05,
@@ -173,7 +175,7 @@ def standard_loops() -> dict[str, Loop]:
     return {**paper, "every feature": EVERY_FEATURE}
 
 
-def unlimited(loop: Loop, substeps: int) -> Actuator:
+def unlimited(loop: Loop, substeps: int) -> DCMotorActuator:
     """The loop's actuator where it is linear: without limit and sensor errors, with so many electrical substeps."""
     linear = {
         "substeps": substeps,
@@ -185,6 +187,8 @@ def unlimited(loop: Loop, substeps: int) -> Actuator:
     return loop.actuator.replaced({**changes, "supply": None})
 
 
-def run(actuator: Actuator, timestep: float, torques: np.ndarray, speeds: np.ndarray) -> Record:
+def run(
+    actuator: DCMotorActuator, timestep: float, torques: np.ndarray, speeds: np.ndarray
+) -> Record:
     """Drive one motor in MuJoCo with desired joint torques at joint speeds."""
     return drive(motors_on(HELD, [actuator], timestep), torques * actuator.motor.arm_radius, speeds)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.pages.plots import Curve, Plot
+from codrl_mj.viz.pages.plots import Curve, Plot
 
 ORDER_TOLERANCE = 0.1
 """Farthest that any end of a slope's 95 % interval may lie from the promised order. A method one

@@ -13,12 +13,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.pages.plots import Curve, Plot
 from codrl_mj.physics import AnalyticPhysics, SimulationDivergedError, trace_names
 from codrl_mj.tasks import Task, find_task, named_actuator
 from codrl_mj.validation.compare import both, differences, without_oracle
-from codrl_mj.validation.drives import FITTED, fitted_run
+from codrl_mj.validation.motor_catalogue import FITTED, fitted_run
 from codrl_mj.validation.table import Case, Check, Skipped, check
+from codrl_mj.viz.pages.plots import Curve, Plot
 
 TOLERANCE = 1e-9
 """Of the difference: rounding (1e-16), a thousand steps, and the growth of tasks that are not chaotic."""

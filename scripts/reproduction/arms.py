@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop
+from codrl_mj.actuators import IDEAL, CurrentLoop, DCMotorActuator
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.doses import CENTRE_RADIUS
 from codrl_mj.study.trials import Arm, Trial
@@ -58,7 +58,7 @@ class PaperArm(Arm):
         )
 
 
-FAST: Actuator = dataclasses.replace(
+FAST: DCMotorActuator = dataclasses.replace(
     find_task("mountain_car").paper[0], controller=CurrentLoop(kp=2.0, ki=10.0, kd=1e-6)
 )
 """The mountain car's second set of gains (Solving the Mountain Car Environment)."""

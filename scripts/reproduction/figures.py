@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.films.strip import ACTUAL, DESIRED
 from codrl_mj.study.doses import CENTRE_RADIUS
 from codrl_mj.study.pages import COLOURS, legend, save
 from codrl_mj.tasks import (
@@ -18,6 +17,7 @@ from codrl_mj.tasks import (
     mountain_car_continuous,
     pendulum,
 )
+from codrl_mj.viz.films.strip import ACTUAL, DESIRED
 from reproduction.drawn import ENTRIES, Table, arms_of, column
 from reproduction.rows import LAST
 from reproduction.value_iteration import Optimum

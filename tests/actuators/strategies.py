@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from codrl_mj.actuators import (
     IDEAL,
-    Actuator,
     CurrentLoop,
+    DCMotorActuator,
     Drive,
     GearMotor,
     Lag,
@@ -48,7 +48,7 @@ controllers = st.builds(
     integral_leak=zero_or(1e-3, 50),
     derivative_time_constant=zero_or(1e-4, 0.5),
 )
-actuators = st.builds(Actuator, motor=motors, controller=controllers)
+actuators = st.builds(DCMotorActuator, motor=motors, controller=controllers)
 """Current loops with perfect sensors and supplies."""
 
 
@@ -64,7 +64,7 @@ supplies = st.none() | st.builds(
 )
 every_actuator = st.builds(
     _with_sensor,
-    st.builds(Actuator, motor=motors, controller=controllers, supply=supplies),
+    st.builds(DCMotorActuator, motor=motors, controller=controllers, supply=supplies),
     between(-5, 5),
     zero_or(1e-3, 5),
 )

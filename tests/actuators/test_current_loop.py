@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from codrl_mj.actuators import (
-    Actuator,
     CurrentLoop,
+    DCMotorActuator,
     Inputs,
     Motor,
     Supply,
@@ -115,10 +115,10 @@ def test_integral_and_derivative_are_scipys_backward_euler_filters(constant, dt)
     integral, previous, found = 0.0, 0.0, []
     for error in ERRORS:
         (_, integral, _), *_ = advance(
-            Actuator(controller=leaking), dt, (0.0, integral, 0.0), error, 0.0
+            DCMotorActuator(controller=leaking), dt, (0.0, integral, 0.0), error, 0.0
         )
         (*_, previous), _, signals = advance(
-            Actuator(controller=filtering), dt, (0.0, 0.0, previous), error, 0.0
+            DCMotorActuator(controller=filtering), dt, (0.0, 0.0, previous), error, 0.0
         )
         found.append((integral, signals.voltage))
     for ours, system in zip(
@@ -135,40 +135,70 @@ STALLED, LINE = Motor(resistance=2.0, torque_constant=0.5), Motor(1.5, 0.1, 0.06
 SHARE, STIFF = Motor(2.0, 0.1, 0.5, 0.7), CurrentLoop(kp=1e6, max_voltage=12.0)
 FREE = CurrentLoop(kp=6.0, max_voltage=math.inf, bemf_compensation=False)
 RESTS = {  # name: actuator, torque, speed, steps of 10 ms, current
-    "stall": (Actuator(STALLED, STIFF), 1e5, 0.0, 600, 12.0 / 2.0),
-    "the supply is the limit": (Actuator(STALLED, STIFF, Supply(6.0)), 1e5, 0.0, 600, 6.0 / 2.0),
-    "V/(R + Rs)": (Actuator(STALLED, STIFF, Supply(12.0, 1.0)), 1e5, 0.0, 600, 12.0 / 3.0),
+    "stall": (DCMotorActuator(STALLED, STIFF), 1e5, 0.0, 600, 12.0 / 2.0),
+    "the supply is the limit": (
+        DCMotorActuator(STALLED, STIFF, Supply(6.0)),
+        1e5,
+        0.0,
+        600,
+        6.0 / 2.0,
+    ),
+    "V/(R + Rs)": (DCMotorActuator(STALLED, STIFF, Supply(12.0, 1.0)), 1e5, 0.0, 600, 12.0 / 3.0),
     "the supply has the controller's voltage": (
-        Actuator(STALLED, STIFF, Supply(math.inf, 1.0)),
+        DCMotorActuator(STALLED, STIFF, Supply(math.inf, 1.0)),
         1e5,
         0.0,
         600,
         4.0,
     ),
     "it sags to more than the controller uses": (
-        Actuator(STALLED, CurrentLoop(kp=1e6, max_voltage=6.0), Supply(12.0, 1.0)),
+        DCMotorActuator(STALLED, CurrentLoop(kp=1e6, max_voltage=6.0), Supply(12.0, 1.0)),
         *(1e5, 0.0, 600, 6.0 / 2.0),
     ),
     "a first-order lag after 10 steps": (
-        Actuator(Motor(2.0, 0.4), STIFF),
+        DCMotorActuator(Motor(2.0, 0.4), STIFF),
         1e5,
         0.0,
         10,
         6.0 * (1.0 - 0.95**10),
     ),
-    "no load": (Actuator(LINE, STIFF), 1e5, 12.0 / 0.06, 500, 0.0),
-    "driven beyond it": (Actuator(LINE, STIFF), 1e5, 13.0 / 0.06, 500, -1.0 / 1.5),
-    "the datasheet's line": (Actuator(LINE, STIFF), 1e5, -50.0, 500, (12.0 + 0.06 * 50.0) / 1.5),
-    "a proportional share": (Actuator(SHARE, CurrentLoop(kp=6.0)), 1.2, 3.0, 100, 2.4 * 6.0 / 8.0),
-    "the same with back-EMF": (Actuator(SHARE, FREE), 1.2, 3.0, 100, (6.0 * 2.4 - 0.7 * 3.0) / 8.0),
-    "an integral": (Actuator(controller=CurrentLoop(kp=1.0, ki=5.0)), 1.7, 2.0, 1300, 1.7),
+    "no load": (DCMotorActuator(LINE, STIFF), 1e5, 12.0 / 0.06, 500, 0.0),
+    "driven beyond it": (DCMotorActuator(LINE, STIFF), 1e5, 13.0 / 0.06, 500, -1.0 / 1.5),
+    "the datasheet's line": (
+        DCMotorActuator(LINE, STIFF),
+        1e5,
+        -50.0,
+        500,
+        (12.0 + 0.06 * 50.0) / 1.5,
+    ),
+    "a proportional share": (
+        DCMotorActuator(SHARE, CurrentLoop(kp=6.0)),
+        1.2,
+        3.0,
+        100,
+        2.4 * 6.0 / 8.0,
+    ),
+    "the same with back-EMF": (
+        DCMotorActuator(SHARE, FREE),
+        1.2,
+        3.0,
+        100,
+        (6.0 * 2.4 - 0.7 * 3.0) / 8.0,
+    ),
+    "an integral": (DCMotorActuator(controller=CurrentLoop(kp=1.0, ki=5.0)), 1.7, 2.0, 1300, 1.7),
     "one that leaks: (kp + ki/leak)/(R + kp + ki/leak)": (
-        Actuator(controller=CurrentLoop(kp=1.0, ki=5.0, integral_leak=2.0)),
+        DCMotorActuator(controller=CurrentLoop(kp=1.0, ki=5.0, integral_leak=2.0)),
         *(1.7, 0.0, 1300, 1.7 * 3.5 / 4.5),
     ),
-    "feed-forward of R": (Actuator(Motor(3.0), CurrentLoop(kp=0.0, kff=3.0)), 1.1, 0.0, 2000, 1.1),
+    "feed-forward of R": (
+        DCMotorActuator(Motor(3.0), CurrentLoop(kp=0.0, kff=3.0)),
+        1.1,
+        0.0,
+        2000,
+        1.1,
+    ),
     "deadbeat: kp + R = L/dt, kff = R": (
-        Actuator(Motor(1.0, 0.05), CurrentLoop(kp=4.0, kff=1.0)),
+        DCMotorActuator(Motor(1.0, 0.05), CurrentLoop(kp=4.0, kff=1.0)),
         1.3,
         0.0,
         1,
@@ -193,10 +223,10 @@ def test_it_ends_where_the_closed_form_says(name, sign):
 def test_a_resistance_under_which_the_saturated_current_oscillates_is_refused_with_its_bound():
     # i' = i + (V - Rs*i - R*i)*dt/L: the pole 1 - (R + Rs)*dt/L is -1 at Rs = 2*L/dt - R = 3
     allowed, refused = (
-        Actuator(supply=Supply(resistance=resistance)) for resistance in (2.99, 3.0)
+        DCMotorActuator(supply=Supply(resistance=resistance)) for resistance in (2.99, 3.0)
     )
     assert allowed.check(0.05) is None
-    radii = Actuator.instability(np.array([allowed.numbers, refused.numbers]), 0.05)
+    radii = DCMotorActuator.instability(np.array([allowed.numbers, refused.numbers]), 0.05)
     np.testing.assert_array_equal(radii < 1.0, [True, False])
     with pytest.raises(
         ValueError, match=r"supply\.resistance = 3: must be < 2\*L/dt - R = 3 ohm .* of 0\.05 s"
@@ -206,7 +236,9 @@ def test_a_resistance_under_which_the_saturated_current_oscillates_is_refused_wi
 
 
 def test_it_says_what_it_is_made_of():
-    actuator = Actuator(Motor(2.0, 0.3, 0.5, arm_radius=0.15), CurrentLoop(max_voltage=math.inf))
+    actuator = DCMotorActuator(
+        Motor(2.0, 0.3, 0.5, arm_radius=0.15), CurrentLoop(max_voltage=math.inf)
+    )
     assert (actuator.winding, actuator.arm_radius, actuator.voltage_limit) == (
         (2.0, 0.3),
         0.15,
@@ -214,16 +246,17 @@ def test_it_says_what_it_is_made_of():
     )
     assert actuator.motor.electrical_time_constant == 0.15
     limits = [
-        Actuator(supply=supply).voltage_limit for supply in (None, Supply(12.0), Supply(48.0, 1.0))
+        DCMotorActuator(supply=supply).voltage_limit
+        for supply in (None, Supply(12.0), Supply(48.0, 1.0))
     ]
     assert limits == [24.0, 12.0, 24.0]
     command = actuator.commands()["current"]
     assert command.actuator is actuator
     assert (command.torque_per_unit, command.limit) == (0.5, None)  # tau = kT*i
-    noisy = Actuator(controller=CurrentLoop(current_noise=0.1))
+    noisy = DCMotorActuator(controller=CurrentLoop(current_noise=0.1))
     assert noisy.random
     assert noisy.commands()["voltage"].actuator.random
-    assert not Actuator(controller=CurrentLoop(current_bias=0.1)).random
+    assert not DCMotorActuator(controller=CurrentLoop(current_bias=0.1)).random
 
 
 # -- under a commanded voltage ------------------------------------------------------------------------------
@@ -264,7 +297,7 @@ def test_the_terminal_voltage_is_the_command_within_what_is_left(
 
 
 def test_under_a_voltage_only_the_winding_is_left_and_the_sensor_drives_nothing():
-    actuator = Actuator(
+    actuator = DCMotorActuator(
         controller=CurrentLoop(5.0, 3.0, 1e-3, substeps=2, integral_leak=1.0, current_bias=0.5)
     )
     command = actuator.commands()["voltage"]

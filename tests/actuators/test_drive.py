@@ -363,7 +363,9 @@ def links(name, timestep, count):
 def chain(name, timestep, loads, allow_unstable=False):
     """Links that are each told another load, compiled."""
     actuators = {f"joint{link}": stiff(name, told) for link, told in enumerate(loads)}
-    return codrl_mj.motorise(links(name, timestep, len(loads)), actuators, allow_unstable).compile()
+    return codrl_mj.add_motors(
+        links(name, timestep, len(loads)), actuators, allow_unstable
+    ).compile()
 
 
 def reversals(name, timestep, loads, allow_unstable=False):
@@ -445,11 +447,11 @@ def test_several_drives_on_a_joint_are_judged_together():
     spec = links("dcx22l", 0.02, 1)
     spec.add_actuator(name="b", target="joint0", trntype=mujoco.mjtTrn.mjTRN_JOINT).set_to_motor()
     one = stiff("dcx22l", 0.0)
-    codrl_mj.motorise(spec, {"a0": one})
+    codrl_mj.add_motors(spec, {"a0": one})
     with pytest.raises(
         ValueError, match=r"in 0\.02 s over which that is held, must be < 2; shorten the step"
     ):
-        codrl_mj.motorise(spec, {"a0": one, "b": one})
+        codrl_mj.add_motors(spec, {"a0": one, "b": one})
 
 
 def test_a_drive_that_was_switched_off_begins_anew():

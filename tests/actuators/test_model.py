@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from codrl_mj.actuators import (
     FAMILIES,
     IDEAL,
-    Actuator,
     ActuatorModel,
     CurrentLoop,
+    DCMotorActuator,
     Drive,
     Inputs,
     Lag,
@@ -78,7 +78,7 @@ def test_numbers_make_the_actuator_again(actuator):
     if family is Drive:  # the gear's ratio goes into the arm and out again
         assert found.motor.arm_radius == pytest.approx(actuator.motor.arm_radius, rel=1e-15)
         found = found.replaced({"motor.arm_radius": actuator.motor.arm_radius})
-    if family in (Actuator, Drive):  # a supply that says what None does
+    if family in (DCMotorActuator, Drive):  # a supply that says what None does
         actuator = dataclasses.replace(actuator, supply=found.supply)
     assert found == actuator
 
@@ -95,7 +95,7 @@ def test_what_is_refused_is_what_counts_as_unstable(actuator, timestep):
 
 
 def test_an_absent_part_and_one_of_its_numbers_are_one_actuator():
-    assert Actuator.from_numbers(Actuator(supply=Supply()).numbers).supply is None
+    assert DCMotorActuator.from_numbers(DCMotorActuator(supply=Supply()).numbers).supply is None
     assert Nested().numbers == Nested(maybe=Inner(gain=4.0)).numbers
     assert Nested.from_numbers(Nested(maybe=Inner(5.0)).numbers, 0.5) == Nested(maybe=Inner(5.0))
     found = Nested.from_numbers((0.0, 2.0, 7.0, 4.0, 2.0), 0.25)
@@ -123,7 +123,7 @@ def test_paths_are_those_of_all_fields_and_parameters_all_but_the_arm():
         "maybe_count": "maybe.count",
     }
     assert Nested(on=False, always=Inner(2.0, 7)).numbers == (0.0, 2.0, 7.0, 4.0, 2.0)
-    assert parameters_type(Actuator)._fields[:2] == ("resistance", "inductance")
+    assert parameters_type(DCMotorActuator)._fields[:2] == ("resistance", "inductance")
     assert field_paths(type(IDEAL)) == ()
     assert parameters_type(type(IDEAL))._fields == ()
 
@@ -136,7 +136,7 @@ class Twice(ActuatorModel):
     inner: Inner = Inner()
 
 
-LOOP = parameters_type(Actuator)(*Actuator().numbers)
+LOOP = parameters_type(DCMotorActuator)(*DCMotorActuator().numbers)
 LEAST = {  # field: the least that it may be, or what it must be more than
     "Motor": {
         ">": ("resistance", "inductance", "torque_constant", "arm_radius"),
@@ -193,7 +193,7 @@ def test_quantities_have_their_bounds(kind, field, sign):
             r"Nested\.maybe = .*: must be a Inner; .*Nested\.from_mapping",
         ),
         (lambda: Nested(always=None), r"Nested\.always = None: must be a Inner"),
-        (lambda: Actuator(motor={}), r"Actuator\.motor = .*must be a Motor.*from_mapping"),
+        (lambda: DCMotorActuator(motor={}), r"Actuator\.motor = .*must be a Motor.*from_mapping"),
         (
             lambda: parameter_paths(Twice),
             r"Twice: another parameter has the same name as gain: rename one",
@@ -214,30 +214,33 @@ def test_quantities_have_their_bounds(kind, field, sign):
             lambda: Nested.from_numbers((0.5, 2.0, 7.0, 4.0, 2.0)),
             r"Nested\.on = 0\.5: must be true or false",
         ),
-        (lambda: Actuator.from_numbers(LOOP._replace(substeps=1.5)), r"\.substeps = 1\.5"),
-        (lambda: Actuator.from_numbers(LOOP._replace(substeps=math.inf)), r"\.substeps = inf"),
+        (lambda: DCMotorActuator.from_numbers(LOOP._replace(substeps=1.5)), r"\.substeps = 1\.5"),
         (
-            lambda: Actuator.from_numbers(LOOP._replace(bemf_compensation=2.0)),
+            lambda: DCMotorActuator.from_numbers(LOOP._replace(substeps=math.inf)),
+            r"\.substeps = inf",
+        ),
+        (
+            lambda: DCMotorActuator.from_numbers(LOOP._replace(bemf_compensation=2.0)),
             r"\.bemf_compensation = 2",
         ),
         (
-            lambda: Actuator.from_numbers(LOOP._replace(supply_resistance=-1.0)),
+            lambda: DCMotorActuator.from_numbers(LOOP._replace(supply_resistance=-1.0)),
             r"Supply\.resistance = -1\.0",
         ),
         (
-            lambda: Actuator.from_numbers(LOOP, 0.0),
+            lambda: DCMotorActuator.from_numbers(LOOP, 0.0),
             r"Motor\.arm_radius = 0\.0: must be a finite number > 0",
         ),
         (
-            lambda: Actuator().replaced({"controller.substeps": 1.5}),
+            lambda: DCMotorActuator().replaced({"controller.substeps": 1.5}),
             r"substeps = 1\.5: must be an integer >= 1",
         ),
         (
-            lambda: Actuator().replaced({"motor.inductanc": 1.0}),
+            lambda: DCMotorActuator().replaced({"motor.inductanc": 1.0}),
             "unknown actuator field motor.inductanc",
         ),
         (
-            lambda: Actuator().replaced({"motr.inductance": 1.0}),
+            lambda: DCMotorActuator().replaced({"motr.inductance": 1.0}),
             "unknown actuator field motr.inductance",
         ),
     ],
@@ -263,20 +266,20 @@ def test_a_current_loop_by_default_is_the_papers_motor_under_a_proportional_gain
         True,
         1,
     )
-    assert Actuator().supply is None
+    assert DCMotorActuator().supply is None
     with pytest.raises(dataclasses.FrozenInstanceError):
         loop.ki = 2.0
 
 
 def test_fields_are_replaced_by_their_path():
-    base = Actuator(Motor(resistance=2.0), CurrentLoop(kp=3.0))
+    base = DCMotorActuator(Motor(resistance=2.0), CurrentLoop(kp=3.0))
     changed = base.replaced(
         {"motor.inductance": 0.2, "controller.substeps": 4.0, "controller.bemf_compensation": 0.0}
     )
     loop = CurrentLoop(kp=3.0, substeps=4, bemf_compensation=False)
-    assert changed == Actuator(Motor(resistance=2.0, inductance=0.2), loop)
+    assert changed == DCMotorActuator(Motor(resistance=2.0, inductance=0.2), loop)
     assert Lag(0.1).replaced({"delay": 0.2}) == Lag(0.1, 0.2)
-    assert Actuator(supply=Supply()).replaced({"supply.voltage": 12.0}).supply == Supply(
+    assert DCMotorActuator(supply=Supply()).replaced({"supply.voltage": 12.0}).supply == Supply(
         voltage=12.0
     )
     assert base.replaced({"supply.voltage": 12.0}).supply == Supply(

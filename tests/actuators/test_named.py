@@ -14,9 +14,9 @@ from codrl_mj.actuators import (
     FAMILIES,
     IDEAL,
     NAMED,
-    Actuator,
     ActuatorModel,
     CurrentLoop,
+    DCMotorActuator,
     Lag,
     Motor,
     Supply,
@@ -26,15 +26,15 @@ from codrl_mj.actuators import (
     check_same_family,
     find_family,
     label_of,
-    labelled,
     mapping_of,
     name_of,
     named_mapping,
     resolve,
+    set_display_name,
 )
 from codrl_mj.fields import real
-from codrl_mj.own_code import asset_folder
 from codrl_mj.tasks import TASKS, named_actuator, resolve_actuators
+from codrl_mj.user_code import asset_folder
 from tests.actuators.strategies import of_every_family
 from tests.tasks.faces import every_rebuilt
 
@@ -72,11 +72,11 @@ def test_named_actuators_are_the_papers_motor_and_gains_and_variations_of_them(t
         resistance=1.0, inductance=0.1, torque_constant=1.0, back_emf_constant=1.0, arm_radius=arm
     )
     expected = {
-        "paper": Actuator(motor, CurrentLoop(kp, ki, kd, kff, max_voltage=24.0)),
-        "weak": Actuator(motor, CurrentLoop(kp=1.0, ki=1.0)),
-        "weaker": Actuator(motor, CurrentLoop(kp=0.2, ki=0.2)),
+        "paper": DCMotorActuator(motor, CurrentLoop(kp, ki, kd, kff, max_voltage=24.0)),
+        "weak": DCMotorActuator(motor, CurrentLoop(kp=1.0, ki=1.0)),
+        "weaker": DCMotorActuator(motor, CurrentLoop(kp=0.2, ki=0.2)),
         # u = R*i_ref is the voltage at which i_ref is at rest
-        "open_loop": Actuator(
+        "open_loop": DCMotorActuator(
             dataclasses.replace(motor, inductance=0.5), CurrentLoop(kp=0.0, kff=motor.resistance)
         ),
     }
@@ -90,7 +90,7 @@ def test_named_actuators_are_the_papers_motor_and_gains_and_variations_of_them(t
 
 # -- whatever may be written --------------------------------------------------------------------------------
 
-FED = Actuator(Motor(resistance=3.0), supply=Supply(12.0, 0.5))
+FED = DCMotorActuator(Motor(resistance=3.0), supply=Supply(12.0, 0.5))
 BY_HAND = "motor: {resistance: 2}\ncontroller:\n  kp: 1.5  # V/A\n  max_voltage: .inf\n"
 FILES = {  # JSON is YAML
     **{
@@ -142,7 +142,7 @@ def files(tmp_path, monkeypatch):
 
 def over(part, **fields):
     """The cart-pole's weak actuator with some fields of its own."""
-    weak = Actuator(CARTPOLE.paper[0].motor, CurrentLoop(kp=1.0, ki=1.0))
+    weak = DCMotorActuator(CARTPOLE.paper[0].motor, CurrentLoop(kp=1.0, ki=1.0))
     return dataclasses.replace(weak, **{part: dataclasses.replace(getattr(weak, part), **fields)})
 
 
@@ -155,8 +155,8 @@ def over(part, **fields):
         ("ideal", IDEAL),
         (None, IDEAL),
         *((name, family()) for name, family in FAMILIES.items()),
-        ({"motor": {"resistance": 3}}, Actuator(Motor(resistance=3.0))),
-        ({"family": "current_loop"}, Actuator()),
+        ({"motor": {"resistance": 3}}, DCMotorActuator(Motor(resistance=3.0))),
+        ({"family": "current_loop"}, DCMotorActuator()),
         ({"family": f"{__name__}:Mine", "strength": 3.0}, MINE),
         (MINE.as_mapping(), MINE),
         (f"{__name__}:MINE", MINE),
@@ -167,7 +167,7 @@ def over(part, **fields):
         ("mine.json", MINE),
         (
             "by_hand.yaml",
-            Actuator(Motor(resistance=2.0), CurrentLoop(kp=1.5, max_voltage=math.inf)),
+            DCMotorActuator(Motor(resistance=2.0), CurrentLoop(kp=1.5, max_voltage=math.inf)),
         ),
         ("over.yaml", over("motor", resistance=2.0)),
         ({"name": "weak", "controller": {"kp": 5.0}}, over("controller", kp=5.0)),
@@ -309,7 +309,7 @@ PAIR = dataclasses.replace(
     name="pair",
     motors=("left", "right"),
     forces=((-10.0, -10.0), (10.0, 10.0)),
-    paper=(Actuator(Motor(inductance=0.2)), Actuator(Motor(inductance=0.3))),
+    paper=(DCMotorActuator(Motor(inductance=0.2)), DCMotorActuator(Motor(inductance=0.3))),
 )
 
 
@@ -317,7 +317,7 @@ def test_every_motor_has_its_own_variation_of_its_own_actuator():
     for name, gain in (("weak", 1.0), ("weaker", 0.2)):
         loop = CurrentLoop(kp=gain, ki=gain)
         assert resolve_actuators(name, PAIR) == tuple(
-            Actuator(paper.motor, loop) for paper in PAIR.paper
+            DCMotorActuator(paper.motor, loop) for paper in PAIR.paper
         )
     assert resolve_actuators(["paper", "weak"], PAIR)[0] == PAIR.paper[0]
     assert resolve_actuators(Lag(), PAIR) == (Lag(), Lag())
@@ -399,17 +399,20 @@ def test_a_motor_of_the_catalogue_is_known_by_its_numbers_and_written_short():
     )
     assert label_of(geared) == ""
     assert name_of(geared) == "kraken-x60"
-    assert named_mapping(labelled(geared, "kraken-x60")) == {
+    assert named_mapping(set_display_name(geared, "kraken-x60")) == {
         "name": "kraken-x60",
         "motor": {"gear_ratio": 70.3, "arm_radius": 200.0},
     }
     other = dataclasses.replace(there, motor=dataclasses.replace(there.motor, resistance=1.0))
     assert name_of(other) == "drive"
-    assert named_mapping(labelled(other, "kraken-x60")) == {
+    assert named_mapping(set_display_name(other, "kraken-x60")) == {
         "name": "kraken-x60",
         "motor": {"resistance": 1.0},
     }
-    assert named_mapping(labelled(Lag(0.2), "slow")) == {"label": "slow", **Lag(0.2).as_mapping()}
+    assert named_mapping(set_display_name(Lag(0.2), "slow")) == {
+        "label": "slow",
+        **Lag(0.2).as_mapping(),
+    }
 
 
 def test_a_name_is_nothing_of_the_actuator(files):
@@ -417,7 +420,7 @@ def test_a_name_is_nothing_of_the_actuator(files):
     assert (name_of(asked), name_of(plain)) == ("drawer", "maxon-re65")
     assert (asked, hash(asked), asked.as_mapping()) == (plain, hash(plain), plain.as_mapping())
     assert (
-        label_of(labelled(IDEAL, "nothing")) == label_of(MINE) == ""
+        label_of(set_display_name(IDEAL, "nothing")) == label_of(MINE) == ""
     )  # which may be known by other names
 
 
@@ -428,11 +431,15 @@ def test_a_name_is_nothing_of_the_actuator(files):
 
 
 def test_single_fields_are_set_over_anothers():
-    base = Actuator(Motor(resistance=2.0), CurrentLoop(kp=3.0, ki=4.0))
+    base = DCMotorActuator(Motor(resistance=2.0), CurrentLoop(kp=3.0, ki=4.0))
     changed = actuator_over(base, {"controller": {"kp": 5.0}, "motor": {"inductance": 0.3}})
-    assert changed == Actuator(Motor(resistance=2.0, inductance=0.3), CurrentLoop(kp=5.0, ki=4.0))
+    assert changed == DCMotorActuator(
+        Motor(resistance=2.0, inductance=0.3), CurrentLoop(kp=5.0, ki=4.0)
+    )
     assert actuator_over(base, {"supply": {"voltage": 12.0}}).supply == Supply(voltage=12.0)
-    assert actuator_over(Actuator(supply=Supply(12.0)), {"supply": None}) == Actuator()
+    assert (
+        actuator_over(DCMotorActuator(supply=Supply(12.0)), {"supply": None}) == DCMotorActuator()
+    )
     assert actuator_over(changed, {}) is changed
     assert actuator_over(Lag(0.1, 0.2), {"delay": 0.3}) == Lag(0.1, 0.3)
     assert actuator_over(TorqueSpeed(), {"max_torque": 2.0}) == TorqueSpeed(max_torque=2.0)

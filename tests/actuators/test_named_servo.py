@@ -23,7 +23,7 @@ from codrl_mj.actuators import (
     resolve,
 )
 from codrl_mj.cli import main
-from codrl_mj.drives import find_drive, find_loop
+from codrl_mj.sizing import find_drive, find_loop
 from codrl_mj.training import load_config
 from codrl_mj.training.folder import admit
 from tests.cli.lines import TINY, ran, refused
@@ -63,7 +63,7 @@ def files(tmp_path, monkeypatch):
 
 def settled(actuator, target):
     """The joint's position [rad] and the load [N*m] on it there, after two seconds."""
-    model = codrl_mj.motorise(mujoco.MjSpec.from_string(ARM), {"kn.*": actuator}).compile()
+    model = codrl_mj.add_motors(mujoco.MjSpec.from_string(ARM), {"kn.*": actuator}).compile()
     data = mujoco.MjData(model)
     data.ctrl[0] = target
     mujoco.mj_step(model, data, 2000)

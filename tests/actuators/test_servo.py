@@ -56,7 +56,7 @@ def run(model, targets, load=0.0, start=0.0):
 
 
 def turned(one, targets, timestep=0.001, load=0.0):
-    return run(codrl_mj.motorise(hinge(timestep), {"shaft": one}).compile(), targets, load)
+    return run(codrl_mj.add_motors(hinge(timestep), {"shaft": one}).compile(), targets, load)
 
 
 @pytest.mark.parametrize(
@@ -113,11 +113,14 @@ def test_what_the_model_s_own_servo_was_is_gone(saved):
         spec = hinge(0.002)
         if own:
             spec.actuator("it").set_to_position(kp=3.0, kv=30.0)
-        motorised = codrl_mj.motorise(spec, {"shaft": servo(velocity_gain=1.5, servo_rate=500.0)})
-        model = motorised.compile()
+        motors_added = codrl_mj.add_motors(
+            spec, {"shaft": servo(velocity_gain=1.5, servo_rate=500.0)}
+        )
+        model = motors_added.compile()
         ways.append(
             run(
-                mujoco.MjModel.from_xml_string(motorised.to_xml()) if saved else model, [0.3] * 250
+                mujoco.MjModel.from_xml_string(motors_added.to_xml()) if saved else model,
+                [0.3] * 250,
             )[0]
         )
     np.testing.assert_array_equal(*ways)
@@ -234,7 +237,7 @@ def test_the_bound_of_stability_is_where_it_is(rate, gains, integrator, links, d
             name=f"a{link}", target=f"j{link}", trntype=mujoco.mjtTrn.mjTRN_JOINT
         ).set_to_motor()
 
-    def motorised(gain, allow_unstable):
+    def motors_added(gain, allow_unstable):
         one = servo(
             1e9,
             controls=controls,
@@ -243,20 +246,22 @@ def test_the_bound_of_stability_is_where_it_is(rate, gains, integrator, links, d
             velocity_integral_gain=integral,
             servo_rate=rate,
         )
-        return codrl_mj.motorise(spec, {f"a{link}": one for link in range(links)}, allow_unstable)
+        return codrl_mj.add_motors(spec, {f"a{link}": one for link in range(links)}, allow_unstable)
 
     low, high = 0.2, 2000.0
     while high / low > 1.01:
         middle = math.sqrt(low * high)
-        stable = check_shafts(motorised(middle, True).compile(), allow_unstable=True) < 1.0 + 1e-6
+        stable = (
+            check_shafts(motors_added(middle, True).compile(), allow_unstable=True) < 1.0 + 1e-6
+        )
         low, high = (middle, high) if stable else (low, middle)
     assert (
-        growth(motorised(low / 1.03, False).compile())
+        growth(motors_added(low / 1.03, False).compile())
         < 1.0
-        < growth(motorised(high * 1.03, True).compile())
+        < growth(motors_added(high * 1.03, True).compile())
     )
     with pytest.raises(UnstableError, match=r"spectral radius 1\."):
-        motorised(high * 1.03, False)
+        motors_added(high * 1.03, False)
 
 
 ASKED = Servo(

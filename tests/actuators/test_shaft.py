@@ -45,7 +45,7 @@ def hinge(timestep, inertia=1e-3, weight=0.0, mass=1.0, down=0.0):
 
 def on_a_shaft(one, timestep, **load):
     """A compiled model of such a hinge behind an actuator."""
-    return codrl_mj.motorise(hinge(timestep, **load), {"shaft": one}).compile()
+    return codrl_mj.add_motors(hinge(timestep, **load), {"shaft": one}).compile()
 
 
 def after(model, seconds, control=0.0):

@@ -9,8 +9,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from codrl_mj.actuators import (
-    Actuator,
     CurrentLoop,
+    DCMotorActuator,
     Inputs,
     Motor,
     check_stable,
@@ -45,7 +45,7 @@ def electrical_matrix(actuator, timestep):
     Only the states that some gain reads are part of the loop: the current always, the integral if
     ki > 0 and the previous error if kd > 0.
     """
-    parameters = parameters_type(Actuator)(*actuator.numbers)._replace(
+    parameters = parameters_type(DCMotorActuator)(*actuator.numbers)._replace(
         max_voltage=np.inf, substeps=1
     )
     states = [0, *[1] * (actuator.controller.ki > 0), *[2] * (actuator.controller.kd > 0)]
@@ -77,7 +77,7 @@ def polynomial_of(actuator, dt):
 
 @given(motors, plain_loops, timesteps)
 def test_the_spectral_radius_is_that_of_the_hand_derived_polynomial(motor, loop, dt):
-    actuator = Actuator(motor, loop)
+    actuator = DCMotorActuator(motor, loop)
     polynomial = polynomial_of(actuator, dt)
     # the radius itself can be ill-conditioned at a double root; that it is a root is not
     values = np.linalg.eigvals(electrical_matrix(actuator, dt))
@@ -100,30 +100,35 @@ def test_the_radius_is_that_of_the_matrix_once_for_each_substep(actuator, dt):
 
 # -- the paper's gains, at its steps and at longer ones ------------------------------------------------------
 
-PENDULUM = Actuator(controller=CurrentLoop(kp=1.0, ki=20.0, kd=1e-6))
-CARTPOLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6))
+PENDULUM = DCMotorActuator(controller=CurrentLoop(kp=1.0, ki=20.0, kd=1e-6))
+CARTPOLE = DCMotorActuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6))
 # name: actuator, step [s], spectral radius, the kd at which the loop turns unstable
 PAPER_LOOPS = {
     "pendulum": (PENDULUM, 0.05, 0.500, 0.038),
     "mountain car": (
-        Actuator(controller=CurrentLoop(kp=1.0, ki=1.0, kd=1e-2)),
+        DCMotorActuator(controller=CurrentLoop(kp=1.0, ki=1.0, kd=1e-2)),
         0.05,
         0.975,
         0.049,
     ),
     "mountain car, tight": (
-        Actuator(controller=CurrentLoop(kp=2.0, ki=10.0, kd=1e-6)),
+        DCMotorActuator(controller=CurrentLoop(kp=2.0, ki=10.0, kd=1e-6)),
         0.05,
         0.843,
         0.019,
     ),
     "mountain car, continuous": (
-        Actuator(controller=CurrentLoop(kp=0.1, ki=10.0, kd=1e-3)),
+        DCMotorActuator(controller=CurrentLoop(kp=0.1, ki=10.0, kd=1e-3)),
         0.05,
         0.676,
         0.066,
     ),
-    "acrobot": (Actuator(controller=CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)), 0.02, 0.872, 0.079),
+    "acrobot": (
+        DCMotorActuator(controller=CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)),
+        0.02,
+        0.872,
+        0.079,
+    ),
     "cart-pole": (CARTPOLE, 0.02, 0.996, 0.047),
 }
 
@@ -162,7 +167,7 @@ def test_at_a_longer_step_the_papers_gains_are_unstable_and_the_remedy_is_two_su
 
 
 def test_a_radius_of_exactly_one_is_refused():
-    actuator = Actuator(Motor(resistance=1.0, inductance=0.125), CurrentLoop(kp=1.0))
+    actuator = DCMotorActuator(Motor(resistance=1.0, inductance=0.125), CurrentLoop(kp=1.0))
     assert spectral_radius(actuator, 0.125) == 1.0  # |1 - 2|
     with pytest.raises(ValueError, match="spectral radius 1, must be < 1"):
         check_stable(actuator, 0.125)
@@ -207,9 +212,9 @@ def test_many_are_each_the_one_to_the_last_bit_and_the_quick_test_is_below_one_w
     several, dt
 ):
     numbers = np.array([one.numbers for one in several])
-    radii = spectral_radii(Actuator, numbers, dt)
+    radii = spectral_radii(DCMotorActuator, numbers, dt)
     np.testing.assert_array_equal(radii, [spectral_radius(one, dt) for one in several])
-    np.testing.assert_array_equal(stability_radii(Actuator, numbers, dt) < 1.0, radii < 1.0)
+    np.testing.assert_array_equal(stability_radii(DCMotorActuator, numbers, dt) < 1.0, radii < 1.0)
 
 
 @given(motors, st.sampled_from([-1.0, 1.0]), st.integers(-3, 3), timesteps)
@@ -218,23 +223,28 @@ def test_the_quick_test_asks_the_eigenvalues_on_the_edge(motor, pole, nudge, dt)
     kp = (1.0 - pole) * motor.inductance / dt - motor.resistance
     assume(kp >= 0.0)
     numbers = np.array(
-        [Actuator(motor, CurrentLoop(kp=kp + nudge * np.spacing(max(kp, 1.0)))).numbers]
+        [DCMotorActuator(motor, CurrentLoop(kp=kp + nudge * np.spacing(max(kp, 1.0)))).numbers]
     )
     np.testing.assert_array_equal(
-        stability_radii(Actuator, numbers, dt), spectral_radii(Actuator, numbers, dt)
+        stability_radii(DCMotorActuator, numbers, dt), spectral_radii(DCMotorActuator, numbers, dt)
     )
 
 
 def test_the_quick_test_asks_nobody_where_the_case_is_clear(monkeypatch):
     monkeypatch.setattr("codrl_mj.actuators.stability.spectral_radii", None)
-    numbers = np.array([Actuator(controller=CurrentLoop(kp=kp)).numbers for kp in (1.0, 1e4)])
-    np.testing.assert_array_equal(stability_radii(Actuator, numbers, 0.01), [0.0, np.inf])
+    numbers = np.array(
+        [DCMotorActuator(controller=CurrentLoop(kp=kp)).numbers for kp in (1.0, 1e4)]
+    )
+    np.testing.assert_array_equal(stability_radii(DCMotorActuator, numbers, 0.01), [0.0, np.inf])
 
 
 @pytest.mark.parametrize("field", ["kp", "ki", "kd"])
 def test_gains_that_overflow_are_unstable_at_any_number_of_substeps(field):
     numbers = np.array(
-        [with_gains(Actuator(), **{field: 1e308}, substeps=count).numbers for count in (1, 4)]
+        [
+            with_gains(DCMotorActuator(), **{field: 1e308}, substeps=count).numbers
+            for count in (1, 4)
+        ]
     )
     for radii in (stability_radii, spectral_radii):
-        assert not (radii(Actuator, numbers, 0.01) < 1.0).any()
+        assert not (radii(DCMotorActuator, numbers, 0.01) < 1.0).any()

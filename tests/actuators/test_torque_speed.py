@@ -53,7 +53,7 @@ LEG = """<mujoco><option timestep="1e-6"/><worldbody><body><joint name="knee" ax
 def test_nothing_but_what_is_given_limits_a_printed_line_in_mujoco(speed, more):
     """The closed form min(asked, stall*(1 - w/w0), most), where most is the stall torque unless it is given."""
     given = {"family": "torque_speed", "stall_torque": 24.0, "no_load_speed": 30.0, **more}
-    model = codrl_mj.motorise(mujoco.MjSpec.from_string(LEG), {"knee": given}).compile()
+    model = codrl_mj.add_motors(mujoco.MjSpec.from_string(LEG), {"knee": given}).compile()
     data = mujoco.MjData(model)
     data.ctrl[0], data.qvel[0] = 20.0, speed
     mujoco.mj_step(model, data)

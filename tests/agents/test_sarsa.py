@@ -16,7 +16,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.logger import configure
 
 import codrl_mj
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.agents.sarsa import SARSAConfig
 from codrl_mj.agents.sarsa_algorithm import FORGOTTEN, SARSA
 from codrl_mj.physics.base import SimulationDivergedError
@@ -291,7 +291,7 @@ def test_an_episode_that_was_left_is_finished_step_by_step():
 
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_diverging_simulation_is_an_error(compiled):
-    actuator = Actuator(Motor(), CurrentLoop(kp=1.0, kd=0.2, max_voltage=np.inf))
+    actuator = DCMotorActuator(Motor(), CurrentLoop(kp=1.0, kd=0.2, max_voltage=np.inf))
     with pytest.raises(SimulationDivergedError, match="mountain_car"):
         _model(compiled=compiled, actuator=actuator, allow_unstable=True).learn(10_000)
 

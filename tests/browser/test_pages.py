@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from markupsafe import Markup
 
-from codrl_mj.drives import find_drive, find_entry
-from codrl_mj.pages import page as builder
-from codrl_mj.pages.motor import motor_page
-from codrl_mj.pages.plots import Curve, Plot
-from codrl_mj.pages.report import replays, report
+from codrl_mj.sizing import find_drive, find_entry
+from codrl_mj.viz.pages import page as builder
+from codrl_mj.viz.pages.motor import motor_page
+from codrl_mj.viz.pages.plots import Curve, Plot
+from codrl_mj.viz.pages.report import replays, report
 from tests.browser.waiting import until
 
 pytestmark = pytest.mark.browser

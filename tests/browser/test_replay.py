@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from codrl_mj.replay import SCRIPT, library, motion, replay, write_replay
+from codrl_mj.viz.replay import SCRIPT, library, motion, replay, write_replay
 from tests.browser.waiting import until
-from tests.replay.test_motion import ARM, positions
+from tests.viz.replay.test_motion import ARM, positions
 
 pytestmark = pytest.mark.browser
 

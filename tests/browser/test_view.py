@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.view.browser import Browser
-from codrl_mj.view.session import Session
+from codrl_mj.viz.view.browser import Browser
+from codrl_mj.viz.view.session import Session
 from tests.browser.waiting import until
 
 pytestmark = pytest.mark.browser

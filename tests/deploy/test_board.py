@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor, Servo, ServoLoop
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor, Servo, ServoLoop
 from codrl_mj.agents import DQNConfig, SACConfig
 from codrl_mj.cli import main
 from codrl_mj.deploy import (
@@ -146,7 +146,7 @@ LOOPS = {
         DRIVE.supply,
         ServoLoop(servo_rate=500.0, velocity_gain=0.004),
     ),
-    "the paper's": Actuator(
+    "the paper's": DCMotorActuator(
         Motor(), CurrentLoop(kp=2.0, ki=5.0, kd=1e-4, substeps=3, current_bias=0.02, kff=0.1)
     ),
 }

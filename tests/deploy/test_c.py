@@ -10,7 +10,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Actuator, Drive, Servo, ServoLoop, Supply, electrical_step
+from codrl_mj.actuators import DCMotorActuator, Drive, Servo, ServoLoop, Supply, electrical_step
 from codrl_mj.actuators.drive import State
 from codrl_mj.actuators.model import Inputs
 from codrl_mj.actuators.parameters import parameters_type
@@ -165,7 +165,7 @@ def test_the_paper_s_loop_in_c_is_the_actuator_s_sample_by_sample(tmp_path, name
     actuator = dataclasses.replace(usual, controller=controller, supply=supply)
     written(tmp_path, "cartpole", "dqn", double=double, actuator=actuator)
     library, kind = compiled(tmp_path, double, "current_step", "current_reference")
-    parameters = parameters_type(Actuator)(*actuator.numbers)
+    parameters = parameters_type(DCMotorActuator)(*actuator.numbers)
     header = (tmp_path / "controller.h").read_text()
     period = 1.0 / float(
         header.partition("CONTROLLER_CURRENT_RATE ")[2].partition(" ")[0].rstrip("f")

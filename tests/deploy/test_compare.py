@@ -10,10 +10,10 @@ import pytest
 from codrl_mj.cli import main
 from codrl_mj.deploy import Contract, OnnxPolicy, board_test, compare, export, write_log
 from codrl_mj.deploy.contract import Interface
-from codrl_mj.drives import find_drive
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
 from codrl_mj.identify import identify, read_log
+from codrl_mj.sizing import find_drive
 from tests.deploy.test_export import trained
 
 FURUTA = EnvConfig("furuta")

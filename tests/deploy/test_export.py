@@ -10,7 +10,7 @@ import pytest
 import torch
 from onnx.reference import ReferenceEvaluator
 
-from codrl_mj.actuators import Actuator
+from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.agents import AGENTS
 from codrl_mj.cli import main
 from codrl_mj.deploy import Contract, board_test, export, network_of, onnx_model
@@ -206,7 +206,7 @@ def test_another_actuator_is_refused_by_the_number_that_differs(exported):
     weaker = drive.replaced({"supply.voltage": 6.0})
     for other, message in {
         weaker: r"supply\.voltage = 6\.0, must be 18\.0",
-        Actuator(): "must be drive",
+        DCMotorActuator(): "must be drive",
     }.items():
         with pytest.raises(ValueError, match=message):
             contract.admit_actuators({"motor": other})

@@ -13,7 +13,7 @@ from codrl_mj.agents import SACConfig
 from codrl_mj.deploy import Interface, export
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.tasks import TASKS
-from tests.foreign.models import V5, BareEnv
+from tests.external_envs.models import V5, BareEnv
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning")
 

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from codrl_mj.actuators import IDEAL
 from codrl_mj.disturbances import Joint
-from codrl_mj.physics import MujocoPhysics, Plant
+from codrl_mj.physics import MujocoPhysics, SimulationConfig
 from codrl_mj.tasks import TASKS
 
 START = np.array([2.0, 1.0])
@@ -16,7 +16,9 @@ START = np.array([2.0, 1.0])
 
 def _pendulum(inner_steps, torque, **joint):
     physics = MujocoPhysics(
-        Plant(TASKS["pendulum"], [IDEAL], inner_steps, "semi-implicit", joint=Joint(**joint))
+        SimulationConfig(
+            TASKS["pendulum"], [IDEAL], inner_steps, "semi-implicit", joint=Joint(**joint)
+        )
     )
     physics.reset(START)
     for _ in range(10):
@@ -55,7 +57,7 @@ def test_friction_is_a_constant_torque_against_the_motion():
 @pytest.mark.parametrize(("torque", "sticks"), [(0.9, True), (-0.9, True), (1.4, False)])
 def test_friction_holds_what_does_not_exceed_it(torque, sticks):
     physics = MujocoPhysics(
-        Plant(TASKS["pendulum"], [IDEAL], 10, "semi-implicit", joint=Joint(friction=1.0))
+        SimulationConfig(TASKS["pendulum"], [IDEAL], 10, "semi-implicit", joint=Joint(friction=1.0))
     )
     physics.reset(np.array([np.pi, 0.0]))
     for _ in range(40):
@@ -84,9 +86,11 @@ def test_the_explicit_integrator_stays_explicit():
     """CartPole: positions move by the old velocity, and damping is that of the old velocity: a force like any other."""
     damping, cartpole = 2.0, TASKS["cartpole"]
     damped = MujocoPhysics(
-        Plant(cartpole, [IDEAL], 1, "euler", np.array([1e6]), joint=Joint(damping=damping))
+        SimulationConfig(
+            cartpole, [IDEAL], 1, "euler", np.array([1e6]), joint=Joint(damping=damping)
+        )
     )
-    plain = MujocoPhysics(Plant(cartpole, [IDEAL], 1, "euler", np.array([1e6])))
+    plain = MujocoPhysics(SimulationConfig(cartpole, [IDEAL], 1, "euler", np.array([1e6])))
     generator = np.random.default_rng(0)
     for _ in range(50):
         state, force = generator.normal(size=4), generator.normal() * 10
@@ -96,7 +100,7 @@ def test_the_explicit_integrator_stays_explicit():
         plain.step(force - damping * state[1])
         np.testing.assert_allclose(damped.state, plain.state, rtol=1e-12, atol=1e-12)
     rubbed = MujocoPhysics(
-        Plant(cartpole, [IDEAL], 1, "euler", joint=Joint(damping=1.0, friction=1.0))
+        SimulationConfig(cartpole, [IDEAL], 1, "euler", joint=Joint(damping=1.0, friction=1.0))
     )
     rubbed.reset(state)
     rubbed.step(3.0)
@@ -107,7 +111,9 @@ def test_armature_is_an_inertia_of_the_joint():
     """From rest the pendulum turns by tau/(m l^2/3 + I) for a step of semi-implicit Euler, whatever gravity adds."""
     rotor, torque = 0.25, 1.5
     physics = MujocoPhysics(
-        Plant(TASKS["pendulum"], [IDEAL], 4, "semi-implicit", joint=Joint(armature=rotor))
+        SimulationConfig(
+            TASKS["pendulum"], [IDEAL], 4, "semi-implicit", joint=Joint(armature=rotor)
+        )
     )
     physics.reset(np.zeros(2))
     physics.step(torque)

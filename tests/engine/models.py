@@ -5,12 +5,12 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.engine.families import SLOT, Slot, signals_at
-from codrl_mj.own_code import asset_path
 from codrl_mj.physics.mjcf import drive
+from codrl_mj.user_code import asset_path
 
-FULL = Actuator(
+FULL = DCMotorActuator(
     Motor(
         resistance=1.2, inductance=0.05, torque_constant=0.8, back_emf_constant=0.7, arm_radius=0.5
     ),
@@ -29,18 +29,18 @@ FULL = Actuator(
 
 
 TICK = Slot._fields.index("tick")
-_SIZE = len(Actuator.State._fields)
+_SIZE = len(DCMotorActuator.State._fields)
 STATE = [SLOT + _SIZE + entry for entry in range(_SIZE)]
 """Where a current loop's state of the last step is in `data.act`: current, integral, error."""
 CURRENT = STATE[0]
-VOLTAGE = signals_at(Actuator) + Actuator.Signals._fields.index("voltage")
+VOLTAGE = signals_at(DCMotorActuator) + DCMotorActuator.Signals._fields.index("voltage")
 
 
 def changed(actuator, **fields):
     """The actuator with some fields of its motor or controller changed."""
     motor = {name: value for name, value in fields.items() if hasattr(actuator.motor, name)}
     loop = {name: value for name, value in fields.items() if name not in motor}
-    return Actuator(
+    return DCMotorActuator(
         dataclasses.replace(actuator.motor, **motor),
         dataclasses.replace(actuator.controller, **loop),
     )

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from codrl_mj import engine
-from codrl_mj.own_code import asset_path
 from codrl_mj.tasks import TASKS
+from codrl_mj.user_code import asset_path
 from tests.engine.models import (
     FULL,
     STATE,

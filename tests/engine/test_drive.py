@@ -39,7 +39,7 @@ def native(timestep, inertia=HELD):
 def ours(timestep, samples, inertia=HELD):
     loop = SampledLoop(samples / timestep, kp=KP, bemf_compensation=False)
     drive = Drive(GearMotor(R, L, K, K, rotor_inertia=0.0), loop, Supply(1e3))
-    return codrl_mj.motorise(hinge(timestep, inertia)[0], {"hinge": drive}).compile()
+    return codrl_mj.add_motors(hinge(timestep, inertia)[0], {"hinge": drive}).compile()
 
 
 def run(model, voltages, speed, unit=1.0):
@@ -119,6 +119,6 @@ def test_the_torque_is_within_the_line_and_the_limit(case, sign):
         constant * VOLTAGE / STALL, 1e-3, constant, constant, rotor_inertia=0.0, gear_ratio=gear
     )
     drive = Drive(motor, SampledLoop(20e3, max_current=most), Supply(VOLTAGE))
-    model = codrl_mj.motorise(hinge(0.002)[0], {"hinge": drive}).compile()
+    model = codrl_mj.add_motors(hinge(0.002)[0], {"hinge": drive}).compile()
     torque = run(model, [sign * demand] * 50, sign * speed)[-1, 1]
     assert torque == pytest.approx(sign * expected, rel=1e-6, abs=1e-9)

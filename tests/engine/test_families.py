@@ -26,7 +26,13 @@ from codrl_mj.actuators import (
 from codrl_mj.actuators.noise import standard_normal
 from codrl_mj.engine.families import SLOT, Slot, loaded_families, signals_at, slot_size, user_head
 from codrl_mj.fields import flag, integer, part, real
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant, install_callbacks, motors
+from codrl_mj.physics import (
+    AnalyticPhysics,
+    MujocoPhysics,
+    SimulationConfig,
+    install_callbacks,
+    motors,
+)
 from codrl_mj.physics.mjcf import drive
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed, controls, rotor, rotor_spec, trajectory
@@ -288,7 +294,7 @@ def test_both_physics_give_it_the_same_inputs(task):
     start = np.full(len(definition.state_names), 0.05)
     rows = []
     for kind in (MujocoPhysics, AnalyticPhysics):
-        physics = kind(Plant(definition, actuators, 4))
+        physics = kind(SimulationConfig(definition, actuators, 4))
         physics.reset(start, KEY)
         for force in controls(10, size=definition.max_force)[:, 0]:
             physics.step(float(force))

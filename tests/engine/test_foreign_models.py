@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 
 from codrl_mj import engine
-from codrl_mj.actuators import Actuator
+from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.engine.families import slot_size, user_head
 from tests.engine.models import controls, rotor_spec, trajectory
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
 
-HEAD, SIZE = user_head(Actuator), slot_size(Actuator)
+HEAD, SIZE = user_head(DCMotorActuator), slot_size(DCMotorActuator)
 
 
-OURS = (*HEAD, *Actuator().numbers)
+OURS = (*HEAD, *DCMotorActuator().numbers)
 
 
 def general(user=(), actdim=SIZE, **kinds):
@@ -82,7 +82,7 @@ def test_a_foreign_model_moves_as_without_us(kind, integrator):
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     inputs = controls(50, model.nu)
     without = trajectory(model, inputs, _start(model))
-    engine.load_family(Actuator)
+    engine.load_family(DCMotorActuator)
     engine.install()
     assert engine.installed()
     np.testing.assert_array_equal(trajectory(model, inputs, _start(model)), without)
@@ -102,7 +102,7 @@ def test_models_compile_alike_while_installed(build):
 
 
 def test_a_spec_is_recompiled_mid_episode_while_installed():
-    engine.load_family(Actuator)
+    engine.load_family(DCMotorActuator)
     engine.install()
     spec = rotor_spec()
     model = spec.compile()

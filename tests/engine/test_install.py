@@ -4,8 +4,8 @@ import mujoco
 import pytest
 
 from codrl_mj import engine
-from codrl_mj.actuators import IDEAL, Actuator
-from codrl_mj.physics import MujocoPhysics, Plant, trace_names
+from codrl_mj.actuators import IDEAL, DCMotorActuator
+from codrl_mj.physics import MujocoPhysics, SimulationConfig, trace_names
 from codrl_mj.tasks import TASKS
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
@@ -79,18 +79,18 @@ def test_an_unknown_part_is_refused():
 
 
 def test_a_simulation_whose_callback_was_replaced_says_so_and_works_again_at_the_next_episode_without_it():
-    physics = MujocoPhysics(Plant(TASKS["cartpole"], [Actuator()], 1, "euler"))
+    physics = MujocoPhysics(SimulationConfig(TASKS["cartpole"], [DCMotorActuator()], 1, "euler"))
     mujoco.set_mjcb_control(FOREIGN["control"])
     with pytest.raises(engine.CallbackInUseError):
         physics.reset(physics.state)
     mujoco.set_mjcb_control(None)
     physics.reset(physics.state)
     physics.step(5.0)
-    assert physics.trace[-1, 0, trace_names(Actuator).index("current")] > 0.0
+    assert physics.trace[-1, 0, trace_names(DCMotorActuator).index("current")] > 0.0
 
 
 def test_an_ideal_actuator_needs_no_callback():
     mujoco.set_mjcb_act_bias(FOREIGN["act_bias"])
-    physics = MujocoPhysics(Plant(TASKS["cartpole"], [IDEAL], 1, "euler"))
+    physics = MujocoPhysics(SimulationConfig(TASKS["cartpole"], [IDEAL], 1, "euler"))
     physics.step(10.0)
     assert physics.state[1] > 0.0

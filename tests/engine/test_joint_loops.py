@@ -116,13 +116,13 @@ def test_a_family_of_somebody_s_is_refused_where_jury_says_so(shares):
             with pytest.raises(
                 UnstableError, match=r"moves 0\.02 kg\*m\^2 .* Or shorten the step to 0\.005 s"
             ):
-                codrl_mj.motorise(hinge(inertia), {"it": one})
+                codrl_mj.add_motors(hinge(inertia), {"it": one})
         else:
-            codrl_mj.motorise(hinge(inertia), {"it": one})
+            codrl_mj.add_motors(hinge(inertia), {"it": one})
 
 
 def test_dry_friction_of_somebody_s_is_no_loop():
-    codrl_mj.motorise(hinge(0.02), {"it": Spring(stiffness=1.0, dry=0.5)})
+    codrl_mj.add_motors(hinge(0.02), {"it": Spring(stiffness=1.0, dry=0.5)})
 
 
 def test_a_torque_speed_line_that_overshoots_is_refused():
@@ -130,7 +130,7 @@ def test_a_torque_speed_line_that_overshoots_is_refused():
     line = TorqueSpeed(stall_torque=1.0, no_load_speed=10.0, max_torque=1.0)
     for inertia, swings in ((0.01 * 0.1 / 1.9, False), (0.01 * 0.1 / 2.1, True)):
         data = mujoco.MjData(
-            codrl_mj.motorise(hinge(inertia), {"it": line}, allow_unstable=True).compile()
+            codrl_mj.add_motors(hinge(inertia), {"it": line}, allow_unstable=True).compile()
         )
         data.ctrl[:], speeds = 1.0, []
         for _ in range(400):
@@ -141,9 +141,9 @@ def test_a_torque_speed_line_that_overshoots_is_refused():
             with pytest.raises(
                 UnstableError, match=r"takes 2\.1 of the way .* less than 0\.00952 s"
             ):
-                codrl_mj.motorise(hinge(inertia), {"it": line})
+                codrl_mj.add_motors(hinge(inertia), {"it": line})
         else:
-            codrl_mj.motorise(hinge(inertia), {"it": line})
+            codrl_mj.add_motors(hinge(inertia), {"it": line})
 
 
 @pytest.mark.parametrize(

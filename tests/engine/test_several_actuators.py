@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Actuator
+from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.engine import uninstall
 from codrl_mj.engine.families import slot_size
 from codrl_mj.physics import motors
@@ -99,7 +99,7 @@ def test_every_motor_is_its_own_reference(integrator):
         mujoco.mj_step(model, data)
         for name, reference in references.items():
             actuator, close = model.actuator(name).id, {"rel": 1e-10, "abs": 1e-11}
-            act = data.act[model.actuator_actadr[actuator] :][: slot_size(Actuator)]
+            act = data.act[model.actuator_actadr[actuator] :][: slot_size(DCMotorActuator)]
             np.testing.assert_allclose(act[STATE], reference.state, rtol=1e-10, atol=1e-11)
             torque = OURS[name].motor.torque_constant * reference.current
             assert data.actuator_force[model.actuator_outadr[actuator]] == pytest.approx(
@@ -133,7 +133,9 @@ def test_a_disabled_group_silences_one_motor_of_several():
     data = mujoco.MjData(model)
     trajectory(model, controls(20, model.nu), data)
     for name in OURS:
-        act = data.act[model.actuator_actadr[model.actuator(name).id] :][: slot_size(Actuator)]
+        act = data.act[model.actuator_actadr[model.actuator(name).id] :][
+            : slot_size(DCMotorActuator)
+        ]
         assert np.any(act != 0.0) == (name != "second")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 import codrl_mj
-from codrl_mj.envs.worlds import World
+from codrl_mj.envs.worlds import EnvSource
 
 XML = """
 <mujoco model="rig">
@@ -62,7 +62,7 @@ class RigEnv(gymnasium.Env):
         return np.concatenate([self.data.qpos, self.data.qvel])
 
 
-class Rig(World):
+class Rig(EnvSource):
     """Environments of the rig."""
 
     name, time_limit = "rig", 30

@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor, Supply
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor, Supply
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.own_code import asset_path
 from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
+from codrl_mj.user_code import asset_path
 from tests.engine.models import changed
 from tests.envs.faces import LIMIT, MOTOR, commanded, plain
 from tests.envs.vectors import assert_same
@@ -81,7 +81,7 @@ def test_a_current_is_the_force_that_it_makes(task, physics):
 @every_command
 def test_the_end_of_the_space_asks_for_no_more_than_the_limit(physics, command):
     """In float32 the limits 0.6 A and 0.7 V are a little more than they are."""
-    actuator = Actuator(Motor(arm_radius=0.3), CurrentLoop(max_voltage=0.7))
+    actuator = DCMotorActuator(Motor(arm_radius=0.3), CurrentLoop(max_voltage=0.7))
     env = make("pendulum", command, physics=physics, actuator=actuator)
     info = env.step(env.action_space.high)[-1]
     assert info["voltage"] <= 0.7
@@ -100,13 +100,13 @@ def test_the_end_of_the_space_asks_for_no_more_than_the_limit(physics, command):
         (
             "pendulum",
             "voltage",
-            Actuator(controller=CurrentLoop(max_voltage=24.0), supply=Supply(12.0)),
+            DCMotorActuator(controller=CurrentLoop(max_voltage=24.0), supply=Supply(12.0)),
             12.0,
         ),
         (
             "pendulum",
             "voltage",
-            Actuator(controller=CurrentLoop(max_voltage=math.inf), supply=Supply(12.0)),
+            DCMotorActuator(controller=CurrentLoop(max_voltage=math.inf), supply=Supply(12.0)),
             12.0,
         ),
     ],
@@ -197,7 +197,7 @@ def test_pendulum_under_voltages_is_mujocos_dcmotor():
     motor = Motor(
         resistance=r, inductance=equivalent, torque_constant=k, back_emf_constant=k, arm_radius=arm
     )
-    env = make("pendulum", "voltage", actuator=Actuator(motor, CurrentLoop(max_voltage=5.0)))
+    env = make("pendulum", "voltage", actuator=DCMotorActuator(motor, CurrentLoop(max_voltage=5.0)))
     env.physics.reset(np.array([2.5, 0.0]))
     data.qpos[:] = 2.5
     for voltage in np.repeat(np.random.default_rng(0).uniform(-5, 5, 20), 5):
@@ -237,7 +237,7 @@ def test_a_loop_that_would_be_unstable_does_not_hinder_voltages_and_an_unstable_
         make("pendulum", actuator=wild)
     make("pendulum", "voltage", actuator=wild)
     with pytest.raises(ValueError, match=r"unstable at a step of 0\.05 s"):  # |1 - R dt/L| = 2
-        make("pendulum", "voltage", actuator=Actuator(Motor(resistance=6.0)))
+        make("pendulum", "voltage", actuator=DCMotorActuator(Motor(resistance=6.0)))
 
 
 @pytest.mark.parametrize("task", CONTINUOUS)

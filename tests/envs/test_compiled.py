@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from codrl_mj import Uniform
-from codrl_mj.actuators import IDEAL, Actuator, actuator_over
+from codrl_mj.actuators import IDEAL, DCMotorActuator, actuator_over
 from codrl_mj.engine.families import signals_at
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.compiled import compiled_env
@@ -71,7 +71,7 @@ def _plain_step(env, task, state, force):
             data.qpos[:], data.qvel[:] = state[positions], state[velocities]
     if env.actuator == IDEAL:
         return state, force
-    return state, env.actuator.motor.torque_constant * data.act[signals_at(Actuator)] / arm
+    return state, env.actuator.motor.torque_constant * data.act[signals_at(DCMotorActuator)] / arm
 
 
 @every_rebuilt

@@ -10,17 +10,17 @@ import pytest
 
 from codrl_mj import Choice, Uniform
 from codrl_mj.actuators import (
-    Actuator,
+    DCMotorActuator,
     Drive,
     GearMotor,
     JointAdditions,
     Supply,
     field_paths,
     field_values,
-    unchecked,
+    from_array,
 )
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.validation.drives import Bench, Mechanics
+from codrl_mj.validation.motor_catalogue import Bench, Mechanics
 from tests.envs.faces import run
 from tests.envs.vectors import assert_equal_episodes, assert_same, batched, looped
 from tests.matrix import but
@@ -284,7 +284,7 @@ def test_where_a_current_is_commanded_a_rotor_is_drawn_and_what_would_change_its
         )
 
 
-@pytest.mark.parametrize("one", [ONE, Actuator()], ids=["drive", "current loop"])
+@pytest.mark.parametrize("one", [ONE, DCMotorActuator()], ids=["drive", "current loop"])
 def test_an_unchecked_actuator_follows_as_a_checked_one(one):
-    twin = unchecked(type(one), field_values(one))
+    twin = from_array(type(one), field_values(one))
     assert (twin.arm_radius, twin.additions) == (one.arm_radius, one.additions)

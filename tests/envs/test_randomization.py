@@ -9,7 +9,14 @@ import pytest
 import scipy.stats
 
 from codrl_mj import Choice, LogUniform, Uniform
-from codrl_mj.actuators import Actuator, CurrentLoop, Drive, GearMotor, Supply, spectral_radius
+from codrl_mj.actuators import (
+    CurrentLoop,
+    DCMotorActuator,
+    Drive,
+    GearMotor,
+    Supply,
+    spectral_radius,
+)
 from codrl_mj.actuators.stability import spectral_radii, stability_radii
 from codrl_mj.engine.families import HEAD
 from codrl_mj.envs import ActuatedEnv
@@ -308,7 +315,7 @@ def test_what_is_drawn_has_the_drawn_length():
 
 def _proportional():
     """A P loop, whose stability is a line of algebra, and ranges that straddle it at CartPole's step of 0.02 s."""
-    nominal = Actuator(controller=CurrentLoop(kp=1.0))
+    nominal = DCMotorActuator(controller=CurrentLoop(kp=1.0))
     return nominal, {"motor.inductance": Uniform(0.02, 0.2), "controller.kp": LogUniform(0.5, 30.0)}
 
 
@@ -370,7 +377,7 @@ def test_what_a_motors_fields_refuse_together_is_rejected_too():
 
 
 def test_a_winding_too_fast_for_its_supply_is_rejected():
-    nominal = Actuator(controller=CurrentLoop(kp=0.5))
+    nominal = DCMotorActuator(controller=CurrentLoop(kp=0.5))
     arguments = {"randomize": {"motor.inductance": Uniform(0.02, 0.2)}}
     for ohms, least in ((0.0, 0.02), (7.0, 0.08)):  # (R + 7) * 0.02 < 2 L
         env = batched(
@@ -430,24 +437,24 @@ def test_bounds_without_a_stable_loop_are_an_error_at_the_reset(make):
 
 
 def test_a_nominal_actuator_may_be_unstable_if_its_draws_are_not():
-    unstable = Actuator(controller=CurrentLoop(kp=100.0))
+    unstable = DCMotorActuator(controller=CurrentLoop(kp=100.0))
     env = ActuatedEnv("cartpole", unstable, randomize={"controller.kp": Uniform(1.0, 2.0)})
     env.reset(seed=0)
 
 
 def test_the_radius_of_one_is_that_among_many():
     generator = np.random.default_rng(0)
-    vectors = np.array([Actuator().numbers] * 300)
+    vectors = np.array([DCMotorActuator().numbers] * 300)
     vectors[:, 4:8] = generator.uniform(0.0, [20.0, 50.0, 0.05, 1.0], (300, 4))
     vectors[generator.random(300) < 0.3, 5] = 0.0
     vectors[generator.random(300) < 0.3, 6] = 0.0
     vectors[:, 10] = generator.integers(1, 4, 300)
-    radii = spectral_radii(Actuator, vectors, 0.05)
+    radii = spectral_radii(DCMotorActuator, vectors, 0.05)
     assert (radii < 1.0).any()
     assert (radii > 1.0).any()
     for size in (1, 2, 7, 100):
         parts = [
-            spectral_radii(Actuator, vectors[start : start + size], 0.05)
+            spectral_radii(DCMotorActuator, vectors[start : start + size], 0.05)
             for start in range(0, 300, size)
         ]
         np.testing.assert_array_equal(np.concatenate(parts), radii)
@@ -455,23 +462,27 @@ def test_the_radius_of_one_is_that_among_many():
 
 def test_the_quick_proof_of_stability_and_the_radius_agree():
     generator = np.random.default_rng(1)
-    vectors = np.array([Actuator().numbers] * 20000)
+    vectors = np.array([DCMotorActuator().numbers] * 20000)
     vectors[:, 0:2] = np.exp(generator.uniform(-3.0, 1.0, (20000, 2)))
     vectors[:, 4:7] = np.exp(generator.uniform(-9.0, 4.0, (20000, 3))) * (1.0, 1.0, 1e-3)
     vectors[generator.random(20000) < 0.3, 5] = 0.0
     vectors[generator.random(20000) < 0.3, 6] = 0.0
     vectors[:, 10] = generator.integers(1, 4, 20000)
     vectors[:, 11:13] = generator.choice([0.0, 1.0], (20000, 2)) * (10.0, 0.01)
-    radii, quick = spectral_radii(Actuator, vectors, 0.02), stability_radii(Actuator, vectors, 0.02)
+    radii, quick = (
+        spectral_radii(DCMotorActuator, vectors, 0.02),
+        stability_radii(DCMotorActuator, vectors, 0.02),
+    )
     np.testing.assert_array_equal(radii < 1.0, quick < 1.0)
     assert 0.02 < (radii >= 1.0).mean() < 0.9
     assert np.isin(quick, (0.0, np.inf)).mean() > 0.8  # it is what saves the time
     edge = np.array(
         [
-            Actuator(controller=CurrentLoop(kp=kp)).numbers
+            DCMotorActuator(controller=CurrentLoop(kp=kp)).numbers
             for kp in 9.0 + np.linspace(-1e-9, 1e-9, 401)
         ]
     )
     np.testing.assert_array_equal(
-        spectral_radii(Actuator, edge, 0.02) < 1.0, stability_radii(Actuator, edge, 0.02) < 1.0
+        spectral_radii(DCMotorActuator, edge, 0.02) < 1.0,
+        stability_radii(DCMotorActuator, edge, 0.02) < 1.0,
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from codrl_mj import Choice, LogUniform, Uniform
-from codrl_mj.actuators import Actuator, CurrentLoop, Drive, GearMotor, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Drive, GearMotor, Motor
 from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv, SerialVectorEnv
 from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS, named_actuator
@@ -17,9 +17,9 @@ from tests.envs.faces import commanded
 from tests.envs.vectors import MODES, assert_same, batched, random_actions
 
 INF, NAN = math.inf, math.nan
-STABLE = Actuator(Motor(), CurrentLoop(kp=1.0))
-UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0, max_voltage=INF))
-WILD = Actuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=INF))
+STABLE = DCMotorActuator(Motor(), CurrentLoop(kp=1.0))
+UNSTABLE = DCMotorActuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0, max_voltage=INF))
+WILD = DCMotorActuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=INF))
 GEARED = Drive(GearMotor(rotor_inertia=0.001, gear_ratio=20.0))
 WEAK, IDEAL = named_actuator("weak", "pendulum"), {"family": "ideal"}
 CURRENT = {"action": "current", "levels": (-1.0, 1.0)}
@@ -99,7 +99,10 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
         ({"actuator": UNSTABLE}, "unstable at a step of 0.02 s: spectral radius 19.2, must be < 1"),
         ({"actuator": UNSTABLE, "inner_steps": 10}, "unstable at a step of 0.002 s"),
         # |1 - R dt / L| = 2
-        ({**VOLTAGE, "actuator": Actuator(Motor(resistance=15.0))}, "unstable at a step of 0.02 s"),
+        (
+            {**VOLTAGE, "actuator": DCMotorActuator(Motor(resistance=15.0))},
+            "unstable at a step of 0.02 s",
+        ),
         ({"actuator": {"supply": {"resistance": 9.0}}}, "supply.resistance = 9: must be < "),
         ({"physics": "analytic", "joint": {"damping": 0.1}}, "use physics='mujoco'"),
         ({"physics": "analytic", "joint": {"friction": 0.1}}, "no place for it"),

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor, spectral_radius
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor, spectral_radius
 from codrl_mj.engine import CallbackInUseError
 from codrl_mj.envs import ActuatedEnv, ActuatedVectorEnv
 from codrl_mj.physics import PHYSICS, SimulationDivergedError
@@ -20,7 +20,7 @@ from tests.matrix import but
 from tests.tasks.faces import REBUILT
 
 every_task = pytest.mark.parametrize("task", TASKS)
-WILD = Actuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=float("inf")))
+WILD = DCMotorActuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=float("inf")))
 pytestmark = pytest.mark.filterwarnings(
     "ignore:overflow encountered", "ignore:invalid value encountered"
 )
@@ -46,7 +46,7 @@ def _constant_action(env):
 def test_a_diverging_simulation_raises_with_task_and_entry_and_is_not_reset(task, physics, command):
     actuator, options = WILD, {"inner_steps": 1}
     if command == "voltage":  # a winding too fast for the step: |1 - R dt/L| = 1e4 dt - 1
-        actuator = Actuator(Motor(inductance=1e-4), CurrentLoop(max_voltage=10.0))
+        actuator = DCMotorActuator(Motor(inductance=1e-4), CurrentLoop(max_voltage=10.0))
         options |= {"action": "voltage"} | (
             {"levels": (-1, 0, 1)} if hasattr(TASKS[task].action_space, "n") else {}
         )
@@ -183,7 +183,7 @@ _loops = st.builds(
 )
 def test_both_physics_agree_on_any_actuator_from_any_start(task, motor, loop, seed, command):
     """Fifty steps under random actions: states relative to their size within 1e-9, chaotic Acrobot's within 1e-6."""
-    actuator, definition = Actuator(motor, loop), TASKS[task]
+    actuator, definition = DCMotorActuator(motor, loop), TASKS[task]
     options = {"actuator": actuator, "action": command}
     if command == "voltage":
         assume(np.isfinite(loop.max_voltage))

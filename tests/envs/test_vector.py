@@ -8,7 +8,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from codrl_mj import LogUniform, Uniform, make_sb3_vec_env
-from codrl_mj.actuators import Actuator, CurrentLoop
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator
 from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.tasks import TASKS
@@ -60,7 +60,7 @@ def test_episodes_are_those_of_single_environments(task, mode, setup):
 
 CURRENT = {"action": "current", "levels": (-1.5, 1.5)}
 DAMPED = {**DRIVE, **scales("cartpole"), "model.damping.slider": Uniform(0.0, 0.3)}
-SPREAD = [Actuator(controller=CurrentLoop(kp=kp, substeps=2)) for kp in (0.5, 1.0, 2.0, 3.0)]
+SPREAD = [DCMotorActuator(controller=CurrentLoop(kp=kp, substeps=2)) for kp in (0.5, 1.0, 2.0, 3.0)]
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ import pytest
 import codrl_mj
 from codrl_mj import EnvConfig
 from codrl_mj.__main__ import main
-from codrl_mj.envs.worlds import World, find_world, world_of
+from codrl_mj.envs.worlds import EnvSource, find_world, world_of
 from codrl_mj.training import TrainConfig
-from codrl_mj.view.session import Session
+from codrl_mj.viz.view.session import Session
 from tests.envs.rig import RIG, RigEnv
 
 NAME, MOTOR = "tests.envs.rig:RIG", "maxon-re65"
@@ -46,7 +46,7 @@ def test_a_configuration_of_it_survives_json_and_makes_environments():
     assert TrainConfig.preset(NAME, "sac", actuator="lag").env.through == "lag"
 
 
-class Nameless(World):
+class Nameless(EnvSource):
     def make(self, *_, **__):
         return 3
 
@@ -59,7 +59,10 @@ class Nameless(World):
             "integrator = 'rk4': rig has none: leave it out",
         ),
         (lambda: EnvConfig("tests.envs.rig:rk4_of_nobody"), "rk4_of_nobody"),
-        (lambda: EnvConfig("tests.envs.rig:XML"), "must be a codrl_mj.Task or a codrl_mj.World"),
+        (
+            lambda: EnvConfig("tests.envs.rig:XML"),
+            "must be a codrl_mj.Task or a codrl_mj.EnvSource",
+        ),
         (lambda: EnvConfig("tests.envs.rig:Rig"), r"^Rig: must be an instance of it: Rig\(...\)"),
         (
             lambda: world_of(Nameless()),

@@ -23,7 +23,7 @@ def swung(drive, volts, name="swing"):
         <actuator><motor name="motor" joint="hinge" ctrlrange="-999 999"/></actuator></mujoco>"""
     )
     command = drive.commands()["voltage"]
-    model = codrl_mj.motorise(spec, {"motor": command.actuator}).compile()
+    model = codrl_mj.add_motors(spec, {"motor": command.actuator}).compile()
     data, position = mujoco.MjData(model), np.empty(len(volts))
     for row, volt in enumerate(volts):
         position[row] = data.qpos[0]

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import IDEAL, Actuator
-from codrl_mj.physics import PHYSICS, AnalyticPhysics, Plant, SimulationDivergedError
+from codrl_mj.actuators import IDEAL, DCMotorActuator
+from codrl_mj.physics import PHYSICS, AnalyticPhysics, SimulationConfig, SimulationDivergedError
 from codrl_mj.tasks import TASKS
 
 every_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
@@ -17,7 +17,7 @@ FIELDS = {"body_mass": np.ones((1, 2)), "body_ipos": np.zeros((1, 2, 3))}
 def test_steps_are_the_papers_inner_loop_with_a_motor_and_gymnasiums_without_unless_they_are_given(
     task,
 ):
-    assert task.steps_within(Actuator(), None, None) == task.motor_inner_steps
+    assert task.steps_within(DCMotorActuator(), None, None) == task.motor_inner_steps
     assert task.steps_within(IDEAL, None, None) == (10 if task.name == "furuta" else 1)
     for count in (1, 2, 3, 7, 10, 1000):
         assert task.steps_within(IDEAL, None, task.step_duration / count) == count
@@ -49,7 +49,7 @@ def test_the_default_integrator_is_the_first_and_others_are_refused_with_the_cho
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1.1e10, -1e39])
 @every_task
 def test_divergence_names_every_broken_entry_and_the_time(task, bad):
-    physics = AnalyticPhysics(Plant(task, [IDEAL]))
+    physics = AnalyticPhysics(SimulationConfig(task, [IDEAL]))
     physics.time = 1.25
     physics.check_finite()
     for index, name in enumerate(task.state_names):
@@ -67,7 +67,7 @@ def test_a_physics_without_a_model_refuses_its_fields_by_its_own_name(monkeypatc
     class Mine(AnalyticPhysics):
         """Of nobody else."""
 
-    plant = Plant(TASKS["pendulum"], [IDEAL])
+    plant = SimulationConfig(TASKS["pendulum"], [IDEAL])
     said = (
         "fields = body_mass, body_ipos: they are a MuJoCo model's, which {!r} has not; use 'mujoco'"
     )

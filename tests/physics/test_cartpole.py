@@ -7,9 +7,9 @@ import pytest
 
 from codrl_mj.actuators import IDEAL
 from codrl_mj.engine import motors
-from codrl_mj.own_code import asset_path
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationConfig
 from codrl_mj.tasks import TASKS, named_actuator
+from codrl_mj.user_code import asset_path
 
 TASK = TASKS["cartpole"]
 every_physics = pytest.mark.parametrize("physics", [MujocoPhysics, AnalyticPhysics])
@@ -33,7 +33,7 @@ def _gymnasiums_step(integrator, timestep):
 @every_integrator
 @pytest.mark.parametrize("inner_steps", [1, 5])
 def test_steps_are_gymnasiums_of_a_fraction_of_the_time(physics, integrator, inner_steps):
-    simulation = physics(Plant(TASK, [IDEAL], inner_steps, integrator))
+    simulation = physics(SimulationConfig(TASK, [IDEAL], inner_steps, integrator))
     step = _gymnasiums_step(integrator, 0.02 / inner_steps)
     generator = np.random.default_rng(0)
     high = np.array([2.4, 5.0, np.pi, 10.0])

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from codrl_mj import engine
 from codrl_mj.actuators import (
     IDEAL,
-    Actuator,
     CurrentLoop,
+    DCMotorActuator,
     JointAdditions,
     Lag,
     Motor,
@@ -21,14 +21,14 @@ from codrl_mj.actuators import (
 from codrl_mj.disturbances import Joint
 from codrl_mj.engine import motors
 from codrl_mj.engine.families import HEAD, slot_size, user_head
-from codrl_mj.own_code import asset_path
-from codrl_mj.physics import MujocoPhysics, Plant
+from codrl_mj.physics import MujocoPhysics, SimulationConfig
 from codrl_mj.physics.mjcf import drive, task_model
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.tasks import TASKS
+from codrl_mj.user_code import asset_path
 from tests.actuators.strategies import of_every_family
 
-SIZE = slot_size(Actuator)
+SIZE = slot_size(DCMotorActuator)
 XML = """
 <mujoco>
   <compiler autolimits="false"/>
@@ -40,7 +40,7 @@ XML = """
 
 def _spec(actuator=None, max_force=None):
     spec = mujoco.MjSpec.from_string(XML)
-    drive(spec.actuator("drive"), actuator or Actuator(), max_force)
+    drive(spec.actuator("drive"), actuator or DCMotorActuator(), max_force)
     return spec
 
 
@@ -79,9 +79,13 @@ def test_a_motor_s_arm_and_limits_are_its_own_behind_an_actuator_of_several_outp
         dataclasses.replace(TASKS["pendulum"], asset=str(asset)),
         (Motor(arm_radius=0.2), Motor()),
     )
-    compiled, exchanged = (MujocoPhysics(Plant(task, [Actuator(motor)])) for motor in (long, short))
-    exchanged.set_actuators([Actuator(long)])
-    batch = MujocoBatchPhysics(Plant(task, [Actuator(short)]), [[Actuator(long)]])
+    compiled, exchanged = (
+        MujocoPhysics(SimulationConfig(task, [DCMotorActuator(motor)])) for motor in (long, short)
+    )
+    exchanged.set_actuators([DCMotorActuator(long)])
+    batch = MujocoBatchPhysics(
+        SimulationConfig(task, [DCMotorActuator(short)]), [[DCMotorActuator(long)]]
+    )
     assert compiled.model.nout > compiled.model.nactuator
     for field in ("actuator_gear", "actuator_ctrlrange", "actuator_user"):
         np.testing.assert_array_equal(
@@ -91,7 +95,7 @@ def test_a_motor_s_arm_and_limits_are_its_own_behind_an_actuator_of_several_outp
 
 
 def test_the_ideal_actuator_is_a_plain_motor_of_gear_one_whatever_was_there_before():
-    spec = _spec(Actuator(Motor(arm_radius=0.2)), 3.0)
+    spec = _spec(DCMotorActuator(Motor(arm_radius=0.2)), 3.0)
     drive(spec.actuator("drive"), IDEAL, None)
     model, plain = spec.compile(), mujoco.MjModel.from_xml_string(XML)
     assert (
@@ -120,7 +124,7 @@ def test_motors_are_found_by_their_index_in_order():
             name=f"extra{index}", trntype=mujoco.mjtTrn.mjTRN_JOINT, target="hinge"
         )
         if index != 1:
-            drive(driver, Actuator(controller=CurrentLoop(kp=float(index + 2))), None)
+            drive(driver, DCMotorActuator(controller=CurrentLoop(kp=float(index + 2))), None)
     found = motors(spec.compile())
     assert {index: actuator.controller.kp for index, actuator in found.items()} == {
         0: 1.0,
@@ -157,7 +161,7 @@ def test_a_motor_that_would_not_run_as_described_is_refused_by_name(
     spec.actuator("drive").name = name
     model = spec.compile()
     assert len(motors(model)) == 1
-    numbers = parameters_type(Actuator)._fields
+    numbers = parameters_type(DCMotorActuator)._fields
     if field in numbers:
         model.actuator_user[0, HEAD + numbers.index(field)] = value
     elif field == "family":
@@ -169,7 +173,7 @@ def test_a_motor_that_would_not_run_as_described_is_refused_by_name(
 
 
 def test_user_data_too_short_for_a_motor_is_refused():
-    user = " ".join(map(repr, [*user_head(Actuator), 1]))
+    user = " ".join(map(repr, [*user_head(DCMotorActuator), 1]))
     short = XML.replace(
         '<motor name="drive" joint="hinge"/>',
         f'<general name="drive" joint="hinge" dyntype="user" actdim="{SIZE}" gainprm="0"'
@@ -193,7 +197,7 @@ class _Heavy(Lag):
 @pytest.mark.parametrize("task", TASKS)
 def test_what_actuator_and_environment_add_to_the_joint_is_summed_there_alone(task):
     plain, added = (
-        task_model(Plant(TASKS[task], (actuator,), joint=joint))
+        task_model(SimulationConfig(TASKS[task], (actuator,), joint=joint))
         for actuator, joint in (
             (Lag(), Joint()),
             (_Heavy(), Joint(damping=0.5, friction=0.25, armature=0.125)),

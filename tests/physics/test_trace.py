@@ -6,8 +6,8 @@ Against the reference motor, row by row, it is in `tests/envs/test_wiring.py`.
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import IDEAL, Actuator, CurrentLoop, Motor, Supply
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant
+from codrl_mj.actuators import IDEAL, CurrentLoop, DCMotorActuator, Motor, Supply
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationConfig
 from codrl_mj.tasks import TASKS
 
 DESIRED, ACTUAL, CURRENT, REFERENCE, VOLTAGE, SATURATED, SPEED = range(7)
@@ -18,7 +18,7 @@ every_kind = pytest.mark.parametrize("kind", [MujocoPhysics, AnalyticPhysics])
 def _rows(kind, actuator):
     """The traces of twenty steps under random forces, one below the other, and the forces."""
     physics, forces, rows = (
-        kind(Plant(TASK, [actuator], 3, "euler")),
+        kind(SimulationConfig(TASK, [actuator], 3, "euler")),
         np.random.default_rng(0).uniform(-10, 10, 20),
         [],
     )
@@ -42,7 +42,7 @@ def test_the_integration_steps_are_marked_in_which_the_voltage_is_at_its_sagging
     limit, supply_resistance = 2.0, 0.8
     loop = CurrentLoop(kp=2.0, max_voltage=limit)
     rows, _ = _rows(
-        kind, Actuator(Motor(arm_radius=0.15), loop, Supply(resistance=supply_resistance))
+        kind, DCMotorActuator(Motor(arm_radius=0.15), loop, Supply(resistance=supply_resistance))
     )
     before = np.append(
         0.0, rows[:-1, CURRENT]

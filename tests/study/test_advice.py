@@ -11,9 +11,9 @@ from scipy import stats
 
 from codrl_mj import cli
 from codrl_mj.actuators import IDEAL as IDEAL_ACTUATOR
-from codrl_mj.actuators import Actuator, CurrentLoop, Lag, Motor, Supply
-from codrl_mj.drives import find_drive, torque_limits
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Lag, Motor, Supply
 from codrl_mj.runs.files import write_json
+from codrl_mj.sizing import find_drive, torque_limits
 from codrl_mj.study.advice import (
     BUY,
     COMMAND,
@@ -100,7 +100,7 @@ def test_what_creeps_to_its_end_counts_as_missing():
     """A PI loop that is at kp/(kp + R) with (L/R)/(1 + kp/R), and at the rest with (1 + kp)/ki."""
     step, dt = find_task("pendulum").step_duration, timestep("pendulum")
     loop = CurrentLoop(kp=1.0, ki=2.0 / (1000 * step), max_voltage=1e3)
-    found = delivered(Actuator(Motor(1.0, 10 * dt, 1.0, 1.0), loop), "pendulum")
+    found = delivered(DCMotorActuator(Motor(1.0, 10 * dt, 1.0, 1.0), loop), "pendulum")
     assert found.at_rest == pytest.approx(1.0 - 0.5 * math.exp(-0.02), abs=2e-3)
     # of what is there in the 20th step: the quick half, by a fifth in each of ten integration
     # steps, and what creeps
@@ -403,7 +403,7 @@ def test_a_ringing_loop_is_late(evidence):
     """Poles of 0.9 rad a step with a damping ratio of 0.1: an overshoot of exp(-pi*0.1/sqrt(0.99)) = 73 %."""
     speed = 0.9 / find_task("pendulum").step_duration
     loop = CurrentLoop(kp=0.0, ki=speed**2, max_voltage=1e6, substeps=100)
-    found = advise(Actuator(Motor(0.2 * speed, 1.0, 1.0, 1.0), loop), "pendulum", evidence)
+    found = advise(DCMotorActuator(Motor(0.2 * speed, 1.0, 1.0, 1.0), loop), "pendulum", evidence)
     assert found.found.lag > 1.0
     assert found.verdict != IDEAL
 

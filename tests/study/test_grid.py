@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.agents import PPOConfig
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
@@ -29,7 +29,7 @@ from codrl_mj.training import TrainConfig, finished, load_config
 PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=1, hidden=(8,))
 ENV = EnvConfig("cartpole", "weaker")
 TINY = TrainConfig(ENV, PPO, 0, 512, num_envs=2, evaluation_episodes=2, checkpoint_interval=256)
-UNSTABLE = EnvConfig("cartpole", Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0)))
+UNSTABLE = EnvConfig("cartpole", DCMotorActuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0)))
 IDEAL = EnvConfig("cartpole", "ideal")
 CELLS = {f"seed {seed}": dataclasses.replace(TINY, seed=seed) for seed in range(3)}
 ONE = Workers(jobs=1)

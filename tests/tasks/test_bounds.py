@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import IDEAL
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationConfig
 from codrl_mj.physics.compiled_task import compiled_constrain
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import NEW, WITH_HILL, random_states
@@ -16,7 +16,10 @@ from tests.tasks.faces import NEW, WITH_HILL, random_states
 def test_a_step_from_states_beyond_every_bound_is_gymnasiums(task):
     definition = TASKS[task]
     arguments = definition, [IDEAL], 1, definition.integrators[0]
-    pair = MujocoPhysics(Plant(*arguments)), AnalyticPhysics(Plant(*arguments))
+    pair = (
+        MujocoPhysics(SimulationConfig(*arguments)),
+        AnalyticPhysics(SimulationConfig(*arguments)),
+    )
     forces = np.random.default_rng(1).uniform(-1, 1, 1000) * definition.max_force
     for state, force in zip(random_states(task, 0, 1000), forces, strict=True):
         for physics in pair:
@@ -37,7 +40,7 @@ def test_a_step_from_states_beyond_every_bound_is_gymnasiums(task):
 def test_walls(task, inner_steps, state, wall, stops):
     definition = TASKS[task]
     one = dataclasses.replace(definition, step_duration=definition.step_duration / inner_steps)
-    physics = MujocoPhysics(Plant(one, [IDEAL], 1, "semi-implicit"))
+    physics = MujocoPhysics(SimulationConfig(one, [IDEAL], 1, "semi-implicit"))
     physics.reset(np.array(state))
     for _ in range(inner_steps):
         physics.step(np.sign(state[1]) * definition.max_force)

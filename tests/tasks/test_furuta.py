@@ -16,12 +16,12 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from codrl_mj import Uniform, make_sb3_vec_env
 from codrl_mj.actuators import IDEAL, NAMED, Drive
 from codrl_mj.catalogue import motor_entry
-from codrl_mj.drives.scripted import Scripted, state_observed
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes, summarize
-from codrl_mj.physics import MujocoPhysics, Plant
+from codrl_mj.physics import MujocoPhysics, SimulationConfig
+from codrl_mj.sizing.scripted import Scripted, state_observed
 from codrl_mj.tasks import TASKS, resolve_actuators
-from codrl_mj.tasks.furuta import MAX_TORQUE, Twin
+from codrl_mj.tasks.furuta import MAX_TORQUE, ReferenceEnv
 from tests.envs.vectors import MODES, assert_equal_episodes, batched, looped
 from tests.matrix import but
 
@@ -96,7 +96,7 @@ def off(found, expected):
 
 @every_actuator
 def test_the_engines_accelerations_are_lagranges(actuator):
-    physics = MujocoPhysics(Plant(TASK, resolve_actuators(actuator, TASK), 10, "rk4"))
+    physics = MujocoPhysics(SimulationConfig(TASK, resolve_actuators(actuator, TASK), 10, "rk4"))
     model, data = physics.model, mujoco.MjData(physics.model)
     hub = NUMBERS["hub"] + (ROTOR if actuator == "default" else 0.0)
     generator = np.random.default_rng(1)
@@ -110,7 +110,7 @@ def test_the_engines_accelerations_are_lagranges(actuator):
 
 
 def test_the_closed_form_is_lagranges():
-    twin = Twin()
+    twin = ReferenceEnv()
     for state in states(300, seed=2):
         assert off(twin.derivative(state, 0.05)[2:], accelerations(state, 0.05)) < 1e-11
 
@@ -137,7 +137,9 @@ def test_a_number_that_is_set_is_lagranges(name, value):
 
 def test_energy_is_kept_over_an_episode_without_damping():
     """As `docs/environments/furuta.md` says: 1e-7 of what lifts the rod, 1 % with one integration step a step."""
-    physics = {count: MujocoPhysics(Plant(TASK, [IDEAL], count, "rk4")) for count in (10, 1)}
+    physics = {
+        count: MujocoPhysics(SimulationConfig(TASK, [IDEAL], count, "rk4")) for count in (10, 1)
+    }
     lost = {}
     for count, each in physics.items():
         each.model.dof_damping[:] = 0.0

@@ -8,7 +8,7 @@ from codrl_mj import engine
 from codrl_mj.actuators import IDEAL
 from codrl_mj.engine import CallbackInUseError
 from codrl_mj.engine.families import SIGNATURE
-from codrl_mj.physics import MujocoPhysics, Plant, hills, install_callbacks
+from codrl_mj.physics import MujocoPhysics, SimulationConfig, hills, install_callbacks
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import WITH_HILL, ours
 
@@ -167,7 +167,7 @@ def test_somebody_elses_callback_is_not_replaced(bare_engine):
 def test_the_car_follows_the_hill(task, x, after):
     """What our renders draw, and what any viewer draws after the engine's own functions."""
     definition = TASKS[task]
-    physics = MujocoPhysics(Plant(definition, [IDEAL], 1, "semi-implicit"))
+    physics = MujocoPhysics(SimulationConfig(definition, [IDEAL], 1, "semi-implicit"))
     physics.reset(np.array([x, 0.0]))
     if after == "render":
         physics.show(np.array([x, 0.0]))
@@ -184,7 +184,7 @@ def test_the_car_follows_the_hill(task, x, after):
 
 @pytest.mark.parametrize("task", WITH_HILL)
 def test_the_drawn_hill_is_the_one_the_car_follows(task):
-    model = MujocoPhysics(Plant(TASKS[task], [IDEAL], 1, "semi-implicit")).model
+    model = MujocoPhysics(SimulationConfig(TASKS[task], [IDEAL], 1, "semi-implicit")).model
     (joint,) = hills(model)
     np.testing.assert_array_equal(model.jnt_user[joint], [*SIGNATURE, 0.0025, WAVENUMBER, HEIGHT])
     height = model.geom("hill").pos[2] + model.hfield_size[0][2] * model.hfield_data.reshape(2, -1)

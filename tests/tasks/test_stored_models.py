@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.own_code import asset_path
 from codrl_mj.physics import motors
 from codrl_mj.tasks import TASKS
+from codrl_mj.user_code import asset_path
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.agents import AGENTS, DDPGConfig, PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, PRESETS
 from codrl_mj.disturbances import Disturbances
@@ -17,7 +17,7 @@ from codrl_mj.training import TrainConfig, load_config, read_config
 
 ENV = EnvConfig("cartpole", "weaker")
 TINY = TrainConfig(ENV, PPOConfig(hidden=(8, 8)), 1, 1000, num_envs=4)
-OWN = Actuator(
+OWN = DCMotorActuator(
     Motor(inductance=0.07, arm_radius=0.3), CurrentLoop(kp=0.9, max_voltage=math.inf, substeps=3)
 )
 

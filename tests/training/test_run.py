@@ -15,7 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
-from codrl_mj.actuators import Actuator, CurrentLoop, Motor
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.agents import PPOConfig
 from codrl_mj.agents.fast_ppo import FastPPO
 from codrl_mj.agents.sarsa_algorithm import CompiledEpisodes
@@ -31,7 +31,7 @@ from tests.training.interruptions import begin
 TINY_PPO = PPOConfig(rollout_steps=256, batch_size=64, epochs=2, hidden=(8, 8))
 ENV = EnvConfig("cartpole", "weaker", options={"center_radius": 0.1})
 TINY = TrainConfig(ENV, TINY_PPO, 1, 500, num_envs=4, evaluation_episodes=5)
-UNSTABLE = Actuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0))
+UNSTABLE = DCMotorActuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0))
 
 
 def within(**changes):

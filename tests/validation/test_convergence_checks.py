@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import IDEAL
-from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, Plant
+from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationConfig
 from codrl_mj.tasks import TASKS
 from codrl_mj.validation import convergence
 from codrl_mj.validation.compare import gymnasium_equations
@@ -127,7 +127,7 @@ def test_acrobots_equations_are_the_limit_of_its_steps():
     task = TASKS["acrobot"]
     equations, state = gymnasium_equations(task), np.array([0.3, -0.7, 0.9, -1.1])
     physics = AnalyticPhysics(
-        Plant(dataclasses.replace(task, step_duration=1e-4), [IDEAL], 1, "rk4")
+        SimulationConfig(dataclasses.replace(task, step_duration=1e-4), [IDEAL], 1, "rk4")
     )
     physics.reset(state)
     physics.step(1.0)
@@ -147,7 +147,7 @@ def test_the_runs_stay_away_from_every_bound(task, motor):
     unbounded = dataclasses.replace(
         definition, step_duration=definition.step_duration / 128, constrain=None
     )
-    physics = MujocoPhysics(Plant(unbounded, actuators, 1, definition.integrators[0]))
+    physics = MujocoPhysics(SimulationConfig(unbounded, actuators, 1, definition.integrators[0]))
     physics.reset(start)
     for force in forces:
         for _ in range(128):

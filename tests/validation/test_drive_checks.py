@@ -8,7 +8,7 @@ import pytest
 
 from codrl_mj.actuators import Drive, GearMotor
 from codrl_mj.tasks import OURS, TASKS
-from codrl_mj.validation.drives import FITTED, Bench, Mechanics, drive_checks, fitted
+from codrl_mj.validation.motor_catalogue import FITTED, Bench, Mechanics, drive_checks, fitted
 
 ROTOR = GearMotor(
     rotor_inertia=0.02, viscous_friction=0.3, coulomb_friction=0.4, gear_ratio=2.0, arm_radius=0.8

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy import integrate, signal
 
-from codrl_mj.actuators import FAMILIES, Actuator, CurrentLoop, Motor, Supply
-from codrl_mj.validation import drives, motor, own_model, rotors
+from codrl_mj.actuators import FAMILIES, CurrentLoop, DCMotorActuator, Motor, Supply
+from codrl_mj.validation import motor, motor_catalogue, own_model, rotors
 from codrl_mj.validation.motor_loops import closed_form, closed_loop, sampled_system
 from codrl_mj.validation.rotors import EVERY_FEATURE, Loop, standard_loops
 from codrl_mj.validation.table import Skipped
@@ -36,7 +36,7 @@ NATIVE = {MAP, SUB, FAST}
 COMPILED = {
     f"compiled advance: {kind}"
     for kind in (
-        "Actuator",
+        "DCMotorActuator",
         "VoltageDriven",
         "Drive",
         "VoltageDrive",
@@ -63,7 +63,7 @@ MADE = (  # names -> their checks, with a few loops and motors only
     (COMPILED, lambda: own_model.compiled_checks(quick=True)),
     ({RK4}, lambda: motor.rk4_check(quick=True)),
     ({GEM}, lambda: motor.gem_check(Motor(), quick=True)),
-    (DRIVES, lambda: drives.drive_checks(quick=True)),
+    (DRIVES, lambda: motor_catalogue.drive_checks(quick=True)),
 )
 
 
@@ -164,7 +164,7 @@ def test_a_task_has_its_own_loop_checked(monkeypatch):
 
 
 def test_a_motor_that_never_saturates_and_one_without_back_emf_have_their_own_checks():
-    quiet = Actuator(Motor(back_emf_constant=0.0), CurrentLoop(max_voltage=math.inf))
+    quiet = DCMotorActuator(Motor(back_emf_constant=0.0), CurrentLoop(max_voltage=math.inf))
     names = {
         check.name: check for check in motor.checks_of({"mine": Loop(quiet, 0.01)}, quick=True)
     }
@@ -174,7 +174,7 @@ def test_a_motor_that_never_saturates_and_one_without_back_emf_have_their_own_ch
 
 @pytest.mark.parametrize("supply", [Supply(12.0), Supply(24.0, 0.5), Supply(np.inf, 0.5), None])
 def test_a_motor_behind_a_supply_is_held_to_the_torque_that_this_leaves(supply):
-    actuator = Actuator(controller=CurrentLoop(kp=2.0, ki=5.0), supply=supply)
+    actuator = DCMotorActuator(controller=CurrentLoop(kp=2.0, ki=5.0), supply=supply)
     checks = {
         check.name: check for check in motor.checks_of({"mine": Loop(actuator, 0.01)}, quick=True)
     }
@@ -182,7 +182,7 @@ def test_a_motor_behind_a_supply_is_held_to_the_torque_that_this_leaves(supply):
 
 
 def test_a_stiff_motor_passes_at_its_own_substeps():
-    stiff = Actuator(
+    stiff = DCMotorActuator(
         Motor(
             resistance=0.5,
             inductance=2e-4,
@@ -204,8 +204,8 @@ def test_the_sampled_oracles_are_the_papers_equations(name):
     """State space, blocks and the equations in plain Python are one system."""
     actuator, timestep = standard_loops()[name]
     m, c = actuator.motor, dataclasses.replace(actuator.controller, substeps=1)
-    actuator = Actuator(m, c)
-    step = of_actuator(Actuator(dataclasses.replace(m, arm_radius=1.0), c))
+    actuator = DCMotorActuator(m, c)
+    step = of_actuator(DCMotorActuator(dataclasses.replace(m, arm_radius=1.0), c))
     state, currents = (0.0, 0.0, 0.0), []
     for _ in range(50):
         *state, _, _ = step(timestep, *state, m.torque_constant, 0.0)
@@ -218,7 +218,7 @@ def test_the_sampled_oracles_are_the_papers_equations(name):
 
 def test_the_closed_form_solves_the_circuits_equations():
     """Against scipy's integrator, on the loop without a derivative."""
-    actuator = Actuator(
+    actuator = DCMotorActuator(
         Motor(inductance=0.05, back_emf_constant=0.7),
         CurrentLoop(kp=2, ki=5, bemf_compensation=False),
     )
@@ -242,7 +242,7 @@ def test_the_closed_form_solves_the_circuits_equations():
 
 def test_the_oracles_use_none_of_our_mathematics():
     """Only the parameters' names are taken from the motor: not one of its functions."""
-    classes = {"Motor", "CurrentLoop", "Actuator"}
+    classes = {"Motor", "CurrentLoop", "DCMotorActuator"}
     for path in Path(motor.__file__).parent.glob("motor*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and node.module.startswith("codrl_mj.actuators"):

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import codrl_mj
-from codrl_mj.actuators import Actuator, CurrentLoop
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator
 from codrl_mj.validation import validate, validate_model
 from codrl_mj.validation.mutations import wrong_model
 from codrl_mj.validation.table import REPORT
-from tests.motorised.models import arm
+from tests.add_motors.models import arm
 
 XML = """
 <mujoco>
@@ -149,8 +149,10 @@ def test_a_fault_of_ours_is_still_found_in_somebodys_task_and_said_to_be_ours(tm
 
 
 def test_an_unstable_motor_is_its_owners():
-    unstable = Actuator(controller=CurrentLoop(kp=200.0))
-    model = codrl_mj.motorise(arm("implicitfast"), {".*": unstable}, allow_unstable=True).compile()
+    unstable = DCMotorActuator(controller=CurrentLoop(kp=200.0))
+    model = codrl_mj.add_motors(
+        arm("implicitfast"), {".*": unstable}, allow_unstable=True
+    ).compile()
     found = validate_model(model, quick=True).checks
     failed = [one.fault for one in found if one.name.startswith("stable: ")]
     assert (

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from codrl_mj.actuators import IDEAL, Actuator
+from codrl_mj.actuators import IDEAL, DCMotorActuator
 from codrl_mj.evaluation import evaluate
 from codrl_mj.evaluation.episodes import Episode
 from codrl_mj.physics import trace_names
@@ -368,7 +368,10 @@ def made_up(arm, steps=30, inner_steps=3):
         action=np.zeros(steps),
         reward=np.zeros(steps),
         first_speeds=np.zeros(1),
-        trace={name: random.uniform(-1, 1, steps * inner_steps) for name in trace_names(Actuator)},
+        trace={
+            name: random.uniform(-1, 1, steps * inner_steps)
+            for name in trace_names(DCMotorActuator)
+        },
         signals={"desired_force": random.uniform(-1, 1, steps)},
         terminated=True,
         actuator=arm.actuator,

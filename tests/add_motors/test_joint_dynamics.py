@@ -1,0 +1,234 @@
+"""What a model has of a motor already: damping, armature and friction, named, added up or taken out."""
+
+import math
+import warnings
+
+import mujoco
+import numpy as np
+import pytest
+
+import codrl_mj
+from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply, TorqueSpeed
+from codrl_mj.engine import specs
+from codrl_mj.engine.specs import MotorWarning
+from codrl_mj.validation import validate_model
+
+_ARM = """
+<mujoco model="arm">
+  <option gravity="0 0 0"/>
+  <default><joint {}/></default>
+  <worldbody>
+    <body><joint name="shoulder" axis="0 0 1"/>
+      <geom type="capsule" fromto="0 0 0 .1 0 0" size=".02" mass=".1"/></body>
+  </worldbody>
+  <actuator><velocity name="shoulder" joint="shoulder" kv="50" gear="{}"/></actuator>
+</mujoco>
+"""
+OWN = 'damping="0.55" armature="0.03" frictionloss="0.05"'
+RATIO, VOLTS, OHMS, CONSTANT = 100.0, 12.0, 2.0, 0.02
+MOTOR = Drive(
+    GearMotor(
+        resistance=OHMS,
+        torque_constant=CONSTANT,
+        back_emf_constant=CONSTANT,
+        rotor_inertia=1e-6,
+        gear_ratio=RATIO,
+    ),
+    SampledLoop(10e3, max_current=math.inf),
+    Supply(VOLTS),
+)
+STALL, FREE = RATIO * CONSTANT * VOLTS / OHMS, VOLTS / (CONSTANT * RATIO)
+
+
+@pytest.fixture(autouse=True)
+def _nothing_warned(monkeypatch):
+    monkeypatch.setattr(specs, "_WARNED", set())
+
+
+def _arm(own=OWN, gear=1.0):
+    return mujoco.MjSpec.from_string(_ARM.format(own, gear))
+
+
+def _top_speed(model):
+    data = mujoco.MjData(model)
+    data.ctrl[0] = 100.0
+    for _ in range(4000):
+        mujoco.mj_step(model, data)
+    return data.qvel[0]
+
+
+@pytest.mark.parametrize("saved", [False, True])
+def test_kept_losses_brake_a_joint_and_replaced_ones_do_not(saved):
+    """Full voltage without a load: (stall - friction)/(stall/free + damping), and the motor's own no-load speed."""
+    found = {}
+    for how in ("keep", "replace"):
+        spec = codrl_mj.add_motors(_arm(), {"shoulder": MOTOR}, joint_dynamics=how)
+        found[how] = mujoco.MjModel.from_xml_string(spec.to_xml()) if saved else spec.compile()
+    assert _top_speed(found["keep"]) == pytest.approx(
+        (STALL - 0.05) / (STALL / FREE + 0.55), rel=1e-3
+    )
+    assert found["replace"].dof_damping[0] == 0.0
+    assert found["replace"].dof_armature[0] == 0.0
+    # friction is no loss that this motor brings, and stays
+    assert found["replace"].dof_frictionloss[0] == 0.05
+    assert _top_speed(found["replace"]) == pytest.approx((STALL - 0.05) / (STALL / FREE), rel=1e-3)
+
+
+def test_the_warning_names_joint_numbers_and_remedy_once_and_at_the_caller():
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            codrl_mj.add_motors(_arm(gear=2.0), {"shoulder": MOTOR})
+    (warned,) = caught
+    assert warned.filename == __file__
+    text = str(warned.message)
+    # kT*kE/R through the motor's gear and the model's; the rotor through both
+    braking, rotor = 4 * RATIO**2 * CONSTANT**2 / OHMS, 4 * RATIO**2 * 1e-6
+    assert (
+        f"joint shoulder has armature 0.03 (the motor's is {rotor:.3g}), damping 0.55 (the"
+        " motor's is" in text
+    )
+    assert f"{braking:.3g})" in text
+    assert "joint_dynamics='replace'" in text
+    assert "--env.joint-dynamics" in text
+
+
+QUIET = [
+    (OWN, MOTOR, "keep"),
+    (OWN, MOTOR, "replace"),
+    (OWN, "ideal", None),
+    (OWN, "lag", None),
+    (
+        'armature="0.03" frictionloss="0.05"',
+        TorqueSpeed(),
+        None,
+    ),  # it brings neither rotor nor friction
+    ('damping="0.001"', TorqueSpeed(stall_torque=1.0, no_load_speed=10.0), None),  # a bearing's
+]
+
+
+@pytest.mark.parametrize(("own", "actuator", "how"), QUIET)
+def test_no_warning_where_nothing_can_be_counted_twice(own, actuator, how):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", MotorWarning)
+        codrl_mj.add_motors(_arm(own), {"shoulder": actuator}, joint_dynamics=how)
+
+
+def test_by_default_everything_is_kept():
+    with pytest.warns(MotorWarning):
+        default = codrl_mj.add_motors(_arm(), {"shoulder": MOTOR}).to_xml()
+    assert (
+        default == codrl_mj.add_motors(_arm(), {"shoulder": MOTOR}, joint_dynamics="keep").to_xml()
+    )
+
+
+def test_actuators_and_tendons_have_them_too():
+    spec = mujoco.MjSpec.from_string("""
+<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size=".1" mass="1"/></body></worldbody>
+<tendon><fixed name="rope" damping="2" armature="0.5"><joint joint="j" coef="1"/></fixed></tendon>
+<actuator><motor name="pull" tendon="rope" armature="0.25" damping="3"/></actuator></mujoco>""")
+    with pytest.warns(
+        MotorWarning,
+        match=r"actuator pull has armature 0\.25.*damping 3.*tendon rope has armature 0\.5",
+    ):
+        codrl_mj.add_motors(spec, {"rope": MOTOR})
+    model = codrl_mj.add_motors(spec, {"rope": MOTOR}, joint_dynamics="replace").compile()
+    rotor = RATIO**2 * 1e-6
+    assert (model.tendon_armature[0], model.tendon_damping[0]) == (0.0, 0.0)
+    assert (model.actuator_armature[0], model.actuator_damping[0]) == (pytest.approx(rotor), 0.0)
+
+
+def test_a_certificate_says_what_it_cannot_see():
+    def reasons(own):
+        model = codrl_mj.add_motors(_arm(own), {"shoulder": MOTOR}, joint_dynamics="keep").compile()
+        skipped = validate_model(model, quick=True).skipped
+        return [one.reason for one in skipped if one.name == "whether a motor is counted twice"]
+
+    (reason,) = reasons(OWN)
+    assert (
+        "joint shoulder has armature 0.03 (the motor's is 0.01), damping 0.55 (the motor's is 2)"
+        in reason
+    )
+    assert reasons('damping="0"') == []
+
+
+def test_environments_keep_or_replace_and_so_do_their_configurations():
+    arguments = {".*": MOTOR.replaced({"motor.gear_ratio": 1.0, "motor.rotor_inertia": 1e-4})}
+    config = codrl_mj.EnvConfig(
+        "InvertedPendulum-v5", arguments, joint_dynamics="replace", allow_unstable=True
+    )
+    again = codrl_mj.EnvConfig.from_mapping(config.as_mapping())
+    assert again == config
+    with pytest.warns(MotorWarning, match=r"joint slider has .*damping 1 \(") as caught:
+        kept = codrl_mj.make("InvertedPendulum-v5", arguments, allow_unstable=True)
+    assert caught[0].filename == __file__
+    replaced, plain = again.make(), kept.unwrapped.model
+    slider = plain.joint("slider").dofadr[0]
+    assert plain.dof_damping[slider] == 1.0
+    assert replaced.unwrapped.model.dof_damping[slider] == 0.0
+    # a hinge without a motor keeps its own
+    assert replaced.unwrapped.model.dof_damping[1 - slider] == plain.dof_damping[1 - slider] == 1.0
+    for env in (kept, replaced):
+        env.close()
+
+
+def test_configurations_without_it_are_what_they_were():
+    """Names of runs are hashes of the mapping."""
+    assert "joint_dynamics" not in codrl_mj.EnvConfig("HalfCheetah-v5").as_mapping()
+    assert "joint_dynamics" not in codrl_mj.EnvConfig("pendulum").as_mapping()
+
+
+@pytest.mark.parametrize(
+    ("task", "value", "message"),
+    [
+        ("HalfCheetah-v5", "both", "joint_dynamics = 'both': must be keep or replace"),
+        ("pendulum", "replace", "joint_dynamics = 'replace': pendulum has none"),
+    ],
+)
+def test_values_that_it_cannot_have_are_refused(task, value, message):
+    with pytest.raises(ValueError, match=message):
+        codrl_mj.EnvConfig(task, joint_dynamics=value)
+    with pytest.raises(ValueError, match="joint_dynamics = 'both'"):
+        codrl_mj.add_motors(_arm(), {"shoulder": MOTOR}, joint_dynamics="both")
+
+
+def _legs(count, gravcomp=False):
+    bodies = "".join(
+        f'<body pos="0 {n} 0" gravcomp="{int(gravcomp)}"><joint name="j{n}" axis="0 1 0"'
+        ' actuatorgravcomp="true"/><geom size=".1" mass="1" pos=".2 0 0"/></body>'
+        for n in range(count)
+    )
+    motors = "".join(f'<motor name="m{n}" joint="j{n}"/>' for n in range(count))
+    return mujoco.MjSpec.from_string(
+        f"<mujoco><worldbody>{bodies}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+
+
+def test_several_supplies_that_sag_are_said_to_be_several():
+    weak = MOTOR.replaced({"supply.resistance": 0.5})
+    with pytest.warns(
+        MotorWarning, match=r"supply\.resistance: each of the motors m0, m1 has a supply of its own"
+    ):
+        codrl_mj.add_motors(_legs(3), {"m[01]": weak, "m2": MOTOR})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", MotorWarning)
+        codrl_mj.add_motors(_legs(2), {"m0": weak, "m1": MOTOR})
+
+
+def test_gravity_compensation_goes_past_a_motor():
+    with pytest.warns(
+        MotorWarning,
+        match="joint j0: actuatorgravcomp: its gravity compensation passes through no motor",
+    ):
+        model = codrl_mj.add_motors(_legs(1, gravcomp=True), {"m0": "lag"}).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.actuator_force[0] == 0.0  # why: MuJoCo delivers it all the same
+    assert data.qfrc_actuator[0] == pytest.approx(-0.2 * 9.81)
+
+
+def test_a_reduction_that_brings_no_rotor_leaves_the_model_s():
+    bare = MOTOR.replaced({"motor.rotor_inertia": 0.0})
+    model = codrl_mj.add_motors(_arm(), {"shoulder": bare}, joint_dynamics="replace").compile()
+    assert model.dof_armature[0] == 0.03
+    np.testing.assert_array_equal(model.dof_damping, [0.0])

@@ -1,0 +1,187 @@
+"""`make_dm_control`: dm_control's environments with motors."""
+
+import numpy as np
+import pytest
+from dm_control import composer, manipulation, suite
+from dm_control.locomotion.examples import basic_cmu_2019, basic_rodent_2020
+
+import codrl_mj
+from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Drive, Motor, TorqueSpeed
+from codrl_mj.catalogue import motor_entry
+from tests.matrix import but
+
+IDEAL = {".*": "ideal"}
+DOMAINS = sorted(
+    {domain: f"{domain}/{task}" for domain, task in reversed(suite.ALL_TASKS)}.values()
+)
+"""A task of each domain of the suite."""
+
+
+def _inputs(env, steps):
+    spec = env.action_spec()
+    low = np.where(np.isfinite(spec.minimum), spec.minimum, -1.0)
+    high = np.where(np.isfinite(spec.maximum), spec.maximum, 1.0)
+    return np.random.default_rng(0).uniform(low, high, (steps, *spec.shape))
+
+
+def _assert_same(ours, plain, steps):
+    for index, action in enumerate([None, *_inputs(plain, steps)]):
+        found, expected = (
+            env.reset() if action is None else env.step(action) for env in (ours, plain)
+        )
+        assert found[:3] == expected[:3], index
+        assert found.observation.keys() == expected.observation.keys()
+        for name, value in expected.observation.items():
+            np.testing.assert_array_equal(
+                found.observation[name], value, err_msg=f"{name}, step {index}"
+            )
+    return expected
+
+
+@pytest.mark.parametrize("name", but(("cheetah/run", "cartpole/balance"), DOMAINS))
+def test_ideal_motors_change_no_bit_of_whole_episodes(name):
+    """1000 steps are the suite's longest episodes; shorter ones start again."""
+    ours = codrl_mj.make_dm_control(name, IDEAL, task_kwargs={"random": 1})
+    plain = suite.load(*name.split("/"), task_kwargs={"random": 1})
+    assert len(codrl_mj.engine.motors(ours.mujoco[0])) == plain.physics.model.nactuator > 0
+    for specification in ("action_spec", "observation_spec", "reward_spec", "discount_spec"):
+        assert getattr(ours, specification)() == getattr(plain, specification)()
+    _assert_same(ours, plain, 1001)
+
+
+ANEW = {
+    "reach": lambda: manipulation.load("reach_duplo_features", seed=1),
+    "rodent": lambda: basic_rodent_2020.rodent_run_gaps(random_state=np.random.RandomState(1)),
+    "humanoid": lambda: basic_cmu_2019.cmu_humanoid_run_walls(
+        random_state=np.random.RandomState(1)
+    ),
+}
+
+
+@pytest.mark.parametrize("name", but(("reach",), ANEW))
+def test_environments_that_build_their_model_at_every_reset_have_motors_in_each(name):
+    ours, plain = codrl_mj.make_dm_control(ANEW[name], IDEAL), ANEW[name]()
+    assert isinstance(plain, composer.Environment)
+    models = []
+    for _ in range(2):
+        _assert_same(ours, plain, 10)
+        models.append(ours.mujoco[0])
+        assert len(codrl_mj.engine.motors(models[-1])) == models[-1].nactuator
+        assert len(ours.signals()["actual_force"]) == models[-1].nactuator
+    assert models[0] is not models[1]
+
+
+def test_signals_are_those_of_the_forces_that_moved_it_last():
+    """dm_control's order, `mj_step2` before `mj_step1`: the speed after a step is that of the next first force."""
+    line = TorqueSpeed(stall_torque=1.5, no_load_speed=5.0, max_torque=1.0)
+    env = codrl_mj.make_dm_control("cartpole/swingup", {"slide": line}, task_kwargs={"random": 0})
+    env.reset()
+    gear, saturated = env.mujoco[0].actuator_gear[0, 0], []
+    for action in np.repeat(_inputs(env, 30), 5, axis=0):
+        speed = gear * env.physics.data.qvel[0]
+        env.step(action)
+        upper, lower = (np.clip(1.5 * (sign - speed / 5.0), -1.0, 1.0) for sign in (1.0, -1.0))
+        signals = env.signals()
+        assert signals["desired_force"] == action[0]
+        assert signals["actual_force"] == pytest.approx(
+            np.clip(action[0], lower, upper), rel=1e-12, abs=1e-13
+        )
+        assert signals["saturated"] is bool(signals["actual_force"] != action[0])
+        saturated.append(signals["saturated"])
+    assert 10 < sum(saturated) < 140
+
+
+def test_noise_differs_between_episodes_and_repeats_with_its_seed():
+    noisy = DCMotorActuator(
+        Motor(resistance=1.0, inductance=0.05, torque_constant=0.8, back_emf_constant=0.01),
+        CurrentLoop(kp=0.5, ki=2.0, max_voltage=4.0, current_noise=0.1),
+    )
+    runs = []
+    for seed in (1, 1, 2):
+        env = codrl_mj.make_dm_control(
+            "pendulum/swingup", {".*": noisy}, noise_seed=seed, task_kwargs={"random": 0}
+        )
+        runs.append([])
+        for _ in range(2):
+            env.reset()
+            env.step(np.array([0.3]))
+            runs[-1].append(env.signals()["current"])
+    assert runs[0] == runs[1]
+    assert len({*runs[0], *runs[2]}) == 4
+
+
+MAXON = {".*": "maxon-ec45-flat-50w"}
+
+
+def test_currents_are_commanded_in_amperes():
+    motor = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
+        {"controller.max_current": 5.0}
+    )
+    env = codrl_mj.make_dm_control(
+        "cheetah/run", {".*": motor}, action="current", task_kwargs={"random": 0}
+    )
+    spec = env.action_spec()
+    np.testing.assert_array_equal((spec.minimum, spec.maximum), ([-5.0] * 6, [5.0] * 6))
+    env.reset()
+    action = np.array([0.3, -0.2, 0.1, 5.0, 9.0, 0.0])
+    env.step(action)
+    np.testing.assert_allclose(
+        env.signals()["reference_current"], np.clip(action, -5.0, 5.0), rtol=1e-12
+    )
+    with pytest.raises(ValueError, match=r"action has shape \(1,\): must be \(6,\)"):
+        env.step(np.zeros(1))
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = env.nothing
+
+
+def test_motors_and_model_are_drawn_at_every_reset_and_initial_states_are_not_touched():
+    draws = {
+        ".*": {"motor.resistance": "uniform(0.6, 1.2)"},
+        "model.mass.torso": "uniform(0.5, 2.0)",
+    }
+    arguments = {"task_kwargs": {"random": 3}}
+    env = codrl_mj.make_dm_control("cheetah/run", MAXON, randomize=draws, noise_seed=1, **arguments)
+    again = codrl_mj.make_dm_control(
+        "cheetah/run", MAXON, randomize=draws, noise_seed=1, **arguments
+    )
+    plain = codrl_mj.make_dm_control("cheetah/run", MAXON, **arguments)
+    mass, factors = plain.mujoco[0].body("torso").mass[0], []
+    for _ in range(3):
+        (one, two), other = (each.reset() for each in (env, again)), plain.reset()
+        np.testing.assert_array_equal(one.observation["position"], two.observation["position"])
+        assert env.randomization == again.randomization
+        factors.append(env.randomization["model.mass.torso"])
+        assert env.mujoco[0].body("torso").mass[0] == mass * factors[-1]
+        resistance = env.randomization[".*"]["motor.resistance"]
+        assert {motor.motor.resistance for motor in env.motors.values()} == {resistance}
+        assert one.observation["position"].shape == other.observation["position"].shape
+    assert len(set(factors)) == 3
+    with pytest.raises(
+        ValueError, match="randomize: Environment builds its model anew at every reset"
+    ):
+        codrl_mj.make_dm_control(
+            ANEW["reach"], IDEAL, randomize={"model.gravity": "uniform(0.9, 1.1)"}
+        )
+
+
+def test_commands_are_delayed_by_whole_environment_steps():
+    env = codrl_mj.make_dm_control("cheetah/run", IDEAL, disturbances={"command_delay": 0.02})
+    inputs = _inputs(env, 10)
+    for _ in range(2):  # a reset forgets what is on its way
+        env.reset()
+        for index, action in enumerate(inputs):
+            env.step(action)
+            expected = inputs[index - 2] if index >= 2 else np.zeros(6)  # two steps of 0.01 s
+            np.testing.assert_allclose(env.signals()["desired_force"], expected, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("environment", "actuators", "message"),
+    [
+        ("cheetah/rn", IDEAL, r"environment = 'cheetah/rn': did you mean 'cheetah/run'\?"),
+        ("cheetah/run", {"knee": "lag"}, r"'knee': no actuator has such a name.*bthigh"),
+    ],
+)
+def test_what_is_wrong_is_said(environment, actuators, message):
+    with pytest.raises(ValueError, match=message):
+        codrl_mj.make_dm_control(environment, actuators)

@@ -1,0 +1,520 @@
+"""`make`: Gymnasium's environments with motors."""
+
+import copy
+import functools
+import math
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+import codrl_mj
+from codrl_mj.actuators import (
+    CurrentLoop,
+    DCMotorActuator,
+    Drive,
+    Motor,
+    Servo,
+    TorqueSpeed,
+    VoltageDrive,
+)
+from codrl_mj.catalogue import motor_entry
+from codrl_mj.engine.reading import slots
+from codrl_mj.envs.config import EnvConfig
+from tests.add_motors.models import full_state
+from tests.external_envs.models import ARM, V5, ArmEnv, BareEnv, actions, assert_same, run
+from tests.matrix import but
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::UserWarning"
+)  # deprecated attributes in other people's models
+IDEAL, MAXON = {".*": "ideal"}, {".*": "maxon-ec45-flat-50w"}
+BACK, FRONT = ("bthigh", "bshin", "bfoot"), ("fthigh", "fshin", "ffoot")
+KEPT = ("HalfCheetah-v5", "InvertedPendulum-v5")  # several motors and RK4 with an early end: one
+every_v5 = pytest.mark.parametrize("env_id", but(KEPT, V5))
+CHEETAH, ARM_ID, BARE_ID = "HalfCheetah-v5", "ForeignArm-v0", "ForeignBare-v0"
+NOISY = DCMotorActuator(
+    Motor(resistance=1.0, inductance=0.05, torque_constant=0.8, back_emf_constant=0.01),
+    CurrentLoop(kp=0.5, ki=2.0, max_voltage=4.0, substeps=2, current_noise=0.1),
+)
+
+
+@pytest.fixture(autouse=True)
+def _registered(tmp_path):
+    """An environment of a servo and a motor, and one that is no `MujocoEnv`."""
+    (tmp_path / "arm.xml").write_text(ARM)
+    gym.register(ARM_ID, functools.partial(ArmEnv, tmp_path / "arm.xml"), max_episode_steps=50)
+    gym.register(BARE_ID, BareEnv, max_episode_steps=50)
+    yield
+    for env_id in (ARM_ID, BARE_ID):
+        gym.registry.pop(env_id)
+
+
+@every_v5
+def test_ideal_motors_change_no_bit_of_whole_episodes_and_no_pixel(env_id):
+    plain, ours = (
+        gym.make(env_id, render_mode="rgb_array"),
+        codrl_mj.make(env_id, IDEAL, render_mode="rgb_array"),
+    )
+    assert (ours.observation_space, ours.action_space) == (
+        plain.observation_space,
+        plain.action_space,
+    )
+    inputs = actions(
+        plain, plain.spec.max_episode_steps + 1
+    )  # to the time limit, or over many episodes
+    expected = run(plain, inputs, seed=3)
+    assert any(row[2] or row[3] for row in expected)
+    assert_same(run(ours, inputs, seed=3), expected)
+    images = [env.render() for env in (plain, ours)]
+    assert images[0].std() > 1.0
+    np.testing.assert_array_equal(*images)
+
+
+def _complaints(check, env, **options):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check(env, **options)
+    said = {str(warning.message).split("\n")[0] for warning in caught}
+    return {
+        text for text in said if "is different from the unwrapped version" not in text
+    }  # names the wrappers
+
+
+@every_v5
+@pytest.mark.parametrize(
+    "check", [check_env, check_env_sb3], ids=["gymnasium", "stable_baselines3"]
+)
+def test_the_checkers_say_no_more_than_of_the_environment_without_motors(env_id, check):
+    expected = _complaints(
+        check, gym.make(env_id), skip_render_check=True
+    )  # a window needs a display
+    for actuators, options in (
+        (IDEAL, {}),
+        ({".*": NOISY}, {"observe_actuator": True, "allow_unstable": True}),
+    ):
+        ours = codrl_mj.make(env_id, actuators, **options)
+        assert _complaints(check, ours, skip_render_check=True) <= expected
+
+
+def test_torque_stays_within_the_torque_speed_line_on_every_joint_at_every_step():
+    """One integration step in each environment step: then the speed that the line is of is known."""
+    line = TorqueSpeed(stall_torque=0.64, no_load_speed=950.0, max_torque=0.38)
+    env = codrl_mj.make(CHEETAH, {".*": line}, frame_skip=1, reset_noise_scale=1.0)
+    env.reset(seed=0)
+    model, data, saturated = env.unwrapped.model, env.unwrapped.data, np.zeros(6)
+    dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]]
+    for action in np.repeat(actions(env, 60), 10, axis=0):
+        speed = model.actuator_gear[:, 0] * data.qvel[dofs]
+        *_, info = env.step(action)
+        desired = action.astype(np.float64)
+        upper, lower = (np.clip(0.64 * (sign - speed / 950.0), -0.38, 0.38) for sign in (1.0, -1.0))
+        expected = np.clip(desired, lower, upper)
+        np.testing.assert_array_equal(info["desired_force"], desired)
+        np.testing.assert_allclose(info["actual_force"], expected, rtol=1e-12, atol=1e-13)
+        np.testing.assert_array_equal(info["saturated"], expected != desired)
+        saturated += info["saturated"]
+    assert (saturated > 20).all()
+    assert (saturated < 580).all()
+
+
+PULSES = {"pulse_force": 0.5, "pulse_duration": 0.03, "pulse_interval": 0.1}
+
+
+def _everything(env_id):
+    """An environment with all that a snapshot has to remember: noise, draws, delays, a limit of time."""
+    draws = {
+        ".*": {
+            "motor.resistance": "uniform(0.5, 1.5)",
+            "motor.back_emf_constant": codrl_mj.Uniform(0.0, 0.02),
+        }
+    }
+    draws["model.gravity"] = "uniform(0.8, 1.2)"
+    return codrl_mj.make(
+        env_id,
+        {".*": NOISY},
+        observe_actuator=True,
+        randomize=draws,
+        disturbances={"command_delay": 0.07, "command_rate": 20.0} | PULSES,
+        allow_unstable=True,
+        max_episode_steps=40,
+    )
+
+
+@pytest.mark.parametrize(
+    "env_id", but((*KEPT, "Ant-v5"), V5)
+)  # Ant's rewards come from poses that lag a step
+def test_a_snapshot_continues_bit_for_bit_in_a_fresh_environment(env_id):
+    env, other = _everything(env_id), _everything(env_id)
+    inputs = actions(env, 120)
+    run(env, inputs[:15], seed=5)
+    snapshot = env.snapshot()
+    expected = run(env, inputs[15:])
+    other.restore(snapshot)
+    found = run(other, inputs[15:])
+    assert_same(found, expected)
+    for ours, theirs in zip(found, expected, strict=True):
+        assert ours[4].keys() == theirs[4].keys()
+    assert sum(row[3] or row[2] for row in expected) >= 2  # resets were drawn alike too
+    env.restore(snapshot)
+    assert_same(run(env, inputs[15:]), expected)
+    assert all(isinstance(array, np.ndarray) for array in snapshot.values())
+
+
+def test_a_snapshot_of_something_else_is_refused():
+    env, other = codrl_mj.make(CHEETAH, IDEAL), codrl_mj.make(CHEETAH, {".*": "lag"})
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"snapshot\['state'\].*must be"):
+        other.restore(env.snapshot())
+    with pytest.raises(ValueError, match="must be of 'HalfCheetah-v5'"):
+        env.restore(
+            env.snapshot() | {"environment": np.frombuffer(b"HalfCheetah-v4", dtype=np.uint8)}
+        )
+
+
+def test_setting_the_state_brings_motors_to_rest():
+    """Each of them then does what it does after a reset to that state."""
+    env = codrl_mj.make(CHEETAH, {".*": "lag"})
+    inputs = actions(env, 20)
+    run(env, inputs, seed=0)
+    base = env.unwrapped
+    base.set_state(base.init_qpos, base.init_qvel)
+    moved = [env.step(action)[4]["actual_force"] for action in inputs]
+    fresh = codrl_mj.make(CHEETAH, {".*": "lag"}, reset_noise_scale=0.0)
+    fresh.reset(seed=0)
+    np.testing.assert_array_equal(
+        moved, [fresh.step(action)[4]["actual_force"] for action in inputs]
+    )
+
+
+@pytest.mark.parametrize(
+    ("env_id", "actuator"), [(CHEETAH, NOISY), (CHEETAH, "lag"), (BARE_ID, "lag")]
+)
+def test_resets_bring_motors_to_rest(env_id, actuator):
+    """The engine's own state, motors included, is the same after the same seed, whatever came before."""
+    env = codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True)
+    inputs, states, runs = actions(env, 50), [], []
+    for length in (5, 50):
+        env.reset(seed=1)
+        states.append(full_state(env.unwrapped.data))
+        runs.append(run(env, inputs[:length], seed=1))
+    np.testing.assert_array_equal(*states)
+    assert_same(runs[1][:6], runs[0])
+
+
+def test_every_motor_has_noise_of_its_own_in_every_episode():
+    env = codrl_mj.make(CHEETAH, {"b.*": NOISY, "f.*": "lag"}, allow_unstable=True)
+    views, keys = slots(env.unwrapped.data, env.motors), []
+    for seed in (7, None, 7):
+        env.reset(seed=seed)
+        keys.append([view[1] for view in views.values()])
+    assert keys[0] == keys[2]
+    assert len({*keys[0][:3], *keys[1][:3]}) == 6
+    assert keys[0][3:] == [0.0] * 3  # which need none
+
+
+def cheetah(**options):
+    """Somebody's function."""
+    return gym.wrappers.TimeLimit(HalfCheetahEnv(**options), 500)
+
+
+COMMANDED = {"action": "current", "observe_actuator": True}
+LIMITED = {"disturbances": {"command_rate": 5.0}, "max_episode_steps": 7}
+DRAWN = {"randomize": {"time_constant": "loguniform(0.01, 1)"}}
+COPIES = {
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
+    "spec": lambda env: gym.make(env.spec),
+}
+FROM_IDS = [(CHEETAH, MAXON, COMMANDED), (CHEETAH, {".*": "lag"}, LIMITED)]
+FROM_FUNCTIONS = [(creator, {".*": "lag"}, DRAWN) for creator in (cheetah, HalfCheetahEnv, BareEnv)]
+
+
+@pytest.mark.parametrize(
+    ("how", "creator", "actuators", "options"),
+    [
+        *((how, *one) for how in COPIES for one in FROM_IDS),
+        *((how, *one) for how in ("deepcopy", "pickle") for one in FROM_FUNCTIONS),
+    ],
+)
+def test_copies_have_the_motors_and_their_draws(how, creator, actuators, options):
+    """Gymnasium's copies are environments made again."""
+    env = codrl_mj.make(creator, actuators, **options)
+    other, inputs = COPIES[how](env), actions(env, 10)
+    expected = [run(env, inputs, seed) for seed in (1, 2)]
+    for seed, rows in zip((1, 2), expected, strict=True):
+        assert_same(run(other, inputs, seed), rows)
+    assert not np.array_equal(*(np.array([row[0] for row in rows]) for rows in expected))
+    assert other.step(inputs[0])[4]["desired_force"].shape == inputs[0].shape
+    assert copy.deepcopy(env.unwrapped).model.nplugin == len(env.motors)
+
+
+@pytest.mark.parametrize(("env_id", "count"), [(CHEETAH, 6), ("InvertedPendulum-v5", 1)])
+def test_info_has_arrays_for_several_motors_and_numbers_for_one(env_id, count):
+    env = codrl_mj.make(env_id, MAXON)
+    *_, info = run(env, actions(env, 1), seed=0)[-1]
+    for name in ("desired_force", "actual_force", *Drive.Signals._fields):
+        kind = (bool if count == 1 else np.bool_) if name == "saturated" else float
+        if count == 1:
+            assert type(info[name]) is kind
+        else:
+            assert (info[name].shape, info[name].dtype) == ((count,), kind)
+
+
+def test_motors_of_several_families_have_nan_for_what_the_others_have():
+    env = codrl_mj.make(CHEETAH, {"b.*": MAXON[".*"], "f.*": "lag"}, observe_actuator=True)
+    observation, *_, info = run(env, actions(env, 5), seed=0)[-1]
+    np.testing.assert_array_equal(np.isnan(info["current"]), [False] * 3 + [True] * 3)
+    assert not info["saturated"][3:].any()
+    assert observation.shape == (17 + 3 * 2,)
+
+
+def test_observations_end_with_what_the_sensors_say():
+    env, plain = codrl_mj.make(CHEETAH, MAXON, observe_actuator=True), gym.make(CHEETAH)
+    space = plain.observation_space
+    assert env.observation_space.dtype == space.dtype
+    np.testing.assert_array_equal(env.observation_space.low, np.append(space.low, [-np.inf] * 12))
+    np.testing.assert_array_equal(env.observation_space.high, np.append(space.high, [np.inf] * 12))
+    assert env.sensor_names == tuple(
+        f"{motor}.{name}" for motor in BACK + FRONT for name in Drive.OBSERVED
+    )
+    assert not env.reset(seed=0)[0][17:].any()
+    for action in actions(env, 5):
+        observation, *_, info = env.step(action)
+        np.testing.assert_array_equal(observation[17::2], info["current"])
+        np.testing.assert_array_equal(observation[18::2], info["reference_current"])
+
+
+def test_currents_are_commanded_in_amperes_up_to_the_motors_limits():
+    drives = {
+        "b.*": (
+            Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
+                {"controller.max_current": 5.0}
+            )
+        )
+    }
+    env = codrl_mj.make(CHEETAH, drives, action="current")
+    np.testing.assert_array_equal(env.action_space.high, [5.0] * 3 + [1.0] * 3)
+    np.testing.assert_array_equal(env.action_space.low, -env.action_space.high)
+    env.reset(seed=0)
+    for scale in (1.0, 2.0):
+        action = scale * np.array([5.0, -5.0, 2.0, 0.1, 0.2, -0.3], np.float32)
+        *_, info = env.step(action)
+        np.testing.assert_allclose(
+            info["reference_current"], np.clip(action[:3], -5.0, 5.0), rtol=1e-12
+        )
+        np.testing.assert_allclose(env.unwrapped.data.actuator_force[3:], action[3:], rtol=1e-7)
+
+
+def test_a_current_is_one_whatever_gain_and_arm_stand_before_it_and_whatever_its_limit():
+    fields = {"controller.max_current": 5.0, "motor.gear_ratio": 3.0, "motor.arm_radius": 0.5}
+    drive = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(fields)
+    env = codrl_mj.make(ARM_ID, {"motor": drive}, action="current", allow_unstable=True)
+    assert env.action_space.high[1] == 5.0
+    env.reset(seed=0)
+    *_, info = env.step(np.array([0.0, -0.4], np.float32))
+    assert info["reference_current"] == pytest.approx(-0.4, rel=1e-6)
+    assert info["desired_force"] == pytest.approx(
+        -0.4 * drive.motor.torque_constant * 3.0 / 0.5, rel=1e-6
+    )
+    free = codrl_mj.make(
+        "InvertedPendulum-v5", {".*": NOISY}, action="current", allow_unstable=True
+    )
+    of_force = 3.0 * free.unwrapped.model.actuator_gainprm[0, 0] / NOISY.motor.torque_constant
+    np.testing.assert_allclose(free.action_space.high, [of_force], rtol=1e-6)
+
+
+def test_voltages_are_commanded_past_the_loop():
+    env = codrl_mj.make(CHEETAH, MAXON, action="voltage")
+    np.testing.assert_array_equal(env.action_space.high, [24.0] * 6)
+    assert set(map(type, env.motors.values())) == {VoltageDrive}
+    env.reset(seed=0)
+    for action in actions(env, 5):
+        *_, info = env.step(action)
+        np.testing.assert_allclose(info["voltage"], action, rtol=1e-6)
+        np.testing.assert_array_equal(info["desired_force"], info["actual_force"])
+
+
+def test_a_servo_of_ours_is_asked_for_positions():
+    env = codrl_mj.make(
+        "InvertedPendulum-v5", {".*": Servo()}, action="position", allow_unstable=True
+    )
+    np.testing.assert_allclose(env.action_space.high, [math.pi], rtol=1e-6)
+    env.reset(seed=0)
+    *_, info = env.step(np.array([0.5], np.float32))
+    model, data = env.unwrapped.model, env.unwrapped.data
+    assert abs(info["error"] - 0.5) < 0.2 * 0.5 + abs(model.actuator_gear[0, 0] * data.qpos[0])
+
+
+def test_forces_of_an_environment_are_no_motions_of_a_servo():
+    """Else 1 N would be taken for 1 m."""
+    message = (
+        "action = 'force': '.*': the environment asks its actuators for forces, and a Servo .* must"
+        " be position"
+    )
+    with pytest.raises(ValueError, match=message):
+        codrl_mj.make("InvertedPendulum-v5", {".*": Servo()}, allow_unstable=True)
+
+
+def test_a_servo_of_the_models_stays_one():
+    """What it asks for, kp*(target - q) - kv*w, is the desired torque."""
+    env = codrl_mj.make(
+        ARM_ID, {"servo": TorqueSpeed(stall_torque=5.0, no_load_speed=10.0, max_torque=5.0)}
+    )
+    (q, _, w, _), _ = env.reset(seed=0)
+    (*_,), *_, info = env.step(np.array([0.5, 0.0], np.float32))
+    assert info["desired_force"] == pytest.approx(20.0 * (0.5 - q) - w, rel=1e-12)
+    assert info["actual_force"] == pytest.approx(5.0 * (1.0 - w / 10.0), rel=1e-12)
+    assert info["saturated"] is True
+
+
+def of_gymnasium(makers, context):
+    """Steps of processes under actions, from the seeds 3 and 4: observations and currents."""
+    vector = AsyncVectorEnv(makers, context=context)
+    vector.reset(seed=[3, 4])
+    for action in (yield):
+        observations, *_, infos = vector.step(action)
+        yield observations, infos["current"]
+    vector.close()
+
+
+def of_stable_baselines3(makers, context):
+    """The same."""
+    vector = SubprocVecEnv(makers, start_method=context)
+    vector.seed(3)
+    vector.reset()
+    for action in (yield):
+        observations, _, _, infos = vector.step(action)
+        yield observations, [info["current"] for info in infos]
+    vector.close()
+
+
+@pytest.mark.parametrize("context", ["fork", pytest.param("spawn", marks=pytest.mark.matrix)])
+@pytest.mark.parametrize("face", [of_gymnasium, of_stable_baselines3])
+def test_environments_in_processes_are_those_of_one(face, context):
+    make = functools.partial(
+        codrl_mj.make, CHEETAH, {"b.*": NOISY, "f.*": "lag"}, allow_unstable=True
+    )
+    inputs = np.random.default_rng(0).uniform(-1, 1, (30, 2, 6)).astype(np.float32)
+    singles, steps = [make(), make()], face([make] * 2, context)
+    for seed, single in zip((3, 4), singles, strict=True):
+        single.reset(seed=seed)
+    next(steps)
+    found = [steps.send(inputs), *steps]
+    assert len(found) == len(inputs)
+    for (observations, currents), pair in zip(found, inputs, strict=True):
+        for single, action, observation, current in zip(
+            singles, pair, observations, currents, strict=True
+        ):
+            expected, *_, info = single.step(action)
+            np.testing.assert_array_equal(observation, expected)
+            np.testing.assert_array_equal(current, info["current"])
+
+
+MOTOR = {"motor": MAXON[".*"]}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"actuator": {"knee": "lag"}}, "'knee': no actuator has such a name"),
+        (
+            {"action": "voltage"},
+            r"action = 'voltage': must be one of force, which the lag actuator of '\.\*' takes; or",
+        ),
+        (
+            {"observe_actuator": True},
+            "the lag actuator has no current to observe, and nothing else; choose another",
+        ),
+        ({"randomize": {"knee": {}}}, "randomize: knee: {} is no distribution"),
+        ({"randomize": ["time_constant"]}, "must be FIELD=DISTRIBUTION"),
+        (
+            {"randomize": {"knee:time_constant": "uniform(0, 1)"}},
+            "'knee': no actuator has such a name",
+        ),
+        (
+            {"randomize": {"time_constant": "uniform(0, 1)", "bfoot:time_constant": "choice(1)"}},
+            "drawn by another pattern, too",
+        ),
+        ({"randomize": {".*": {"time_constnt": "uniform(0, 1)"}}}, "did you mean .*time_constant"),
+        (
+            {"randomize": {".*": {"time_constant": "uniform(-1, 1)"}}},
+            r"'\.\*'\]\['time_constant'\].*must be.*>= 0",
+        ),
+        ({"randomize": {"model.mass.trso": "uniform(0.5, 2)"}}, "did you mean 'model.mass.torso'"),
+        (
+            {"randomize": {"model.mass.torso": "uniform(0, 2)"}},
+            r"mass.torso'\] = uniform\(0.*= 0: must be .* > 0",
+        ),
+        (
+            {"randomize": {"model.length.torso": "uniform(0.5, 2)"}},
+            "unknown field 'model.length.torso'",
+        ),
+        (
+            {
+                "actuator": {".*": NOISY},
+                "randomize": {".*": {"controller.substeps": "uniform(1, 4)"}},
+            },
+            "controller.substeps must be drawn from a Choice of int values",
+        ),
+        (
+            {
+                "actuator": MAXON,
+                "action": "current",
+                "randomize": {"motor.torque_constant": "uniform(0.01, 0.02)"},
+            },
+            (
+                "with action='current' it would change what an action means; draw it with"
+                " action='force'"
+            ),
+        ),
+        (
+            {"randomize": {"model.gravity": "uniform(0)"}},
+            "randomize: model.gravity: .* has 1 values",
+        ),
+        ({"disturbances": {"comand_delay": 1}}, "did you mean disturbances.command_delay"),
+        ({"env": BARE_ID, "disturbances": {"command_rate": 1.0}}, "has no dt"),
+        (
+            {"env": ARM_ID, "actuator": MAXON, "action": "current"},
+            r"servo: is no plain motor.*action='force'",
+        ),
+        (
+            {"env": ARM_ID, "actuator": MOTOR, "action": "current"},
+            r"motor: a command \[A\] needs a limit",
+        ),
+        (
+            {"env": "CartPole-v1"},
+            "has no MuJoCo model built from XML, and so no motors: take 'cartpole'",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said(arguments, text):
+    with pytest.raises(ValueError, match=text):
+        codrl_mj.make(
+            **{"env": CHEETAH, "actuator": {".*": "lag"}, "allow_unstable": True, **arguments}
+        )
+
+
+@pytest.mark.parametrize(
+    "options", [{"action": "current"}, {"disturbances": {"command_delay": 0.05}}]
+)
+def test_an_action_of_another_shape_is_refused(options):
+    env = codrl_mj.make(CHEETAH, MAXON, **options)
+    env.reset()
+    with pytest.raises(ValueError, match=r"action has shape \(1,\): must be \(6,\)"):
+        env.step(np.zeros(1, np.float32))
+
+
+def test_a_family_s_class_stands_for_its_defaults():
+    for given in ({".*": TorqueSpeed}, TorqueSpeed):
+        assert EnvConfig("InvertedPendulum-v5", given) == EnvConfig(
+            "InvertedPendulum-v5", {".*": TorqueSpeed()}
+        )
+        codrl_mj.make("InvertedPendulum-v5", given).close()
