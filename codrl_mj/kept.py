@@ -242,8 +242,8 @@ def _foundation() -> bytes:
         key.update(f"{one.__name__} {one.__version__}\n".encode())
     cpu = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten(), platform.machine(), sys.version
     # The module's own names, such as its file's, are no settings: two installations of one version share what is kept.
-    given = {name: value for name, value in vars(numba.config).items() if not name.startswith("__")}
-    settings = sorted((name, repr(value)) for name, value in given.items() if isinstance(value, _PLAIN))
+    named = ((name, value) for name, value in vars(numba.config).items() if not name.startswith("__"))
+    settings = sorted((name, repr(value)) for name, value in named if isinstance(value, _PLAIN))
     key.update(repr((cpu, settings)).encode())
     sources = sorted(_PACKAGE.rglob("*.py"))
     if not sources:

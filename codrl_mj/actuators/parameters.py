@@ -16,7 +16,7 @@ def family_of(actuator: Any) -> Any:
 
 
 @functools.cache
-def _fields(cls: Any) -> dict[str, dataclasses.Field[Any]]:
+def _fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
     """The fields of a dataclass by name: an environment with several motors asks some thousand times."""
     return {field.name: field for field in dataclasses.fields(cls)}
 
@@ -24,8 +24,8 @@ def _fields(cls: Any) -> dict[str, dataclasses.Field[Any]]:
 def value_at(owner: Any, path: str) -> Any:
     """What stands at a dotted path, a word as its number; in a part that is None, what stands for it."""
     for name in path.split("."):
-        field, value = _fields(type(owner)).get(name), getattr(owner, name)
-        metadata: Mapping[str, Any] = field.metadata if field else {}
+        known, value = _fields(family_of(owner)), getattr(owner, name)
+        metadata = known[name].metadata if name in known else {}
         if "options" in metadata:
             return metadata["options"].index(value)
         owner = metadata.get("absent") if value is None else value
