@@ -273,11 +273,12 @@ def _foundation() -> bytes:
         platform.machine(),
         sys.version,
     )
-    settings = sorted(
-        (name, repr(value))
-        for name, value in vars(numba.config).items()
-        if isinstance(value, _PLAIN)
+    # The module's own names, such as its file's, are no settings: two installations of one version
+    # share what is kept.
+    named = (
+        (name, value) for name, value in vars(numba.config).items() if not name.startswith("__")
     )
+    settings = sorted((name, repr(value)) for name, value in named if isinstance(value, _PLAIN))
     key.update(repr((cpu, settings)).encode())
     sources = sorted(_PACKAGE.rglob("*.py"))
     if not sources:

@@ -192,6 +192,10 @@ def read_yaml(path: Path) -> Any:
         raise ValueError(str(error)) from None
 
 
+class UntrustedCodeError(ValueError):
+    """A module that a file names, and that nobody said to trust."""
+
+
 _TRUSTED = contextvars.ContextVar("trusted", default=True)
 FILES_TRUSTED = contextvars.ContextVar("files_trusted", default=True)
 """Whether actuator files may name modules; the command line sets it to its `--trust`."""
@@ -216,7 +220,7 @@ def load_module(text: str) -> Any:
     """The module of `module:NAME`."""
     module = text.partition(":")[0]
     if not _TRUSTED.get():
-        raise ValueError(
+        raise UntrustedCodeError(
             f"{text!r}: needs the module {module}, and importing it executes whatever its author"
             " put there. Pass --trust (in Python: trust=True) if that author is you, or somebody"
             " whose programs you would run"

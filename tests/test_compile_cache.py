@@ -288,6 +288,14 @@ def test_versions_cpu_settings_and_this_packages_source_are_in_the_key(
     compile_cache._foundation.cache_clear()
 
 
+def test_where_numba_is_installed_is_not_in_the_key(place, monkeypatch):
+    before = compile_cache._path("name", ())
+    monkeypatch.setattr(numba.config, "__file__", "/elsewhere/numba/core/config.py")
+    compile_cache._foundation.cache_clear()
+    assert compile_cache._path("name", ()) == before
+    compile_cache._foundation.cache_clear()
+
+
 def test_what_was_not_used_for_long_makes_room(place, monkeypatch):
     function(1.5)(1.0)
     (old,) = place.iterdir()

@@ -523,3 +523,17 @@ def test_an_evaluation_is_json_with_a_unit_for_every_measure():
     assert (mapping["units"]["energy_drawn"], mapping["units"]["tracking_rms"]) == ("J", "N*m")
     assert {"tracking_lag", "mechanical_work", "time_to_goal", "success"} < MEASURES.keys()
     assert {name for name in MEASURES if mapping[name] is not None} >= ELECTRICAL
+
+
+def test_a_policy_is_not_measured_where_its_observations_or_actions_are_others():
+    policy = RandomPolicy("pendulum")
+    policy.action_space = EnvConfig("pendulum", action="voltage").make().action_space
+    with pytest.raises(
+        ValueError,
+        match=r"action_space: the policy was trained with Box.*pendulum as it is set has",
+    ):
+        evaluate(policy, EnvConfig("pendulum"), episodes=1)
+    policy.action_space = None
+    policy.observation_space = EnvConfig("cartpole").make().observation_space
+    with pytest.raises(ValueError, match=r"observation_space: the policy was trained with Box"):
+        evaluate(policy, EnvConfig("pendulum"), episodes=1)

@@ -675,9 +675,16 @@ def test_no_model_is_kept_from_a_mutation_nor_into_it():
 def test_a_model_without_a_motor_is_refused():
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
     with pytest.raises(
-        ValueError, match=r"no motor of codrl_mj among its 0 actuators.*codrl_mj.add_motors"
+        ValueError,
+        match=r"the model has no actuators .*URDF.*add one per joint.*codrl_mj.add_motors",
     ):
         validate_model(model)
+    arm = '<body><joint name="j"/><geom size=".1"/></body>'
+    plain = f'<mujoco><worldbody>{arm}</worldbody><actuator><motor joint="j"/></actuator></mujoco>'
+    with pytest.raises(
+        ValueError, match=r"no motor of codrl_mj among its 1 actuators.*codrl_mj.add_motors"
+    ):
+        validate_model(mujoco.MjModel.from_xml_string(plain))
 
 
 @pytest.mark.parametrize(

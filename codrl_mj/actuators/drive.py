@@ -353,10 +353,15 @@ class Drive(ActuatorModel):
             )
         elif share * samples > 3.0:
             warnings.warn(
-                f"motor.rotor_inertia = {rotor:g}: the back-EMF of a saturated motor takes"
-                f" {share * samples:.3g} of the rotor's speed in a step of {timestep:g} s. That is"
-                " followed on a free shaft; at a stop, under friction or beside other joints the"
-                " torque comes as many steps late; shorten the step",
+                f"motor.rotor_inertia = {rotor:g}: a step of {timestep:g} s is"
+                f" {share * samples:.3g} times the time in which the back-EMF of a saturated motor"
+                " brakes its rotor. A free shaft is simulated well; at a stop, under friction or"
+                " beside other joints the torque comes about as many steps late: "
+                + (
+                    "give rotor_inertia, or shorten the step"
+                    if rotor == 0.0
+                    else "shorten the step"
+                ),
                 stacklevel=2,
             )
 

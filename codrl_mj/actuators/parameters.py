@@ -15,13 +15,17 @@ def family_of(actuator: Any) -> Any:
     return actuator if isinstance(actuator, type) else type(actuator)
 
 
+@functools.cache
+def _fields(cls: type) -> dict[str, dataclasses.Field[Any]]:
+    """The fields of a dataclass by name: an environment with several motors asks some thousand times."""
+    return {field.name: field for field in dataclasses.fields(cls)}
+
+
 def value_at(owner: Any, path: str) -> Any:
     """What stands at a dotted path, a word as its number; in a part that is None, what stands for it."""
     for name in path.split("."):
-        metadata: Mapping[str, Any] = next(
-            (f.metadata for f in dataclasses.fields(owner) if f.name == name), {}
-        )
-        value = getattr(owner, name)
+        known, value = _fields(family_of(owner)), getattr(owner, name)
+        metadata = known[name].metadata if name in known else {}
         if "options" in metadata:
             return metadata["options"].index(value)
         owner = metadata.get("absent") if value is None else value
@@ -30,7 +34,7 @@ def value_at(owner: Any, path: str) -> Any:
 
 def as_kind(cls: type, name: str, value: Any) -> Any:
     """A number as the field's own type: whole numbers, flags and words come as floats from arrays."""
-    field = next(field for field in dataclasses.fields(cls) if field.name == name)
+    field = _fields(cls)[name]
     default, options = field.default, field.metadata.get("options", ())
     if options and not isinstance(value, str) and value in range(len(options)):
         return options[int(value)]
@@ -44,7 +48,7 @@ def as_kind(cls: type, name: str, value: Any) -> Any:
 def from_values(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any:
     """Build a dataclass from values by dotted path; a part whose values stand for None is None."""
     nested, made = fields.parts(cls), {}
-    for field in dataclasses.fields(cls):
+    for field in _fields(cls).values():
         if field.name in nested:
             inner = from_values(nested[field.name], values, f"{prefix}{field.name}.")
             made[field.name] = None if inner == field.metadata.get("absent") else inner
@@ -70,7 +74,7 @@ def from_array(cls: Any, values: Iterable[float]) -> Any:
 def _outline(cls: Any) -> tuple[tuple[str, Any], ...]:
     """The fields of a dataclass, each with its class where it is a part, else with None."""
     nested = fields.parts(cls)
-    return tuple((field.name, nested.get(field.name)) for field in dataclasses.fields(cls))
+    return tuple((field.name, nested.get(field.name)) for field in _fields(cls).values())
 
 
 def choices_of(cls: type, path: str) -> tuple[str, ...]:

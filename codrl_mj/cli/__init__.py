@@ -120,7 +120,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"codrl-mj {codrl_mj.__version__}")
         return 0
     with warnings.catch_warnings(), _engine_warnings():
-        warnings.showwarning = _show_warning
+        warnings.showwarning = _show_each_once()
         words = [word for word in given if word != "--traceback"]
         return contextvars.copy_context().run(_run, words, "--traceback" in given)
 
@@ -257,7 +257,19 @@ def _engine_warnings() -> Iterator[None]:
             mujoco.set_mju_user_warning(None)
 
 
-def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+def _show_each_once() -> Callable[..., None]:
+    """Return a `warnings.showwarning` that shows each text once, for every environment of a command warns anew."""
+    shown = set()
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        if str(message) not in shown:
+            shown.add(str(message))
+            _show_warning(message)
+
+    return show
+
+
+def _show_warning(message: Warning | str) -> None:
     print(f"codrl-mj: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 

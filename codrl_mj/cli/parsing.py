@@ -164,12 +164,11 @@ def _families_with(flag: str) -> list[str]:
 
 def _called(argument: Any) -> str:
     """What a person calls an argument: its flag, or its name in capitals."""
-    name = (
-        argument.field.intern_name.upper()
-        if argument.is_positional()
-        else argument.lowered.name_or_flags[0]
-    )
-    return str(name)
+    if argument.is_positional():
+        return str(argument.field.intern_name.upper())
+    # A short name, such as --voltage, stands first; who typed the long one would look for it in
+    # vain.
+    return "/".join(name for name in argument.lowered.name_or_flags if not name.startswith("--no-"))
 
 
 def _kind(argument: Any) -> str:

@@ -16,6 +16,10 @@ from codrl_mj.engine.reading import check_shafts
 from codrl_mj.fields import check_joint_dynamics, check_pattern, did_you_mean
 from codrl_mj.plugin import FAMILY, NAME
 
+NO_ACTUATORS_READ = (
+    "MuJoCo reads none from a URDF, nor a transmission's mechanicalReduction, which is the motor's"
+    " gear_ratio"
+)
 ON_JOINT = {mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT}
 """Transmissions of actuators that drive a joint."""
 _JOINTS = {mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE}
@@ -178,8 +182,7 @@ def matched_by(pattern: str, names: list[list[str]], needed: bool = True) -> lis
             return []
         if not own and not names:
             raise ValueError(
-                f"{part!r}: the model has no actuators (MuJoCo reads none from a URDF, nor a"
-                " transmission's mechanicalReduction, which is the motor's gear_ratio). Add one"
+                f"{part!r}: the model has no actuators ({NO_ACTUATORS_READ}). Add one"
                 " per joint: <actuator><motor name='JOINT' joint='JOINT'/></actuator>, or"
                 " spec.add_actuator(name='JOINT', target='JOINT',"
                 " trntype=mujoco.mjtTrn.mjTRN_JOINT)"

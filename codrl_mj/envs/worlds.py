@@ -277,18 +277,17 @@ class EnvSource(abc.ABC):
             motors = env.get_wrapper_attr("recorder").motor_names
         if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
             raise ValueError(f"{self.name}: observations are {seen}: must be vectors")
+        entries = described([f"observation {k}" for k in range(seen.shape[0])], seen)
         if isinstance(acts, spaces.Discrete):
-            return described([f"observation {k}" for k in range(seen.shape[0])], seen), [
-                {"name": "action"}
-            ]
+            return entries, [{"name": "action", "unit": None}]
+        if not isinstance(acts, spaces.Box) or len(acts.shape) != 1:
+            raise ValueError(f"{self.name}: actions are {acts}: must be vectors, or Discrete")
         names = (
             motors
             if len(motors) == acts.shape[0]
             else [f"action {k}" for k in range(acts.shape[0])]
         )
-        return described([f"observation {k}" for k in range(seen.shape[0])], seen), described(
-            names, acts
-        )
+        return entries, described(names, acts)
 
     def at_goal(self, episode: Any) -> np.ndarray | None:
         """Whether an episode is at the goal, before its first step and after each, (T+1,); None where nobody knows."""

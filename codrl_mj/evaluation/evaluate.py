@@ -25,7 +25,7 @@ from codrl_mj.evaluation.measures import (
     sign_changes,
     wilson_rate,
 )
-from codrl_mj.runs.policies import Policy
+from codrl_mj.runs.policies import Policy, check_spaces
 
 
 def _measure(label: str, unit: str) -> Any:
@@ -162,9 +162,13 @@ def evaluate(
         on_step: called with (episodes running, episodes finished) after every step.
 
     Raises:
-        ValueError: an argument is unknown or out of bounds.
+        ValueError: an argument is unknown or out of bounds, or the policy was trained with other
+            observations or actions.
         SimulationDivergedError: a simulation left the finite numbers.
     """
+    # The bounds of forces are the task's; those of other commands may be another motor's on
+    # purpose.
+    check_spaces(policy, env, exact=env.action == "force")
     ran = run_episodes(policy, env.make, episodes, seed, deterministic, on_step)
     conditions = {"env": env.as_mapping(), "seed": seed, "deterministic": deterministic}
     return dataclasses.replace(summarize(env.task, ran), conditions=conditions)

@@ -21,9 +21,11 @@ _NAMES = {
     "temperature": "temp temperature",
     "bus": "bus vbus vin vbat vdc vcc supply battery",
     "duty": "duty pwm load",
-    "velocity": "w omega speed velocity vel qd dq drehzahl rpm",
-    "position": "q pos position angle theta phi encoder enc winkel counts ticks",
-    "torque": "tau torque trq moment effort",
+    "velocity": "w omega ω speed velocity vel qd dq drehzahl rpm",
+    "position": (
+        "q pos position angle theta θ phi φ encoder enc winkel turns revolutions counts ticks"
+    ),
+    "torque": "tau torque trq moment drehmoment effort",
     "current": "i current iq strom",
     "voltage": "u v voltage volts spannung vq uq",
 }
@@ -61,6 +63,8 @@ _UNITS = {
 }
 """How files spell a unit -> as the mapping takes it."""
 _TURNS = {"deg": 360.0, "rad": 2.0 * math.pi, "turn": 1.0}  # unit of an angle -> a turn
+_SCALED = re.compile(r"[x×*]?\s*(\d+(?:\.\d+)?(?:e[-+]?\d+)?)\s*[x×*·]?\s*(\D+)", re.IGNORECASE)
+"""A factor and a unit, as in `[0.1 deg]`."""
 _STEPS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # unit of time -> [s]
 _USUAL = {
     "voltage": (1.0, 60.0),
@@ -135,8 +139,7 @@ def propose_columns(path: Path | str) -> Proposal:
 
 def _signal(name: str, table: Cells, taken: Collection[str]) -> tuple[str | None, str | None, str]:
     """Return a column's signal and the unit that the file states, None if unknown, and why a column is left out."""
-    bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]", name)
-    bare = name.replace(bracket[0], " ") if bracket else name
+    stated, bare = _stated(name, table)
     words = [
         one
         for one in re.split(r"[\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", bare).lower())
@@ -145,8 +148,8 @@ def _signal(name: str, table: Cells, taken: Collection[str]) -> tuple[str | None
     ends = [
         one for one in re.split(r"[\W_]+", name.lower() if name.isupper() else name) if one
     ]  # mA is one
-    stated = [table.units.get(name, "").strip("[]() "), *([bracket[1]] if bracket else [])]
-    pairs = [f"{ends[-2]}{sign}{ends[-1]}" for sign in "/*"] if len(ends) > 2 else []  # deg_s, N_m
+    two_units = len(ends) > 2 and not any(re.search(r"\d", one) for one in ends[-2:])
+    pairs = [f"{ends[-2]}{sign}{ends[-1]}" for sign in "/*"] if two_units else []  # deg_s, N_m
     inner = [
         one for one in (*reversed(ends[1:-1]), *reversed(words)) if len(one) > 1
     ]  # letters there are of a name
@@ -154,6 +157,9 @@ def _signal(name: str, table: Cells, taken: Collection[str]) -> tuple[str | None
     units = {
         one: next((unit for text in loose if (unit := _valid(one, text))), None) for one in _NAMES
     }
+    # Without its factor a unit would be a wrong one: it stays open, unless `_entry` knows what the
+    # factor is.
+    units |= {one: None for one in _NAMES if _factor(one, stated, ends)[0]}
     if {*words} & _NO_SIGNALS or ("state" in words and "observation" not in words):
         return None, None, "by its name no signal that a fit needs, left out"
     if "erpm" in words:
@@ -178,6 +184,36 @@ def _signal(name: str, table: Cells, taken: Collection[str]) -> tuple[str | None
     if signal is None or signal in taken:
         return None, None, f"left out, {signal} is another" if signal else "not known, left out"
     return signal, units[signal], ""
+
+
+def _stated(name: str, table: Cells) -> tuple[list[str], str]:
+    """Return what the file states as a column's unit (beside it, in brackets, after "in", as a sign), its bare name."""
+    bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]", name)
+    bare = (name.replace(bracket[0], " ") if bracket else name).strip()
+    after = re.search(r"\sin\s+(\S+)$|([°º%](?:/\w+)?)$", bare)
+    texts = [
+        table.units.get(name, ""),
+        bracket[1] if bracket else "",
+        (after[1] or after[2]) if after else "",
+    ]
+    return [one.strip("[]() ") for one in texts if one], bare[: after.start()] if after else bare
+
+
+def _factor(
+    signal: str, stated: Collection[str], ends: Collection[str] = ()
+) -> tuple[str, str | None]:
+    """Return the factor and unit of `0.1 deg`; a unit of None where it is unclear, as of `deg x10`; else no factor."""
+    for text in (one for one in stated if re.search(r"\d", one) and not _valid(signal, one)):
+        match = _SCALED.fullmatch(text)
+        if match and (unit := _valid(signal, match[2].strip())):
+            return match[1], unit
+        if any(_valid(signal, one) for one in re.split(r"[\W\d_]+", text)):
+            return text, None
+    attached = (re.fullmatch(r"x\d+|\d+x|\d+(\D+)", one) for one in ends)
+    return next(
+        ((one[0], None) for one in attached if one and (not one[1] or _valid(signal, one[1]))),
+        ("", None),
+    )
 
 
 def _valid(signal: str, unit: str) -> str | None:
@@ -205,7 +241,14 @@ def _entry(signal: str, name: str, unit: str | None, table: Cells) -> tuple[_Ent
     plain = bare.isascii() and bare.isidentifier() and not keyword.iskeyword(bare)
     formula = name if plain else json.dumps(name, ensure_ascii=False)
     values, doubt = _numbers(name, table), ""
-    if unit is None:
+    factor, scaled = _factor(signal, _stated(name, table)[0])
+    if scaled:
+        values, unit = values * float(factor), scaled
+        formula, doubt = (
+            f"{formula}*{factor}",
+            f"a factor of {factor} is stated beside its unit, and taken: see to it",
+        )
+    elif unit is None:
         unit, doubt = _unit(signal, name, formula, values, table)
     if (rest := re.sub("sec$", "nanosec", name)) != name and rest in table.columns:
         formula += f"+{json.dumps(rest)}/1e9"

@@ -261,6 +261,8 @@ def check_spaces(policy: Any, env: EnvConfig, exact: bool = True) -> None:
 
     Unless `exact`, actions that differ in their bounds alone are warned of.
     """
+    if all(getattr(policy, name, None) is None for name in ("observation_space", "action_space")):
+        return
     with contextlib.closing(env.make()) as made:
         present = {name: getattr(made, name) for name in ("observation_space", "action_space")}
     for name, space in present.items():

@@ -15,6 +15,7 @@ from filelock import FileLock, Timeout
 
 from codrl_mj.actuators import label_of, set_display_name, trusting
 from codrl_mj.fields import command, differing
+from codrl_mj.user_code import UntrustedCodeError
 from codrl_mj.runs import (
     BEST,
     CHECKPOINT,
@@ -69,6 +70,8 @@ def load_config(run: Path, trust: bool = False) -> TrainConfig:
         for actuator, label in zip(config.actuators, content.get("labels", ()), strict=False):
             set_display_name(actuator, label)
         return config
+    except UntrustedCodeError as error:
+        raise ValueError(f"{run / CONFIG}: {error}") from None
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{run / CONFIG}: not a run configuration: {error}") from None
 

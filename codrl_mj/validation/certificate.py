@@ -12,6 +12,7 @@ from typing import Any
 
 import mujoco
 
+from codrl_mj.engine.specs import NO_ACTUATORS_READ
 from codrl_mj.physics import install_callbacks, motors
 from codrl_mj.tasks import OURS, TASKS, find_task
 from codrl_mj.validation import execution, own_model
@@ -259,6 +260,11 @@ def validate_model(
         ValueError: the model has no motor of ours, or one that is not as it should be.
         CallbackInUseError: another library's MuJoCo callback is installed where ours has to go.
     """
+    if not model.nactuator:
+        raise ValueError(
+            f"the model has no actuators ({NO_ACTUATORS_READ}): add one per joint, put motors"
+            " behind them with codrl_mj.add_motors, and validate what it makes"
+        )
     if not motors(model):
         raise ValueError(
             f"the model has no motor of codrl_mj among its {model.nactuator} actuators: put some in"

@@ -420,7 +420,9 @@ def test_a_speed_that_cannot_be_held_is_refused_and_one_that_is_wrong_warned_of(
         chain("dcx22l", 0.02, [math.inf])
     with pytest.warns(UserWarning, match=r"above 0\.5 it is wrong"):
         chain("1331t", 0.02, [math.inf])
-    with pytest.warns(UserWarning, match=r"takes 22\.4 of the rotor's speed .* shorten the step"):
+    with pytest.warns(
+        UserWarning, match=r"is 22\.4 times the time in which .* steps late: shorten the step"
+    ):
         chain("dcx22l", 0.2, [0.0])
     light = dataclasses.replace(
         Drive(), motor=GearMotor(rotor_inertia=0.0), controller=SampledLoop(500.0)

@@ -39,6 +39,10 @@ REFUSED = [
     ("train cartpole more", "unexpected 'more': codrl-mj train --help"),
     ("train cartpole --seed", "--seed needs a value: a whole number"),
     ("train cartpole --seed two", "--seed two: must be a whole number"),
+    (
+        "train pendulum --actuator.supply.voltage 12V",
+        "--voltage/--actuator.supply.voltage 12V: must be",
+    ),
     ("train cartpole --total-steps 1.5e0", "--total-steps 1.5: must be None or a whole number"),
     ("train cartpole --sed 3", "unknown flag --sed: did you mean '--seed'?"),
     ("train cartpole --kp 3", "unknown flag --kp: did you mean '--actuator.controller.kp'?"),

@@ -343,3 +343,10 @@ def test_training_says_first_what_is_assumed_of_the_motor(capsys, monkeypatch):
     assert capsys.readouterr().out.splitlines()[0] == assumed
     ran(f"{line} --actuator.supply.voltage 12 --actuator.controller.max-current 5")
     assert "assumed, for" not in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("always:Disturbances.command_delay")
+def test_a_warning_is_printed_once_however_many_environments_it_is_about(tmp_path, capsys):
+    line = f"train furuta {TINY} --env.disturbances.command-delay 2"
+    assert main([*line.split(), "--out", str(tmp_path / "late")]) == 0
+    assert capsys.readouterr().err.count("a delay of 100 environment steps") == 1

@@ -13,6 +13,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import stable_baselines3
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 import codrl_mj
@@ -32,6 +33,20 @@ LEARNS["dqn"] = LEARNS["sac"]
 TASK_IDS = {"pendulum": "codrl_mj/Pendulum-v0", "cartpole": "codrl_mj/CartPole-v0"}
 
 
+class Pushes(gym.ActionWrapper):
+    """The inverted pendulum, pushed to a side or not at all."""
+
+    def __init__(self, several=False, **arguments):
+        """Take one action, or a vector of one."""
+        super().__init__(InvertedPendulumEnv(**arguments))
+        self.action_space = gym.spaces.MultiDiscrete([3]) if several else gym.spaces.Discrete(3)
+
+    def action(self, action):
+        return np.array([-3.0, 0.0, 3.0])[np.atleast_1d(action)]
+
+
+gym.register("Pushes-v0", Pushes, max_episode_steps=50)
+gym.register("SeveralPushes-v0", Pushes, max_episode_steps=50, kwargs={"several": True})
 ZIP = ["--task", "pendulum", "--agent", "ppo", "--trust"]
 
 
@@ -377,3 +392,50 @@ def test_statistics_count_as_numbers_of_the_network(half):
         for one in ("none", half / "apart/statistics.pkl")
     )
     assert whole.size == plain.size + 2 * 3
+
+
+@pytest.mark.parametrize("agent", ["ppo", "dqn"])
+def test_discrete_actions_of_anybody_are_exported_as_their_index(
+    tmp_path, monkeypatch, capsys, agent
+):
+    monkeypatch.chdir(tmp_path)
+    model = model_of(agent, gym.make("Pushes-v0"))
+    model.save(tmp_path / "policy.zip")
+    told = [
+        "--task",
+        "tests.deploy.test_zip:Pushes-v0",
+        "--agent",
+        agent,
+        "--trust",
+        "--normalize",
+        "none",
+    ]
+    assert main(["export", "policy.zip", *told, "--out", "exported"]) == 0, capsys.readouterr().err
+    observations = np.random.default_rng(0).normal(size=(300, 4)).astype(np.float32)
+    expected = model.predict(observations, deterministic=True)[0]
+    actions = onnxruntime.InferenceSession("exported/policy.onnx").run(
+        None, {"observation": observations}
+    )[0]
+    assert (actions == expected).all()
+    assert Contract.read(tmp_path / "exported").actions == [{"name": "action", "unit": None}]
+    if not missing_tools("host"):
+        with Board(tmp_path / "exported", trust=True) as board:
+            assert [board.command(one)[0] for one in observations[:50]] == expected[:50].tolist()
+
+
+def test_several_discrete_actions_are_refused_by_name(tmp_path, capsys):
+    model_of("ppo", gym.make("SeveralPushes-v0")).save(tmp_path / "policy.zip")
+    told = [
+        "--task",
+        "tests.deploy.test_zip:SeveralPushes-v0",
+        "--agent",
+        "ppo",
+        "--trust",
+        "--normalize",
+        "none",
+    ]
+    assert (
+        main(["export", str(tmp_path / "policy.zip"), *told, "--out", str(tmp_path / "exported")])
+        == 2
+    )
+    assert "actions are MultiDiscrete([3]): must be vectors, or Discrete" in capsys.readouterr().err

@@ -230,6 +230,38 @@ def test_a_log_of_somebody_is_proposed_and_taken_once_its_units_are_filled_in(tm
     checked([log], "free", {"load_inertia": 0.0})
 
 
+@pytest.mark.parametrize(
+    ("header", "expected", "factor"),
+    [
+        ("current [0.1 A]", 'current="current [0.1 A]"*0.1:A', 0.1),
+        ("current (x10 mA)", 'current="current (x10 mA)"*10:mA', 0.01),
+        ("position (0.088deg)", 'position="position (0.088deg)"*0.088:deg', np.radians(0.088)),
+        ("velocity [10 rpm]", 'velocity="velocity [10 rpm]"*10:rpm', np.pi / 3.0),
+        ("torque [1e-3 N*m]", 'torque="torque [1e-3 N*m]"*1e-3:N*m', 1e-3),
+        ("Drehzahl [min-1]", 'velocity="Drehzahl [min-1]":min-1', np.pi / 30.0),
+        ("pos (axis 1) deg", 'position="pos (axis 1) deg":deg', np.pi / 180.0),
+        ("motor_2_current_A", "current=motor_2_current_A:A", 1.0),
+        ("Winkel °", 'position="Winkel °":deg', np.pi / 180.0),
+        ("turns", "position=turns:turns", 2.0 * np.pi),
+        ("Strom in mA", 'current="Strom in mA":mA', 1e-3),
+    ],
+)
+def test_a_unit_keeps_the_factor_that_a_header_states(tmp_path, header, expected, factor):
+    path = written(tmp_path, {"t [s]": TIME, "U [V]": VOLTS, header: CURRENT})
+    columns = propose_columns(path).columns
+    assert columns.endswith(f",{expected}")
+    log = read_log(path, columns)
+    np.testing.assert_allclose(log.signals[expected.split("=")[0]], factor * CURRENT, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "header", ["position (deg x10)", "speed [rpm/10]", "current_10mA", "pos_01deg", "pos_x100_deg"]
+)
+def test_a_factor_that_can_be_read_in_two_ways_leaves_the_unit_open(tmp_path, header):
+    path = written(tmp_path, {"t [s]": TIME, "U [V]": VOLTS, header: CURRENT})
+    assert propose_columns(path).columns.endswith(":UNIT")
+
+
 MOTION = {"position_rad": ANGLE, "velocity_rad_s": SPEED}
 EFFORTS = {"torque_Nm": CURRENT, "current_A": CURRENT, "voltage_V": VOLTS}
 

@@ -153,8 +153,9 @@ def test_the_episode_is_the_median_one_of_the_evaluation_or_says_how_rare_it_is(
     assert "seed 7, return" in text
     assert f"of 5 evaluated episodes {worse} returned less, the median -900 (seed 1000000)" in text
     evaluated(run, [])
-    assert "seed 0, return" in of(run).text
-    assert "evaluated episodes" not in of(run).text
+    text = of(run).text
+    assert "seed 0, return" in text
+    assert "evaluated episodes" not in text
 
 
 def test_of_the_best_policy_it_is_the_median_of_its_own_evaluation(run, capsys):
