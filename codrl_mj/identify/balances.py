@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.log import Log, sensor_deviation, usable
+from codrl_mj.identify.log import Log, sensor_deviation, gapless_stretches
 
 _ROWS = 12  # rows of a window, at least
 _LONGEST = 20_000  # rows of a log beyond which a lag is not looked for
@@ -22,7 +22,7 @@ _BUMP = np.polynomial.Polynomial([0.0, 1.0, -1.0]) ** 5
 _UNIT = _BUMP / _BUMP.integ()(1.0)
 _PHI = {-1: _UNIT.integ(), 0: _UNIT, 1: _UNIT.deriv(), 2: _UNIT.deriv(2)}
 """Order of the derivative by the phase -> polynomial; -1: its integral."""
-BODY = (
+NONNEGATIVE_TERMS = (
     "inertia",
     "viscous",
     "coulomb",
@@ -46,7 +46,7 @@ class Windows:
         duration = min(duration, float(log.time[-1] - log.time[0]) / 10.0)
         count = max(math.ceil(duration / log.step), _ROWS)
         every = np.concatenate(
-            [np.arange(one.start, one.stop - count, max(count // 4, 1)) for one in usable(log)]
+            [np.arange(one.start, one.stop - count, max(count // 4, 1)) for one in gapless_stretches(log)]
         )
         self.rows = every[:: math.ceil(len(every) / most) or 1, None] + np.arange(count + 1)
         self._log = log
@@ -97,7 +97,7 @@ def regress(
     matrix = np.column_stack(list(terms.values()))
     scales = np.sqrt(np.mean(matrix**2, axis=0))
     matrix = matrix / scales
-    bounds = [least if name in BODY else -np.inf for name in terms], np.inf
+    bounds = [least if name in NONNEGATIVE_TERMS else -np.inf for name in terms], np.inf
     weights = np.ones(len(target))
     for _ in range(8 if least == -np.inf else 1):  # Huber's weights, reweighted
         solution, _, rank, _ = np.linalg.lstsq(
@@ -209,7 +209,7 @@ class Shift(NamedTuple):
 
 def velocity_lag(log: Log) -> Shift | None:
     """How late, up to 0.1 s, the velocity is against the differentiated position, and its gain over that."""
-    log = log.part(slice(0, _LONGEST))
+    log = log.slice_rows(slice(0, _LONGEST))
     windows = Windows(log, max(0.05, 4.0 * log.step), _WINDOWS)
     rate = windows.mean("position", 1)
     velocity, time = log.signals["velocity"], log.time
@@ -236,7 +236,7 @@ def effort_lag(log: Log, effort: str) -> Shift | None:
     That is the current, up to 20 rows, against a `voltage`; the motion, up to 60 ms, against a
     `torque`.
     """
-    log = log.part(slice(0, _LONGEST))
+    log = log.slice_rows(slice(0, _LONGEST))
     if effort == "voltage":
         windows, ahead, behind = Windows(log, most=_WINDOWS), 3.0 * log.step, 20.0 * log.step
         terms = _voltage_terms(log, windows)

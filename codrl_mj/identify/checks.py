@@ -14,16 +14,16 @@ from codrl_mj.identify.balances import (
     voltage_balance,
 )
 from codrl_mj.identify.log import (
-    LONGEST_STEP,
+    GAP_STEPS,
     SIGNALS,
     Finding,
     Log,
     find_resolution,
-    is_supply,
-    moves,
-    obstacle,
-    replaced,
-    turn_jumps,
+    is_supply_voltage,
+    has_motion,
+    find_obstacle,
+    replace_signal,
+    find_turn_jumps,
 )
 from codrl_mj.identify.parameters import PARAMETERS
 from codrl_mj.identify.signal_checks import signal_findings
@@ -53,7 +53,7 @@ _DROWNED = 0.1  # noise over the motion, beyond which no error of speeds is clai
 _TILTED = 0.03  # rad, by which a pendulum hangs beside position 0
 
 
-class Seen(NamedTuple):
+class LogFacts(NamedTuple):
     """A log under examination, beside a datasheet's `GearMotor` and on a rig, where given."""
 
     log: Log
@@ -64,7 +64,7 @@ class Seen(NamedTuple):
     winding: Balance | None  # R, L and kE by the voltage; None where it does not change
 
 
-CHECKS: list[tuple[set[str], Callable[[Seen], Iterator[Finding]]]] = []
+CHECKS: list[tuple[set[str], Callable[[LogFacts], Iterator[Finding]]]] = []
 """What a check needs of a log, and what finds and words what it finds; in this order."""
 
 
@@ -81,10 +81,10 @@ def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
     effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), "")
     holds = {*log.signals, *(["effort"] if effort else []), *(["datasheet"] if motor else [])}
     if log.has("position") or log.has("velocity"):
-        holds |= {"motion", "moves" if moves(log) else "stands"}
+        holds |= {"motion", "moves" if has_motion(log) else "stands"}
     holds |= {"hangs"} if rig in (None, "pendulum") else set()
     winding = voltage_balance(log) if log.has("voltage", "current") else None
-    seen = Seen(log, motor, rig, effort, holds, winding)
+    seen = LogFacts(log, motor, rig, effort, holds, winding)
     findings = [
         *log.findings,
         *(one for needs, found in CHECKS if needs <= holds for one in found(seen)),
@@ -93,7 +93,7 @@ def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
     return sorted(findings, key=lambda one: order.index(one.severity))
 
 
-def name_of_factor(ratio: float, angle: bool = True) -> str:
+def explain_factor(ratio: float, angle: bool = True) -> str:
     """What a ratio, or its inverse, could be: all confusions within 8 %, else a scale or a gear."""
     size = abs(math.log(abs(ratio)))
     near = [
@@ -107,18 +107,18 @@ def name_of_factor(ratio: float, angle: bool = True) -> str:
 
 
 @_needs("")
-def _obstacle(seen: Seen) -> Iterator[Finding]:
+def _obstacle(seen: LogFacts) -> Iterator[Finding]:
     """Find what a fit of this log alone would refuse."""
-    if found := obstacle([seen.log]):
+    if found := find_obstacle([seen.log]):
         yield found
 
 
 @_needs("")
-def _times(seen: Seen) -> Iterator[Finding]:
+def _times(seen: LogFacts) -> Iterator[Finding]:
     """Gaps, dropped rows, jitter, and stamps in another unit."""
     log, usual, rows = seen.log, seen.log.step, seen.log.row_numbers
     steps = np.diff(log.time)
-    gaps = np.flatnonzero(steps > LONGEST_STEP * usual)
+    gaps = np.flatnonzero(steps > GAP_STEPS * usual)
     for place in gaps[:_MOST_LISTED]:
         text = (
             f"a gap of {steps[place]:.4g} s after {log.time[place]:.4g} s,"
@@ -131,7 +131,7 @@ def _times(seen: Seen) -> Iterator[Finding]:
         yield Finding(
             "warning", "gap", None, f"{gaps.size - _MOST_LISTED} more gaps", "see the first ones"
         )
-    dropped = np.flatnonzero((steps > _DROPPED * usual) & (steps <= LONGEST_STEP * usual))
+    dropped = np.flatnonzero((steps > _DROPPED * usual) & (steps <= GAP_STEPS * usual))
     if dropped.size:
         missing = int(np.sum(np.round(steps[dropped] / usual) - 1.0))
         share = missing / (len(log.time) + missing)
@@ -162,15 +162,15 @@ def _times(seen: Seen) -> Iterator[Finding]:
 
 
 @_needs("")
-def _signals(seen: Seen) -> Iterator[Finding]:
+def _signals(seen: LogFacts) -> Iterator[Finding]:
     """Each signal by itself."""
     yield from signal_findings(seen.log)
 
 
 @_needs("position")
-def _wrapped(seen: Seen) -> Iterator[Finding]:
+def _wrapped(seen: LogFacts) -> Iterator[Finding]:
     """A position that jumps by a turn."""
-    jumps = turn_jumps(seen.log.signals["position"], 2.0 * math.pi)
+    jumps = find_turn_jumps(seen.log.signals["position"], 2.0 * math.pi)
     if jumps.size:
         text = f"the position jumps by a turn, {jumps.size} times, first here"
         remedy = "write position=unwrap(column, 2*pi):rad, or unwrap(column, 360):deg"
@@ -178,7 +178,7 @@ def _wrapped(seen: Seen) -> Iterator[Finding]:
 
 
 @_needs("")
-def _sizes(seen: Seen) -> Iterator[Finding]:
+def _sizes(seen: LogFacts) -> Iterator[Finding]:
     """Values that no bench has: more voltage than the supply has, too, and what looks like a duty."""
     for signal in _MOST.keys() & seen.log.signals.keys():
         largest = float(np.quantile(np.abs(seen.log.signals[signal]), 0.99))  # not an outlier
@@ -199,7 +199,7 @@ def _sizes(seen: Seen) -> Iterator[Finding]:
     if log.has("position"):  # over many rows, in which an encoder's flicker is nothing
         rows, position = max(len(log.time) // 20, 1), log.signals["position"]
         others.append(position[rows:] - position[:-rows])
-    if is_supply(log.signals["voltage"], others):
+    if is_supply_voltage(log.signals["voltage"], others):
         text = (
             f"the voltage stays near {np.median(voltage):.3g} V while the motor goes both ways: it"
             " is the supply's"
@@ -228,11 +228,11 @@ def _sizes(seen: Seen) -> Iterator[Finding]:
 
 
 @_needs("position")
-def _degrees(seen: Seen) -> Iterator[Finding]:
+def _degrees(seen: LogFacts) -> Iterator[Finding]:
     """A position in degrees: gravity pulls as at a fraction of it, or its encoder divides 360 and not 2 pi."""
     log, effort, remedy = seen.log, seen.effort, "write position=column:deg"
     if {"effort", "moves", "hangs"} <= seen.holds:
-        turned = replaced(log, "position", np.deg2rad(log.signals["position"]))
+        turned = replace_signal(log, "position", np.deg2rad(log.signals["position"]))
         now, then = (torque_balance(one, effort, aside=True) for one in (log, turned))
         pulls = then is not None and then.certainty.get("gravity", 0.0) > _CERTAIN
         if now and then and pulls and then.residual < 0.5 * now.residual and now.unexplained > 0.1:
@@ -257,7 +257,7 @@ def _degrees(seen: Seen) -> Iterator[Finding]:
 
 
 @_needs("position velocity moves")
-def _velocity(seen: Seen) -> Iterator[Finding]:
+def _velocity(seen: LogFacts) -> Iterator[Finding]:
     """The velocity against the differentiated position."""
     found = velocity_lag(seen.log)
     if found is None:
@@ -284,7 +284,7 @@ def _velocity(seen: Seen) -> Iterator[Finding]:
     if clear and (min(ends) > 0.1 or max(ends) < -0.1):
         text = (
             f"the velocity is {abs(found.gain):.4g} times what the position says:"
-            f" {name_of_factor(found.gain)}"
+            f" {explain_factor(found.gain)}"
         )
         yield Finding("error", "unit", None, text, "correct the unit of velocity, position or time")
     rows = abs(found.lag) / seen.log.step
@@ -299,7 +299,7 @@ def _velocity(seen: Seen) -> Iterator[Finding]:
 
 
 @_needs("voltage current")
-def _electrical(seen: Seen) -> Iterator[Finding]:
+def _electrical(seen: LogFacts) -> Iterator[Finding]:
     """Signs and certainty of R, L and kE."""
     balance = seen.winding
     if balance is None:
@@ -364,7 +364,7 @@ def _electrical(seen: Seen) -> Iterator[Finding]:
 
 
 @_needs("voltage current")
-def _delay(seen: Seen) -> Iterator[Finding]:
+def _delay(seen: LogFacts) -> Iterator[Finding]:
     """The current against the voltage."""
     log, found = seen.log, effort_lag(seen.log, "voltage")
     if found is None or found.unexplained > 0.3:
@@ -398,7 +398,7 @@ def _delay(seen: Seen) -> Iterator[Finding]:
 
 
 @_needs("voltage current")
-def _sag(seen: Seen) -> Iterator[Finding]:
+def _sag(seen: LogFacts) -> Iterator[Finding]:
     """A supply that gives way, where the share of its voltage changes; at one share it looks as the winding does."""
     balance, share = seen.winding, np.abs(seen.log.signals["voltage"])
     sagging = (
@@ -416,7 +416,7 @@ def _sag(seen: Seen) -> Iterator[Finding]:
 
 
 @_needs("effort moves")
-def _mechanical(seen: Seen) -> Iterator[Finding]:
+def _mechanical(seen: LogFacts) -> Iterator[Finding]:
     """Signs of inertia and gravity; whether the motion follows from the torque."""
     log, effort, rig = seen.log, seen.effort, seen.rig
     # where it shakes, shorter windows show more of the inertia
@@ -496,7 +496,7 @@ def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
 
 
 @_needs("motion")
-def _motion(seen: Seen) -> Iterator[Finding]:
+def _motion(seen: LogFacts) -> Iterator[Finding]:
     """Whether it moves back and forth."""
     signals, remedy = seen.log.signals, "leave position and velocity out if it is"
     speed = signals["velocity"] if "velocity" in signals else np.diff(signals["position"])
@@ -512,7 +512,7 @@ def _motion(seen: Seen) -> Iterator[Finding]:
 
 
 @_needs("voltage current torque")
-def _two_constants(seen: Seen) -> Iterator[Finding]:
+def _two_constants(seen: LogFacts) -> Iterator[Finding]:
     """The torque constant against the back-EMF constant, which in SI are equal but for losses and star or delta."""
     # the steps of an encoder take less from the speed of longer windows
     balance = seen.winding and (voltage_balance(seen.log, 0.1) or seen.winding)
@@ -529,14 +529,14 @@ def _two_constants(seen: Seen) -> Iterator[Finding]:
             f"torque/current is {constant:.3g} N*m/A and the back-EMF constant {back_emf:.3g}"
             " V*s/rad, must be about "
         )
-        text += f"equal: {name_of_factor(constant / back_emf)}"
+        text += f"equal: {explain_factor(constant / back_emf)}"
         yield Finding(
             "error", "unit", None, text, "correct the unit of torque, current, voltage or motion"
         )
 
 
 @_needs("voltage current datasheet")
-def _datasheet(seen: Seen) -> Iterator[Finding]:
+def _datasheet(seen: LogFacts) -> Iterator[Finding]:
     """Resistance and back-EMF constant against what is printed."""
     motor, balance = seen.motor, seen.winding
     constant = motor.back_emf_constant * motor.gear_ratio
@@ -551,5 +551,5 @@ def _datasheet(seen: Seen) -> Iterator[Finding]:
                 f" {value:.3g} {unit}: "
             )
             remedy = "correct the units of voltage, current and motion, or name the right motor"
-            text += name_of_factor(found / value, name != "resistance")
+            text += explain_factor(found / value, name != "resistance")
             yield Finding("error", "unit", None, text, remedy)

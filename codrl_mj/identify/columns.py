@@ -13,7 +13,7 @@ import numpy as np
 from codrl_mj.fields import check_names
 from codrl_mj.identify.log import SIGNALS
 
-KINDS: dict[str, str | None] = {
+COLUMN_UNITS: dict[str, str | None] = {
     "time": "s",
     **SIGNALS,
     "only": "",
@@ -84,9 +84,9 @@ class Column:
 
     def __post_init__(self) -> None:
         """Validate, without a file."""
-        check_names([self.signal], KINDS, "signal")
+        check_names([self.signal], COLUMN_UNITS, "signal")
         bare = self._formula[2]
-        kind = KINDS[self.signal]
+        kind = COLUMN_UNITS[self.signal]
         if self.unit == OPEN_UNIT:
             remedy = f"write the column's own, such as {EXAMPLES[self.signal]}"
             raise self._wrong(f"the unit is not filled in; {remedy}. The file does not state it")
@@ -109,7 +109,7 @@ class Column:
         """The columns and constants that it reads."""
         return self._formula[1]
 
-    def value(self, table: Mapping[str, Any]) -> Any:
+    def evaluate(self, table: Mapping[str, Any]) -> Any:
         """The signal in SI, by a table of columns and constants."""
         for name in sorted(self.names - table.keys()):
             if width := sum(
@@ -181,7 +181,7 @@ class Column:
 
     def _quantity(self, value: Any) -> Any:
         """A value in SI."""
-        kind, unit = KINDS[self.signal], self.unit
+        kind, unit = COLUMN_UNITS[self.signal], self.unit
         if unit is None or (not kind and unit in ("", "1")):
             return value
         from codrl_mj.catalogue.units import in_si

@@ -12,21 +12,21 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from codrl_mj.identify.log import Log, Segment, shifted
+from codrl_mj.identify.log import Log, Segment, shift_signal
 from codrl_mj.identify.parameters import DEFAULTS, PARAMETERS
 
 # step of finite differences, in the parameters' scales: dry friction makes smaller ones rough
-DIFFERENCE = 1e-4
-FAR = 1e30
-SCREENING = 12  # evaluations from each of several starts
+DIFFERENCE_STEP = 1e-4
+MAX_SQUARED_RESIDUALS = 1e30
+SCREENING_EVALUATIONS = 12  # evaluations from each of several starts
 DELAYS = (-1, 1, 2, 3)  # rows that the input is tried to be late by, besides 0;
-LONGEST = 20  # and on to so many, while that is better
-STARTS = 4
-BETTER = 0.8  # a delay is believed where it takes the robust cost to less than this share, and
+MAX_DELAY = 20  # and on to so many, while that is better
+NUM_STARTS = 4
+MAX_COST_RATIO = 0.8  # a delay is believed where it takes the robust cost to less than this share, and
 # lowers that of the segments by more, in the mean, than so many standard deviations of that mean
-SURE = 3.0
-UNEXPLAINED = 8.0  # residuals of more standard deviations of the sensor in the mean are no noise,
-UNLIKE = 0.02
+MIN_DEVIATIONS = 3.0
+MAX_MEAN_RESIDUAL = 8.0  # residuals of more standard deviations of the sensor in the mean are no noise,
+MAX_UNEXPLAINED_SHARE = 0.02
 """and more than this share of what moves within a segment is not explained: the log is bad, or the model is."""
 Simulate = Callable[[Segment, np.ndarray], np.ndarray]
 
@@ -40,7 +40,7 @@ class Model(abc.ABC):
     known: Mapping[str, float]  # values of parameters that are not fitted
     defaults: Mapping[str, float] = dataclasses.field(default_factory=lambda: DEFAULTS)
     """Values of parameters that are neither fitted nor known."""
-    names: tuple[str, ...] = ()  # free parameters; none before `begun`
+    names: tuple[str, ...] = ()  # free parameters; none before `initial_guess`
     scales: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(0))
     """What a change of each is measured by, > 0, shape (p,)."""
     steps: ClassVar[np.ndarray]  # steps of finite differences of the state, shape (s,)
@@ -49,7 +49,7 @@ class Model(abc.ABC):
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Least and largest values of the free parameters, each of shape (p,)."""
         free = [PARAMETERS[name] for name in self.names]
-        return np.array([one.least for one in free]), np.array([one.most for one in free])
+        return np.array([one.lower for one in free]), np.array([one.upper for one in free])
 
     def all_values(self, values: np.ndarray) -> dict[str, float]:
         """Free and known parameters by name."""
@@ -64,11 +64,11 @@ class Model(abc.ABC):
         """The logs, cut."""
 
     @abc.abstractmethod
-    def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
+    def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
         """With what is free in such segments, and starts for it, each of shape (p,)."""
 
     @abc.abstractmethod
-    def at(self, values: np.ndarray) -> Simulate:
+    def simulator(self, values: np.ndarray) -> Simulate:
         """(segment, state at its beginning) -> what the sensor would have seen, shape (m,), for parameters (p,)."""
 
 
@@ -89,7 +89,7 @@ class Fit:
     states: tuple[np.ndarray, ...]  # at the beginning of each segment
     logs: tuple[Log, ...] = ()  # of the segments, with the input in time
     delay: float = 0  # rows by which it was late
-    tried: tuple["Fit", ...] = ()  # what each start led to
+    start_fits: tuple["Fit", ...] = ()  # what each start led to
 
     @property
     def cost(self) -> float:
@@ -112,7 +112,7 @@ def robust_cost(residuals: np.ndarray, scale: float) -> float:
 
 def _residuals(simulate: Simulate, segment: Segment, state: np.ndarray) -> np.ndarray:
     found = (simulate(segment, state) - segment.measured) / segment.deviation
-    return found if found @ found < FAR else np.clip(np.nan_to_num(found, nan=1e9), -1e9, 1e9)
+    return found if found @ found < MAX_SQUARED_RESIDUALS else np.clip(np.nan_to_num(found, nan=1e9), -1e9, 1e9)
 
 
 class _Settled(NamedTuple):
@@ -153,9 +153,9 @@ def _settle(
     return _Settled(state, here, columns)
 
 
-def settled_state(model: Model, values: np.ndarray, segment: Segment) -> np.ndarray:
+def best_initial_state(model: Model, values: np.ndarray, segment: Segment) -> np.ndarray:
     """The state from which a segment fits best, by the parameters (p,)."""
-    simulate = model.at(values)
+    simulate = model.simulator(values)
     scale = robust_scale(_residuals(simulate, segment, segment.state))
     return _settle(simulate, segment, segment.state, model.steps, scale).state
 
@@ -175,7 +175,7 @@ class _Problem:
         self.at: tuple[bytes | None, list[_Settled]] = None, []
 
     def settle(self, values: np.ndarray, states: Sequence[np.ndarray]) -> list[_Settled]:
-        simulate, steps = self.model.at(values), self.model.steps
+        simulate, steps = self.model.simulator(values), self.model.steps
         return [
             _settle(simulate, *pair, steps, self.scale)
             for pair in zip(self.segments, states, strict=True)
@@ -207,9 +207,9 @@ class _Problem:
         found = self.solve(values)
         self.known, self.slopes, self.origin = [one.state for one in found], [], values.copy()
         model, made = self.model, []
-        inward = np.where(values + DIFFERENCE * model.scales > model.bounds[1], -1.0, 1.0)
-        moves = np.diag(inward * DIFFERENCE * model.scales)
-        moved = [model.at(values + move) for move in moves]
+        inward = np.where(values + DIFFERENCE_STEP * model.scales > model.bounds[1], -1.0, 1.0)
+        moves = np.diag(inward * DIFFERENCE_STEP * model.scales)
+        moved = [model.simulator(values + move) for move in moves]
         for segment, (state, residuals, own) in zip(self.segments, found, strict=True):
             columns = np.empty((len(residuals), len(values)))
             for place, (simulate, move) in enumerate(zip(moved, moves, strict=True)):
@@ -225,7 +225,7 @@ def robust_scale(residuals: np.ndarray) -> float:
     return 1.5 * max(1.4826 * float(np.median(np.abs(residuals))), 1.0)
 
 
-def search(
+def fit_from_starts(
     model: Model,
     segments: Sequence[Segment],
     starts: Sequence[np.ndarray],
@@ -235,7 +235,7 @@ def search(
     found = []
     for start in starts:
         found.append(
-            refit(model, segments, start, SCREENING, states=[segment.state for segment in segments])
+            optimize(model, segments, start, SCREENING_EVALUATIONS, states=[segment.state for segment in segments])
         )
         on_start()
     least = min(one.scale for one in found)
@@ -244,11 +244,11 @@ def search(
         return robust_cost(np.concatenate(fit.residuals), least)
 
     found.sort(key=cost)
-    polished = [refit(model, segments, one.values, 40, one.scale, one.states) for one in found[:2]]
+    polished = [optimize(model, segments, one.values, 40, one.scale, one.states) for one in found[:2]]
     return min(polished, key=cost), tuple(found)
 
 
-def refit(
+def optimize(
     model: Model,
     segments: Sequence[Segment],
     start: np.ndarray,
@@ -260,11 +260,11 @@ def refit(
     from scipy.optimize import least_squares
 
     if states is None:
-        states = [settled_state(model, start, one) for one in segments]
+        states = [best_initial_state(model, start, one) for one in segments]
     lower, upper = model.bounds
     values = np.clip(start, lower, upper)
     if scale is None:
-        simulate = model.at(values)
+        simulate = model.simulator(values)
         left = [
             _residuals(simulate, one, state) for one, state in zip(segments, states, strict=True)
         ]
@@ -295,14 +295,14 @@ def refit(
     return Fit(model, segments, values, problem.scale, residuals, tuple(jacobians), states)
 
 
-def refitted(fit: Fit, model: Model) -> Fit:
+def refit_model(fit: Fit, model: Model) -> Fit:
     """Another model of the same logs, from where a fit ended."""
     segments = model.segments(fit.logs)
-    found = refit(model.begun(segments)[0], segments, fit.values)
-    return dataclasses.replace(found, logs=fit.logs, delay=fit.delay, tried=fit.tried)
+    found = optimize(model.initial_guess(segments)[0], segments, fit.values)
+    return dataclasses.replace(found, logs=fit.logs, delay=fit.delay, start_fits=fit.start_fits)
 
 
-def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fit:
+def fit_model(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fit:
     """Fit a model to logs: several starts, then the delays.
 
     A voltage whose mean between two rows fits worse than itself is shown to hold from row to row:
@@ -310,21 +310,21 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
     rows' times, and taken half a row later.
     """
     segments = model.segments(logs)
-    model, starts = model.begun(segments)
+    model, starts = model.initial_guess(segments)
     if not model.names:
-        fit = refit(model, segments, starts[0])
+        fit = optimize(model, segments, starts[0])
         on_step()
-        return dataclasses.replace(fit, logs=tuple(logs), tried=(fit,))
-    fit, tried = search(model, segments, starts[:STARTS], on_step)
+        return dataclasses.replace(fit, logs=tuple(logs), start_fits=(fit,))
+    fit, start_fits = fit_from_starts(model, segments, starts[:NUM_STARTS], on_step)
     costs: dict[float, np.ndarray] = {0: fit.costs(fit.scale)}
 
     def late(delay: float) -> list[Log]:
-        return [shifted(log, model.driven_by, delay) for log in logs]
+        return [shift_signal(log, model.driven_by, delay) for log in logs]
 
     def measure(*delays: float) -> float:
         """Their costs; returns the best delay that is believed."""
         for one in delays:
-            costs[one] = refit(model, model.segments(late(one)), fit.values, 20, fit.scale).costs(
+            costs[one] = optimize(model, model.segments(late(one)), fit.values, 20, fit.scale).costs(
                 fit.scale
             )
             on_step()
@@ -332,7 +332,7 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
         return best if _better(costs[best], costs[0]) else 0
 
     delay = measure(*DELAYS)
-    while delay != 0 and delay in (min(costs), max(costs)) and abs(delay) < LONGEST:
+    while delay != 0 and delay in (min(costs), max(costs)) and abs(delay) < MAX_DELAY:
         delay = measure(delay + (1 if delay > 0 else -1))
     told = late(delay)
     if model.output == "current" and not all(log.mean_voltage for log in logs):
@@ -344,16 +344,16 @@ def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lamb
             told = [dataclasses.replace(log, mean_voltage=True) for log in late(delay)]
     if delay != 0:
         segments = model.segments(told)
-        model, starts = model.begun(segments)
-        fit, tried = search(model, segments, [fit.values, starts[0]])
-    return dataclasses.replace(fit, logs=tuple(told), delay=delay, tried=tried)
+        model, starts = model.initial_guess(segments)
+        fit, start_fits = fit_from_starts(model, segments, [fit.values, starts[0]])
+    return dataclasses.replace(fit, logs=tuple(told), delay=delay, start_fits=start_fits)
 
 
 def _better(these: np.ndarray, those: np.ndarray) -> bool:
     """Whether costs of segments are lower than others, by more than chance."""
     gained = those - these
     error = gained.std(ddof=1) / np.sqrt(len(gained)) if len(gained) > 1 else 0.0
-    return bool(these.sum() < BETTER * those.sum() and gained.mean() > SURE * error)
+    return bool(these.sum() < MAX_COST_RATIO * those.sum() and gained.mean() > MIN_DEVIATIONS * error)
 
 
 def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
@@ -367,7 +367,7 @@ def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
         rest = np.concatenate([residuals * segment.deviation for segment, residuals in own])
         swing = np.concatenate([segment.measured - segment.measured.mean() for segment, _ in own])
         share = float(np.std(rest) / max(np.std(swing), 1e-12))
-        if sizes.mean() / 0.8 > UNEXPLAINED and share > UNLIKE:
+        if sizes.mean() / 0.8 > MAX_MEAN_RESIDUAL and share > MAX_UNEXPLAINED_SHARE:
             shares[log.name] = max(share, shares.get(log.name, 0.0))
             unlike[log.name] = (
                 f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} %"
@@ -386,8 +386,8 @@ def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
             " out, find out what else moved, or fit more friction"
             for name, text in unlike.items()
         ]
-    values = np.array([one.values for one in fit.tried])
-    costs = np.array([np.mean(np.abs(np.concatenate(one.residuals))) for one in fit.tried])
+    values = np.array([one.values for one in fit.start_fits])
+    costs = np.array([np.mean(np.abs(np.concatenate(one.residuals))) for one in fit.start_fits])
     near = costs < 1.1 * costs.min()
     apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(fit.values), fit.model.scales)
     if np.any(apart > 0.2):

@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, refit, search
+from codrl_mj.identify.estimate import Fit, optimize, fit_from_starts
 from codrl_mj.identify.log import SIGNALS, Log
 from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.result import predict
 
-LEAST_LOGS = (
+MIN_LOGS = (
     3  # Fewer logs give no standard deviation of what a richer friction gains on the one left out.
 )
 _LOADED = {"coulomb": "load", "stribeck": "both"}
@@ -40,11 +40,11 @@ def choose_friction(
     """
     if wanted != "auto":
         return FrictionChoice(dataclasses.replace(model, friction=wanted), "")
-    if len(logs) < LEAST_LOGS:
+    if len(logs) < MIN_LOGS:
         return FrictionChoice(
             model,
             "friction: coulomb, because auto compares the errors on logs left out: it needs"
-            f" {LEAST_LOGS} logs that move, and there {'is' if len(logs) == 1 else 'are'}"
+            f" {MIN_LOGS} logs that move, and there {'is' if len(logs) == 1 else 'are'}"
             f" {len(logs)}. Name more, or choose --friction load, stribeck or both",
         )
     errors = {"coulomb": _left_out_errors(model, logs, on_step)}
@@ -69,11 +69,11 @@ def _left_out_errors(
 ) -> np.ndarray:
     """Return the mean absolute error on each log of the fit to all others, from that to all, shape (n,)."""
     segments = model.segments(logs)
-    model, starts = model.begun(segments)
-    whole, errors = search(model, segments, starts[:2])[0].values, []
+    model, starts = model.initial_guess(segments)
+    whole, errors = fit_from_starts(model, segments, starts[:2])[0].values, []
     for place, log in enumerate(logs):
         found = predict(
-            refit(model, model.segments([*logs[:place], *logs[place + 1 :]]), whole, 12), log
+            optimize(model, model.segments([*logs[:place], *logs[place + 1 :]]), whole, 12), log
         )
         errors.append(found.open_loop if found.closed_loop is None else found.closed_loop)
         on_step()
@@ -89,7 +89,7 @@ def load_hint(fit: Fit) -> str | None:
         model, names=(*model.names, "gear_efficiency"), scales=np.append(model.scales, 0.1)
     )
     known = model.defaults["gear_efficiency"]
-    richer = refit(loaded, fit.segments, np.append(fit.values, min(known, 0.9)), 20, fit.scale)
+    richer = optimize(loaded, fit.segments, np.append(fit.values, min(known, 0.9)), 20, fit.scale)
     costs, before = richer.costs(fit.scale), fit.costs(fit.scale)
     left = max(costs.sum() / before.sum(), float(np.median(costs / before)))
     if abs(richer.values[-1] - known) <= _APART or left > _HINTED:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.fields import check_names
-from codrl_mj.identify.estimate import Fit, fitted, refitted
+from codrl_mj.identify.estimate import Fit, fit_model, refit_model
 from codrl_mj.identify.friction import choose_friction, load_hint
-from codrl_mj.identify.log import SEGMENT, Log, moves, obstacle, shifted, usage
+from codrl_mj.identify.log import SEGMENT_DURATION, Log, has_motion, find_obstacle, shift_signal, assign_logs
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import (
     DEFAULTS,
@@ -23,17 +23,17 @@ from codrl_mj.identify.parameters import (
     PARAMETERS,
 )
 from codrl_mj.identify.result import (
-    MISUNDERSTOOD,
+    MAX_UNEXPLAINED,
     USABLE,
     Estimate,
     Identified,
     Prediction,
     fitted_traces,
-    missing,
-    motor_of,
+    missing_parameters,
+    base_motor,
     predict,
 )
-from codrl_mj.identify.trust import correlations, judged
+from codrl_mj.identify.uncertainty import correlations, assess_fits
 
 STEPS_OF_A_PART = 8 + 4
 
@@ -45,7 +45,7 @@ def identify(
     friction: str = "coulomb",
     held_out: Sequence[Log] = (),
     estimated: Sequence[str] = (),
-    segment: float = SEGMENT,
+    segment: float = SEGMENT_DURATION,
     base: Mapping[str, Any] | None = None,
     on_progress: Callable[[str, int, int], None] = lambda *_: None,
     seed: int = 0,
@@ -74,14 +74,14 @@ def identify(
         ValueError: unknown names, values out of bounds, or logs that tell nothing; the message says
             what is missing.
     """
-    logs, held_out, repeated = distinct(logs, held_out)
+    logs, held_out, repeated = separate_logs(logs, held_out)
     given, motor = (
-        checked(logs, rig, known or {}, friction, estimated, segment, base),
-        motor_of(base),
+        check_arguments(logs, rig, known or {}, friction, estimated, segment, base),
+        base_motor(base),
     )
     defaults = DEFAULTS | {name: getattr(motor, name) for name in OF_LOSS if motor is not None}
     rig = rig or ("pendulum" if "mgl" in given else "free")
-    electrical, moving, driven_by, output = usage(logs)
+    electrical, moving, driven_by, output = assign_logs(logs)
     total = STEPS_OF_A_PART * max(bool(electrical) + bool(moving), 1) + 4 * len(moving) * (
         friction == "auto"
     )
@@ -94,7 +94,7 @@ def identify(
     # beside the other
     parts: dict[str, Fit] = {}
     if electrical:
-        parts["winding"] = fitted(WindingModel(known=given), electrical, step("winding"))
+        parts["winding"] = fit_model(WindingModel(known=given), electrical, step("winding"))
     if driven_by:
         shaft = ShaftModel(rig=rig, friction="coulomb", driven_by=driven_by, output=output, known=given,
                            defaults=defaults, estimated=tuple(estimated), segment=segment)  # fmt: skip
@@ -102,14 +102,14 @@ def identify(
             _told(shaft, parts.get("winding")), moving, friction, step("friction")
         )
         shaft, friction = choice.model, choice.model.friction
-        parts["shaft"] = fitted(shaft, moving, step("shaft"))
+        parts["shaft"] = fit_model(shaft, moving, step("shaft"))
         if electrical and driven_by != "voltage":
-            parts["winding"] = refitted(
+            parts["winding"] = refit_model(
                 parts["winding"], WindingModel(known=given, shaft=parts["shaft"])
             )
         shaft = _told(dataclasses.replace(shaft, known=given), parts.get("winding"))
-        parts["shaft"] = refitted(parts["shaft"], shaft)
-    estimates, warnings, unexplained = judged(parts, given, defaults, seed, step)
+        parts["shaft"] = refit_model(parts["shaft"], shaft)
+    estimates, warnings, unexplained = assess_fits(parts, given, defaults, seed, step)
     warnings = [*warnings, *_contradictions(estimates, motor)]
     if "shaft" in parts and (hint := load_hint(parts["shaft"])):
         warnings.append(hint)
@@ -149,12 +149,12 @@ def _is_better_blind(found: Identified, moving: Sequence[Log]) -> bool:
         one.name == "back_emf_constant" and one.status not in USABLE for one in found.estimates
     )
     has_voltage = found.driven_by == "current" and all(log.has("voltage") for log in moving)
-    return refused and has_voltage and found.unexplained <= MISUNDERSTOOD
+    return refused and has_voltage and found.unexplained <= MAX_UNEXPLAINED
 
 
 def _without_current(log: Log) -> Log:
     signals = {name: values for name, values in log.signals.items() if name != "current"}
-    return dataclasses.replace(log, signals=signals) if moves(log) else log
+    return dataclasses.replace(log, signals=signals) if has_motion(log) else log
 
 
 def _joined(whole: Identified, blind: Identified) -> Identified:
@@ -200,7 +200,7 @@ def _told(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
     return dataclasses.replace(shaft, known={**shaft.known, name: value})
 
 
-def distinct(
+def separate_logs(
     logs: Sequence[Log], held_out: Sequence[Log]
 ) -> tuple[list[Log], list[Log], list[str]]:
     """Return the logs to fit and the logs held out, each measurement once, and a sentence for each one left out.
@@ -257,23 +257,23 @@ def _contradictions(estimates: Sequence[Estimate], motor: Any) -> list[str]:
     ]
 
 
-def checked(
+def check_arguments(
     logs: Sequence[Log],
     rig: str | None = None,
     known: Mapping[str, float] | None = None,
     friction: str = "coulomb",
     estimated: Sequence[str] = (),
-    segment: float = SEGMENT,
+    segment: float = SEGMENT_DURATION,
     base: Mapping[str, Any] | None = None,
 ) -> dict[str, float]:
     """What is known, the gear of the base too, if the arguments of `identify` are such as it takes."""
-    motor = motor_of(base)
+    motor = base_motor(base)
     # of a motor with a gear that too: otherwise its numbers would be those of the output
     ratio = 1.0 if motor is None else motor.gear_ratio
     known = {**({} if ratio == 1.0 else {"gear_ratio": ratio}), **(known or {})}
-    _, moving, driven_by, output = usage(logs)
+    _, moving, driven_by, output = assign_logs(logs)
     if not segment >= 0.05:
-        raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT:g} is the default")
+        raise ValueError(f"segment = {segment!r}: must be >= 0.05 s; {SEGMENT_DURATION:g} is the default")
     if not logs:
         raise ValueError("logs: none was given; give one or more")
     check_names(
@@ -284,12 +284,12 @@ def checked(
     check_names([friction], ("auto", "coulomb", "stribeck", "load", "both"), "friction")
     for name, value in known.items():
         parameter = PARAMETERS[name]
-        if not (math.isfinite(value) and parameter.least <= value <= parameter.most):
+        if not (math.isfinite(value) and parameter.lower <= value <= parameter.upper):
             raise ValueError(
-                f"known {name} = {value!r}: must be from {parameter.least:g} to {parameter.most:g} "
-                f"{parameter.unit}; give {parameter.what}".strip()
+                f"known {name} = {value!r}: must be from {parameter.lower:g} to {parameter.upper:g} "
+                f"{parameter.unit}; give {parameter.description}".strip()
             )
-    if found := obstacle(logs):
+    if found := find_obstacle(logs):
         have = "; ".join(f"{log.name}: {', '.join(log.signals) or 'nothing'}" for log in logs)
         raise ValueError(f"{found.message}; {found.remedy} (logs and their signals: {have})")
     twice = sorted({*known} & {*estimated})
@@ -317,11 +317,11 @@ def checked(
     return {name: float(value) for name, value in known.items()}
 
 
-def foreseen(
+def predict_missing(
     logs: Sequence[Log], known: Mapping[str, float], base: Mapping[str, Any] | None
 ) -> str | None:
     """What will be missing for an actuator however well logs are fitted, by their signals; None: nothing."""
-    electrical, moving, driven_by, _ = usage(logs)
+    electrical, moving, driven_by, _ = assign_logs(logs)
     names = {*known, *(("resistance", "inductance") if electrical else ())}
     names |= {"resistance"} if driven_by == "voltage" else set()
     constants = {"torque_constant", "back_emf_constant"}
@@ -330,7 +330,7 @@ def foreseen(
     if "load_inertia" in known and driven_by is not None:
         names |= {"rotor_inertia"}
     names |= set() if driven_by is None else {"inertia"}
-    return missing(names, base)
+    return missing_parameters(names, base)
 
 
 def _foretold(shaft: Fit | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
@@ -338,5 +338,5 @@ def _foretold(shaft: Fit | None, logs: Sequence[Log]) -> tuple[Prediction, ...]:
     if shaft is None:
         return ()
     driven_by, output = shaft.model.driven_by, shaft.model.output
-    told = [log for log in logs if moves(log) and log.has(driven_by, output)]
-    return tuple(predict(shaft, shifted(log, driven_by, shaft.delay)) for log in told)
+    told = [log for log in logs if has_motion(log) and log.has(driven_by, output)]
+    return tuple(predict(shaft, shift_signal(log, driven_by, shaft.delay)) for log in told)

@@ -20,7 +20,7 @@ SIGNALS = {
     "command": None,  # in any unit: what a controller was asked for
 }
 """What a log may hold -> its SI unit; None: any."""
-LONGEST_STEP = 5.0  # a longer step, in median steps, is a gap, across which nothing is simulated
+GAP_STEPS = 5.0  # a longer step, in median steps, is a gap, across which nothing is simulated
 _ROUND = {
     *(tenths / 10 for tenths in range(10, 100)),
     1.25,
@@ -110,7 +110,7 @@ class Log:
         """Whether it holds all of these signals."""
         return all(name in self.signals for name in names)
 
-    def part(self, rows: slice) -> "Log":
+    def slice_rows(self, rows: slice) -> "Log":
         """Some of its rows."""
         signals = {name: values[rows] for name, values in self.signals.items()}
         return dataclasses.replace(
@@ -128,12 +128,12 @@ class Log:
         return float(np.median(np.diff(self.time)))
 
 
-def usable(log: Log) -> list[slice]:
+def gapless_stretches(log: Log) -> list[slice]:
     """The stretches of a log without gaps, through which may be simulated by the time stamps; each of two rows or more.
 
     What is dropped within one has to be seen by the stamps: its steps differ.
     """
-    gaps = np.flatnonzero(np.diff(log.time) > LONGEST_STEP * log.step) + 1
+    gaps = np.flatnonzero(np.diff(log.time) > GAP_STEPS * log.step) + 1
     edges = [0, *map(int, gaps), len(log.time)]
     return [slice(start, end) for start, end in itertools.pairwise(edges) if end - start >= 2]
 
@@ -156,7 +156,7 @@ def find_resolution(values: np.ndarray) -> float:
     return 0.0
 
 
-def turn_jumps(values: np.ndarray, period: float) -> np.ndarray:
+def find_turn_jumps(values: np.ndarray, period: float) -> np.ndarray:
     """Return the rows after which an angle jumps by a turn, `period` in its unit; none if it mostly moves that fast."""
     steps = np.abs(np.diff(values))
     jumps = np.flatnonzero(np.abs(steps - period) < 0.1 * period)
@@ -172,7 +172,7 @@ def counts_per_turn(step: float, period: float) -> int | None:
     return count if is_usual and abs(period / step - count) < 0.02 else None
 
 
-def is_supply(volts: np.ndarray, others: Sequence[np.ndarray]) -> bool:
+def is_supply_voltage(volts: np.ndarray, others: Sequence[np.ndarray]) -> bool:
     """Return True if a voltage hardly changes although the motor is driven or turns both ways, as only a supply's."""
     reverses = any(
         one.size and float(one.min()) < -0.2 * float(np.abs(one).max()) < 0.0 < one.max()
@@ -197,7 +197,7 @@ MIN_ROWS = (
 MIN_DURATION = 0.04
 
 
-class Usage(NamedTuple):
+class LogRoles(NamedTuple):
     """The part of a fit that each of some logs is for."""
 
     electrical: list[Log]  # tell the winding
@@ -208,21 +208,21 @@ class Usage(NamedTuple):
     output: str  # the motion that the fit compares; empty if the moving logs have none in common
 
 
-def usage(logs: Sequence[Log]) -> Usage:
+def assign_logs(logs: Sequence[Log]) -> LogRoles:
     """Return which logs tell the winding and which the shaft, by which input and output."""
-    moving = [log for log in logs if moves(log)]
+    moving = [log for log in logs if has_motion(log)]
     driven_by, output = (
         next((name for name in names if moving and all(log.has(name) for log in moving)), None)
         for names in (INPUTS, OUTPUTS)
     )
-    return Usage(
+    return LogRoles(
         [log for log in logs if log.has("voltage", "current")], moving, driven_by, output or ""
     )
 
 
-def obstacle(logs: Sequence[Log]) -> Finding | None:
+def find_obstacle(logs: Sequence[Log]) -> Finding | None:
     """Return the reason why logs cannot be fitted together, as `check` and `identify` report it; None if they can."""
-    electrical, moving, driven_by, _ = usage(logs)
+    electrical, moving, driven_by, _ = assign_logs(logs)
     if not electrical and driven_by is None:
         return _no_signals(logs, bool(moving))
     for log in moving:
@@ -232,7 +232,7 @@ def obstacle(logs: Sequence[Log]) -> Finding | None:
             return Finding("error", "rows", None, text, remedy)
     for log in [*electrical, *moving]:
         rows = max(
-            usable(log), key=lambda stretch: stretch.stop - stretch.start, default=slice(0, 1)
+            gapless_stretches(log), key=lambda stretch: stretch.stop - stretch.start, default=slice(0, 1)
         )
         count, seconds = (
             rows.stop - rows.start,
@@ -282,17 +282,17 @@ def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
 
 # -- cut into segments, each simulated from an initial state of its own ----------------------------------------------
 
-SEGMENT = 0.5
+SEGMENT_DURATION = 0.5
 """Time [s] that a shaft is simulated for at once: longer ones meet friction that no model has, and several minima."""
 # shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together
-BLOCK = 1.0
+BLOCK_DURATION = 1.0
 SHAFT_STEP = 5e-4
 """Rows that are nearer [s] are taken together for a shaft, which is slower: their mean input, their first position."""
 # a row is a spike where it sticks out by more than so many times what nine of ten rows do at most
-SPIKE = 50.0
-WINDOW = 4e-3
+SPIKE_FACTOR = 50.0
+SMOOTHING_WINDOW = 4e-3
 """Time [s] that positions are smoothed over: short beside what a shaft does, long beside an encoder's steps."""
-STILL = 10.0  # a shaft that moves by no more than so many steps of its encoder is locked
+MIN_MOTION_STEPS = 10.0  # a shaft that moves by no more than so many steps of its encoder is locked
 
 
 class Segment(NamedTuple):
@@ -315,18 +315,18 @@ class Segment(NamedTuple):
         return self._replace(**{name: getattr(self, name)[:count] for name in several})
 
 
-def shifted(log: Log, name: str, rows: float) -> Log:
+def shift_signal(log: Log, name: str, rows: float) -> Log:
     """A log whose signal is as it was some rows before (or, negative, after), the ends repeated; halves lie between."""
     places, values = np.arange(len(log.time)), log.signals[name]
-    return log if rows == 0 else replaced(log, name, np.interp(places - rows, places, values))
+    return log if rows == 0 else replace_signal(log, name, np.interp(places - rows, places, values))
 
 
-def replaced(log: Log, name: str, values: np.ndarray) -> Log:
+def replace_signal(log: Log, name: str, values: np.ndarray) -> Log:
     """A log with another signal, shape (n,)."""
     return dataclasses.replace(log, signals={**log.signals, name: values})
 
 
-def without_spikes(values: np.ndarray) -> np.ndarray:
+def remove_spikes(values: np.ndarray) -> np.ndarray:
     """A sampled signal, rows that stick out of both their neighbours by far more than is usual in place of the nearer.
 
     Residuals of an output bear outliers, by the robust loss; what drives a simulation has to be
@@ -336,7 +336,7 @@ def without_spikes(values: np.ndarray) -> np.ndarray:
     off = np.abs(values[1:-1] - middle)
     usual = max(float(np.percentile(off, 90.0)), 1e-3 * float(np.std(values)))
     found = values.copy()
-    found[1:-1][off > SPIKE * usual] = middle[off > SPIKE * usual]
+    found[1:-1][off > SPIKE_FACTOR * usual] = middle[off > SPIKE_FACTOR * usual]
     return found
 
 
@@ -356,11 +356,11 @@ def sensor_deviation(log: Log, name: str) -> float:
     )
 
 
-def moves(log: Log) -> bool:
+def has_motion(log: Log) -> bool:
     """Whether the shaft moves, by more than an encoder flickers or a velocity is noisy; no where neither is logged."""
     if log.has("position"):
         return float(np.ptp(log.signals["position"])) > max(
-            STILL * log.resolution.get("position", 0.0), 1e-4
+            MIN_MOTION_STEPS * log.resolution.get("position", 0.0), 1e-4
         )
     if not log.has("velocity"):
         return False
@@ -373,8 +373,8 @@ def moves(log: Log) -> bool:
     )
 
 
-def speeds(
-    times: np.ndarray, positions: np.ndarray, at: np.ndarray, window: float = WINDOW
+def smoothed_speeds(
+    times: np.ndarray, positions: np.ndarray, at: np.ndarray, window: float = SMOOTHING_WINDOW
 ) -> np.ndarray:
     """Slopes [rad/s] of straight lines through the positions within half a window of a time, at least three of them.
 
@@ -397,10 +397,10 @@ def speeds(
     return (number * tq - t * q) / (number * tt - t * t)
 
 
-def cut(log: Log, longest: float) -> list[slice]:
+def cut_segments(log: Log, longest: float) -> list[slice]:
     """Rows of segments of a length [s], where there are no gaps; the last of a stretch is up to half longer."""
     found = []
-    for stretch in usable(log):
+    for stretch in gapless_stretches(log):
         begin, end = log.time[stretch.start], log.time[stretch.stop - 1]
         count = max(round((end - begin) / longest), 1)
         edges = (
@@ -415,7 +415,7 @@ def cut(log: Log, longest: float) -> list[slice]:
 def initial_state(log: Log, rows: slice) -> np.ndarray:
     """Position and speed at the first row, from the rows around it: a parabola within 15 ms, or five rows."""
     time = log.time[rows.start]
-    stretch = next(one for one in usable(log) if one.start <= rows.start < one.stop)
+    stretch = next(one for one in gapless_stretches(log) if one.start <= rows.start < one.stop)
     first = max(min(int(np.searchsorted(log.time, time - 0.015)), rows.start - 2), stretch.start)
     last = min(max(int(np.searchsorted(log.time, time + 0.015)), rows.start + 3), stretch.stop)
     near = slice(first, last)
@@ -426,13 +426,13 @@ def initial_state(log: Log, rows: slice) -> np.ndarray:
     return np.array([fitted[0], fitted[1]])
 
 
-def halved(log: Log) -> Log:
+def halve_rate(log: Log) -> Log:
     """Every second row of a log; a mean voltage becomes that of both."""
     count = len(log.time) - (len(log.time) + 1) % 2  # to begin and end with a row that is kept
-    kept = log.part(slice(0, count, 2))
+    kept = log.slice_rows(slice(0, count, 2))
     if not (log.mean_voltage and log.has("voltage")):
         return kept
     steps, volts = np.diff(log.time[:count]), log.signals["voltage"][:count]
     energy = volts[:-1] * steps
     mean = (energy[::2] + energy[1::2]) / (steps[::2] + steps[1::2])
-    return replaced(kept, "voltage", np.append(mean, volts[-1]))
+    return replace_signal(kept, "voltage", np.append(mean, volts[-1]))

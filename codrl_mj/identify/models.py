@@ -8,21 +8,21 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Model, Simulate, settled_state
+from codrl_mj.identify.estimate import Model, Simulate, best_initial_state
 from codrl_mj.identify.log import (
-    BLOCK,
-    SEGMENT,
+    BLOCK_DURATION,
+    SEGMENT_DURATION,
     SHAFT_STEP,
     Log,
     Segment,
-    cut,
+    cut_segments,
     initial_state,
-    moves,
+    has_motion,
     sensor_deviation,
-    shifted,
-    speeds,
-    usable,
-    without_spikes,
+    shift_signal,
+    smoothed_speeds,
+    gapless_stretches,
+    remove_spikes,
 )
 from codrl_mj.identify.parameters import ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
 
@@ -38,14 +38,14 @@ class WindingModel(Model):
 
     steps: ClassVar = np.array([1e-3])
 
-    def at(self, values: np.ndarray) -> Simulate:
+    def simulator(self, values: np.ndarray) -> Simulate:
         """Of currents [A]."""
-        from codrl_mj.identify.simulation import winding
+        from codrl_mj.identify.simulation import simulate_winding
 
         number = self.all_values(values)
         resistance, inductance = number["resistance"], number["inductance"]
         constant = number.get("back_emf_constant", 0.0) * number["gear_ratio"]
-        return lambda one, state: winding(
+        return lambda one, state: simulate_winding(
             one.times, one.inputs, one.speeds, state[0], resistance, inductance, constant
         )
 
@@ -57,7 +57,7 @@ class WindingModel(Model):
         for place, log in enumerate(logs):
             volts, deviation = log.signals["voltage"], sensor_deviation(log, "current")
             speed = self._turning(log) if turned is None else turned[place]
-            for rows in cut(log, BLOCK):
+            for rows in cut_segments(log, BLOCK_DURATION):
                 times, current = log.time[rows], log.signals["current"][rows]
                 drive = times, volts[rows], np.zeros(len(times)), speed[rows]
                 made.append(
@@ -65,7 +65,7 @@ class WindingModel(Model):
                 )
         return made
 
-    def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
+    def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
         """With starts by regressions of the voltage's integral over windows of several lengths.
 
         The integral over a window is R times that of the current, L times its change and kE times
@@ -115,23 +115,23 @@ class WindingModel(Model):
         for inductance.
         """
         found, part = np.zeros(len(log.time)), self.shaft
-        for rows in usable(log) if moves(log) else ():
+        for rows in gapless_stretches(log) if has_motion(log) else ():
             times = log.time[rows]
             if log.has("position"):
                 middles = times + 0.5 * np.diff(times, append=2.0 * times[-1] - times[-2])
-                found[rows] = speeds(times, log.signals["position"][rows], middles)
+                found[rows] = smoothed_speeds(times, log.signals["position"][rows], middles)
             else:
                 velocity = log.signals["velocity"][rows]
                 found[rows] = 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
-        if part is None or not moves(log) or not log.has("position", part.model.driven_by):
+        if part is None or not has_motion(log) or not log.has("position", part.model.driven_by):
             return found
         model, values = dataclasses.replace(part.model, output="position"), part.values
-        simulate = model.at(values)
-        for segment in model.segments([shifted(log, model.driven_by, part.delay)], 0.0):
-            positions = simulate(segment, settled_state(model, values, segment))
+        simulate = model.simulator(values)
+        for segment in model.segments([shift_signal(log, model.driven_by, part.delay)], 0.0):
+            positions = simulate(segment, best_initial_state(model, values, segment))
             left = log.signals["position"][segment.rows] - positions
             middles = 0.5 * (segment.times[1:] + segment.times[:-1])
-            rest = speeds(segment.times, left, middles)
+            rest = smoothed_speeds(segment.times, left, middles)
             found[segment.rows][:-1] = np.diff(positions) / np.diff(segment.times) + rest
         return found
 
@@ -163,13 +163,13 @@ class ShaftModel(Model):
     rig: str
     friction: str
     estimated: tuple[str, ...] = ()  # what is fitted besides
-    segment: float = SEGMENT  # time [s] that is simulated at once
+    segment: float = SEGMENT_DURATION  # time [s] that is simulated at once
 
     steps: ClassVar = np.array([1e-4, 1e-3])
 
-    def moved(self, values: np.ndarray) -> Any:
+    def shaft_parameters(self, values: np.ndarray) -> Any:
         """What a simulation takes, a `Moved`."""
-        from codrl_mj.identify.simulation import moved
+        from codrl_mj.identify.simulation import shaft_parameters
 
         number = self.all_values(values)
         ratio = number["gear_ratio"]
@@ -179,14 +179,14 @@ class ShaftModel(Model):
         if self.driven_by == "voltage":
             gain /= number["resistance"]
             braking = gain * ratio * number.get("back_emf_constant", number["torque_constant"])
-        return moved(number, gain, braking)
+        return shaft_parameters(number, gain, braking)
 
-    def at(self, values: np.ndarray) -> Simulate:
+    def simulator(self, values: np.ndarray) -> Simulate:
         """Of positions [rad] or speeds [rad/s]."""
-        from codrl_mj.identify.simulation import moving
+        from codrl_mj.identify.simulation import simulate_shaft
 
-        moved, output = self.moved(values), int(self.output == "velocity")
-        return lambda one, state: moving(
+        moved, output = self.shaft_parameters(values), int(self.output == "velocity")
+        return lambda one, state: simulate_shaft(
             one.times, one.inputs, one.slopes, state[0], state[1], moved
         )[output]
 
@@ -199,15 +199,15 @@ class ShaftModel(Model):
         for place, log in enumerate(logs):
             given = log.signals[driven_by]
             if driven_by != "voltage":
-                given = without_spikes(given)
+                given = remove_spikes(given)
             measured, deviation = log.signals[output], sensor_deviation(log, output)
             # without a position a log begins at 0: it turns on from there
             angle = cumulative_trapezoid(measured, log.time, initial=0.0)
             together = max(int(shortest / log.step * (1.0 + 1e-6)), 1)
             began = -math.inf
-            for rows in cut(log, self.segment):
+            for rows in cut_segments(log, self.segment):
                 times, drive = log.time[rows], given[rows]
-                if times[0] - began >= BLOCK - 1e-3:
+                if times[0] - began >= BLOCK_DURATION - 1e-3:
                     block, began = block + 1, times[0]
                 slopes = np.zeros(len(times))
                 if driven_by != "voltage":
@@ -237,7 +237,7 @@ class ShaftModel(Model):
                 )
         return made
 
-    def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
+    def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
         """With starts by a regression of the input's integral, and changes of it."""
         driven_by, known = self.driven_by, self.known
         wanted = [*OF_RIG[self.rig], *OF_FRICTION[self.friction], *self.estimated]
@@ -259,7 +259,7 @@ class ShaftModel(Model):
                 for name in free
             ]
         )
-        positive = np.array([PARAMETERS[name].least >= 0.0 for name in free], bool)
+        positive = np.array([PARAMETERS[name].lower >= 0.0 for name in free], bool)
         starts = [np.array([one[name] for name in free]) for one, _ in firsts]
         starts = [np.where(positive & ~(one > 0.02 * scales), 0.3 * scales, one) for one in starts]
         changes = np.random.default_rng(0).uniform(-0.7, 0.7, (2, len(free)))
@@ -349,7 +349,7 @@ def _shaft_regression(
         if output == "position":
             position, speed = (
                 segment.measured,
-                speeds(times, segment.measured, times, max(window, 5.0 * step)),
+                smoothed_speeds(times, segment.measured, times, max(window, 5.0 * step)),
             )
         else:
             position, speed = segment.state[0] + turned(segment.measured, times), segment.measured

@@ -7,9 +7,9 @@ class Parameter(NamedTuple):
     """A number that a log may tell."""
 
     unit: str
-    least: float
-    most: float
-    what: str
+    lower: float
+    upper: float
+    description: str
     default: float | None = None  # where it is neither fitted nor known; None: it has to be either
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import Checked, choice, real
-from codrl_mj.identify.estimate import Model, refit
+from codrl_mj.identify.estimate import Model, optimize
 from codrl_mj.identify.log import Log, Segment
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, OF_LOSS, PARAMETERS
@@ -28,7 +28,7 @@ from codrl_mj.identify.synthetic import (
     Load,
     Sampler,
     check_size,
-    run,
+    simulate_drive,
     sample_times,
     simulate,
 )
@@ -187,7 +187,7 @@ def _option(
         / amplitude
     )
     for _ in range(8):  # the response is nearly in proportion to the voltage
-        current = run(drive, amplitude * shape, held).signals["current"]
+        current = simulate_drive(drive, amplitude * shape, held).signals["current"]
         peak, rms = float(np.abs(current).max()), float(np.sqrt(np.mean(current**2)))
         excess = max(peak / limits[0], rms / limits[1])
         if excess <= 1.0:
@@ -237,9 +237,9 @@ def _errors(
     truth: Mapping[str, float], model: Model, segments: Sequence[Segment], deviation: float
 ) -> dict[str, float]:
     """Relative errors of a fit by noise, and of a winding by what it cannot explain; those above 1 are left out."""
-    model, _ = model.begun(segments)
+    model, _ = model.initial_guess(segments)
     values = np.array([truth[name] for name in model.names])
-    fit = refit(model, [one._replace(deviation=deviation) for one in segments], values, 0)
+    fit = optimize(model, [one._replace(deviation=deviation) for one in segments], values, 0)
     inverse = np.linalg.pinv(np.concatenate(fit.jacobians) * values)
     found = np.linalg.norm(inverse, axis=1)
     if isinstance(model, WindingModel):

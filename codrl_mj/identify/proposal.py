@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.columns import EXAMPLES, KINDS, OPEN_UNIT, Column, parse_columns
-from codrl_mj.identify.log import counts_per_turn, find_resolution, is_supply, obstacle, turn_jumps
-from codrl_mj.identify.reading import STAMP, Cells, read_table, to_log
+from codrl_mj.identify.columns import EXAMPLES, COLUMN_UNITS, OPEN_UNIT, Column, parse_columns
+from codrl_mj.identify.log import counts_per_turn, find_resolution, is_supply_voltage, find_obstacle, find_turn_jumps
+from codrl_mj.identify.reading import STAMP, Table, read_table, table_to_log
 
 _NAMES = {
     "only": "enable enabled armed",
@@ -133,7 +133,7 @@ def propose_columns(path: Path | str) -> Proposal:
     return Proposal(columns, tuple(doubts), _problem(path.stem, table, entries))
 
 
-def _signal(name: str, table: Cells, taken: Collection[str]) -> tuple[str | None, str | None, str]:
+def _signal(name: str, table: Table, taken: Collection[str]) -> tuple[str | None, str | None, str]:
     """Return a column's signal and the unit that the file states, None if unknown, and why a column is left out."""
     bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]", name)
     bare = name.replace(bracket[0], " ") if bracket else name
@@ -184,7 +184,7 @@ def _valid(signal: str, unit: str) -> str | None:
     """Return a unit as the mapping takes it, if it is one of the signal."""
     if not re.search(r"[^\W\d]|[%°º]", unit) or unit == OPEN_UNIT:
         return None
-    if KINDS[signal] == "" and _UNITS.get(unit, unit) != "percent":  # a duty cycle is not in cycles
+    if COLUMN_UNITS[signal] == "" and _UNITS.get(unit, unit) != "percent":  # a duty cycle is not in cycles
         return None
     for one in (
         _UNITS.get(unit, unit),
@@ -199,7 +199,7 @@ def _valid(signal: str, unit: str) -> str | None:
     return None
 
 
-def _entry(signal: str, name: str, unit: str | None, table: Cells) -> tuple[_Entry, str]:
+def _entry(signal: str, name: str, unit: str | None, table: Table) -> tuple[_Entry, str]:
     """Return a signal's entry, with the unit that the file states or its values tell, and what is to be seen to."""
     bare = re.sub(r"\[0\]$", "", name)
     plain = bare.isascii() and bare.isidentifier() and not keyword.iskeyword(bare)
@@ -209,22 +209,22 @@ def _entry(signal: str, name: str, unit: str | None, table: Cells) -> tuple[_Ent
         unit, doubt = _unit(signal, name, formula, values, table)
     if (rest := re.sub("sec$", "nanosec", name)) != name and rest in table.columns:
         formula += f"+{json.dumps(rest)}/1e9"
-    if signal == "position" and (turn := _TURNS.get(unit)) and turn_jumps(values, turn).size:
+    if signal == "position" and (turn := _TURNS.get(unit)) and find_turn_jumps(values, turn).size:
         formula = f"unwrap({formula},{'2*pi' if unit == 'rad' else f'{turn:g}'})"
     return _Entry(name, formula, unit), doubt
 
 
-def _numbers(name: str, table: Cells) -> np.ndarray:
+def _numbers(name: str, table: Table) -> np.ndarray:
     """Return a column's finite numbers; none if it holds texts."""
     try:
-        values = table.numbers(name)
+        values = table.numeric_column(name)
     except ValueError:
         return np.empty(0)
     return values[np.isfinite(values)]
 
 
 def _unit(
-    signal: str, name: str, formula: str, values: np.ndarray, table: Cells
+    signal: str, name: str, formula: str, values: np.ndarray, table: Table
 ) -> tuple[str, str]:
     """Return the unit that a column's values tell, or an open one, and what is to be seen to."""
     if signal == "time" and any(
@@ -242,7 +242,7 @@ def _unit(
     if len(units) == 1:
         return units[0], f"no unit is stated, {units[0]} is taken by the steps ({seen}): see to it"
     for unit, turn in _TURNS.items() if signal == "position" and values.size else ():
-        if turn_jumps(values, turn).size and np.ptp(values) <= 1.1 * turn:
+        if find_turn_jumps(values, turn).size and np.ptp(values) <= 1.1 * turn:
             return (
                 unit,
                 f"no unit is stated, {unit} is taken, for it jumps by {turn:.4g}: see to it",
@@ -265,7 +265,7 @@ def _unit(
         scale = (
             "/4096:turn of 4096 counts"
             if signal == "position"
-            else f"*STEP:{KINDS[signal] or '1'} of such steps"
+            else f"*STEP:{COLUMN_UNITS[signal] or '1'} of such steps"
         )
         hint += f"; whole numbers may be those of a register: {signal}={formula}{scale}"
     if signal == "voltage" and len(name) == 1:
@@ -279,7 +279,7 @@ def _time_units(values: np.ndarray) -> list[str]:
     return [unit for unit, size in _STEPS.items() if 4e-5 <= step * size <= 0.5]
 
 
-def _add_voltage(entries: dict[str, _Entry], table: Cells) -> list[str]:
+def _add_voltage(entries: dict[str, _Entry], table: Table) -> list[str]:
     """Tell the motor's voltage from the supply's, of which a duty makes it, and return what is to be seen to."""
     doubts = []
     if "voltage" in entries and "bus" not in entries:
@@ -289,7 +289,7 @@ def _add_voltage(entries: dict[str, _Entry], table: Cells) -> list[str]:
             for one in ("current", "torque", "velocity")
             if one in entries
         ]
-        if is_supply(values, [*others, np.array([-1.0, 1.0])] if "duty" in entries else others):
+        if is_supply_voltage(values, [*others, np.array([-1.0, 1.0])] if "duty" in entries else others):
             entries["bus"] = entries.pop("voltage")
             doubts.append(f"{name}: hardly changes, taken as the supply's voltage")
     if (
@@ -304,21 +304,21 @@ def _add_voltage(entries: dict[str, _Entry], table: Cells) -> list[str]:
     return doubts
 
 
-def _problem(name: str, table: Cells, entries: dict[str, _Entry]) -> str | None:
+def _problem(name: str, table: Table, entries: dict[str, _Entry]) -> str | None:
     """Return why a fit cannot use these columns, whichever units are filled in; None if it can."""
     units = {
-        one: KINDS[one] or "1" if entry.unit == OPEN_UNIT else entry.unit
+        one: COLUMN_UNITS[one] or "1" if entry.unit == OPEN_UNIT else entry.unit
         for one, entry in entries.items()
     }
     try:
-        log = to_log(
+        log = table_to_log(
             name,
             table,
             parse_columns({one: f"{entries[one].formula}:{unit}" for one, unit in units.items()}),
         )
     except ValueError as error:
         return str(error)
-    found = obstacle([log])
+    found = find_obstacle([log])
     if found is None or (found.check == "rows" and entries["time"].unit == OPEN_UNIT):
         return None
     return f"{found.message}; {found.remedy}"

@@ -10,7 +10,7 @@ from codrl_mj.user_code import asset_path
 LAYOUT = "bench_logs"  # where in a folder of data the sets are
 
 
-def published() -> dict[str, dict[str, Any]]:
+def published_datasets() -> dict[str, dict[str, Any]]:
     """What is published, by name: `title`, `source`, `commit`, `licence`, `columns` for `read_log`, and `files`."""
     return tomllib.loads(asset_path("published.toml").read_text(encoding="utf-8"))
 
@@ -30,7 +30,7 @@ def fetch(name: str, folder: Path = Path("data")) -> list[Path]:
         RuntimeError: pooch is not installed.
         OSError: a file cannot be had, or is not the one that was published.
     """
-    sets = published()
+    sets = published_datasets()
     if name not in sets:
         raise ValueError(
             f"NAME = {name!r}: {did_you_mean(name, sets)}published are {', '.join(sets)}"

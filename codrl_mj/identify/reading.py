@@ -34,7 +34,7 @@ _SIGN_BITS = {
 _MOST_UNUSABLE = 0.2  # share of rows that may be left out as unreadable or out of order
 
 
-class Cells(NamedTuple):
+class Table(NamedTuple):
     """What a file holds."""
 
     columns: Mapping[str, Any]  # texts or numbers, each of the same length
@@ -55,7 +55,7 @@ class Cells(NamedTuple):
         )
         return {f"{name}[{entry}]": f"{name}[{place}]" for name, place, entry in pairs}
 
-    def numbers(self, name: str) -> np.ndarray:
+    def numeric_column(self, name: str) -> np.ndarray:
         """A column as numbers, NaN where it is empty."""
         found = np.empty(len(self.columns[name]))
         for place, one in enumerate(self.columns[name]):
@@ -113,12 +113,12 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
     if not path.is_file():
         raise FileNotFoundError(f"no log at {path}")
     try:
-        return to_log(path.name.removesuffix(".gz").rpartition(".")[0], read_table(path), mapping)
+        return table_to_log(path.name.removesuffix(".gz").rpartition(".")[0], read_table(path), mapping)
     except (ValueError, UnicodeDecodeError, gzip.BadGzipFile, EOFError) as error:
         raise ValueError(f"log {path}: {error}") from None
 
 
-def to_log(name: str, table: Cells, mapping: Mapping[str, Column]) -> Log:
+def table_to_log(name: str, table: Table, mapping: Mapping[str, Column]) -> Log:
     """Return the log that a file's columns are by a mapping, as `read_log` does."""
     count = len(next(iter(table.columns.values()), ()))
     numbers = np.setdiff1d(
@@ -130,11 +130,11 @@ def to_log(name: str, table: Cells, mapping: Mapping[str, Column]) -> Log:
     read = {
         **dict.fromkeys(table.columns),
         **table.constants,
-        **{one: table.numbers(one) for one in needed},
+        **{one: table.numeric_column(one) for one in needed},
     }
     read |= {label: read[column] for label, column in labels.items() if column in read}
     signals = {
-        one: np.broadcast_to(np.asarray(made.value(read), float), (count,))
+        one: np.broadcast_to(np.asarray(made.evaluate(read), float), (count,))
         for one, made in mapping.items()
     }
     time, wanted = signals.pop("time"), signals.pop("only", np.ones(count)) != 0.0
@@ -259,7 +259,7 @@ def _left_out(rows: np.ndarray, check: str, what: str) -> Iterator[Finding]:
         yield Finding(severity, check, int(rows[0]), text, remedy)
 
 
-def read_table(path: Path) -> Cells:
+def read_table(path: Path) -> Table:
     """Return a file's columns, a list's as one column an entry; see `read_log`, which says which files are read."""
     table = _read_table(path)
     columns: dict[str, Any] = {}
@@ -309,7 +309,7 @@ def _entry_names(content: Any) -> dict[str, list[str]]:
     return found
 
 
-def _read_table(path: Path) -> Cells:
+def _read_table(path: Path) -> Table:
     """Return a file's columns as they stand there."""
     kind = Path(path.name.removesuffix(".gz")).suffix.lower()
     if kind == ".parquet":
@@ -319,7 +319,7 @@ def _read_table(path: Path) -> Cells:
             raise ValueError(
                 "reading Parquet needs pyarrow: pip install pyarrow, or save the log as .csv"
             ) from None
-        return Cells(parquet.read_table(path).to_pydict(), {}, [])
+        return Table(parquet.read_table(path).to_pydict(), {}, [])
     if kind not in (".csv", ".txt", ".dat", ".tsv", ".json"):
         raise ValueError(
             f"unknown kind of file {kind!r}, must be .csv, .txt, .dat, .tsv, .json (or .gz) or"
@@ -335,7 +335,7 @@ def _read_table(path: Path) -> Cells:
     return _json(json.loads(text)) if kind == ".json" else _csv(text)
 
 
-def _csv(text: str) -> Cells:
+def _csv(text: str) -> Table:
     """A table after whatever comments: names are in the last line before the numbers, or above units."""
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     bare = [(number, line) for number, line in lines if not line.startswith("#")]
@@ -394,7 +394,7 @@ def _csv(text: str) -> Cells:
         else dict.fromkeys(names, ())
     )
     kept = [number for number, row in rows if len(row) == len(names)]
-    return Cells(columns, {}, ragged, kept, dict(zip(names, units, strict=False)), separator != ",")
+    return Table(columns, {}, ragged, kept, dict(zip(names, units, strict=False)), separator != ",")
 
 
 def _is_filled(row: Sequence[str]) -> bool:
@@ -410,7 +410,7 @@ def _is_filled(row: Sequence[str]) -> bool:
     return missing == len(row) or 2 * numbers > len(row) - missing
 
 
-def _json(content: Any) -> Cells:
+def _json(content: Any) -> Table:
     given = content if isinstance(content, dict) else {"": content}
     constants = {name: float(one) for name, one in given.items() if isinstance(one, int | float)}
     lists = {name: one for name, one in given.items() if isinstance(one, list) and one}
@@ -418,14 +418,14 @@ def _json(content: Any) -> Cells:
     if len(tables) == 1 and all(isinstance(row, dict) for row in tables[0]):
         names = dict.fromkeys(name for row in tables[0] for name in row)
         columns = {name: [row.get(name) for row in tables[0]] for name in names}
-        return Cells(columns, constants, [], entries=_entry_names(content))
+        return Table(columns, constants, [], entries=_entry_names(content))
     if (
         isinstance(content, dict)
         and not tables
         and lists
         and len({len(one) for one in lists.values()}) == 1
     ):
-        return Cells(lists, constants, [], entries=_entry_names(content))
+        return Table(lists, constants, [], entries=_entry_names(content))
     raise ValueError(
         "JSON must be a list of rows, an object with one such list and numbers beside it, or an"
         " object of columns of the same length"

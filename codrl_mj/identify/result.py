@@ -8,20 +8,20 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, settled_state
-from codrl_mj.identify.log import Log, Segment, initial_state, usable
+from codrl_mj.identify.estimate import Fit, best_initial_state
+from codrl_mj.identify.log import Log, Segment, initial_state, gapless_stretches
 from codrl_mj.identify.parameters import DEFAULTS, OF_MOTOR, PARAMETERS
 from codrl_mj.runs.files import write_json, writing
 
 Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]
 ACTUATOR = "actuator.yaml"  # name of the file in a folder of results
-MISUNDERSTOOD = 0.2  # share of the motion beyond which it is not single numbers that are amiss
+MAX_UNEXPLAINED = 0.2  # share of the motion beyond which it is not single numbers that are amiss
 USABLE = ("identified", "rough", "given")
 HORIZON = 0.5  # time [s] that is foretold at once,
-KNOWN = 0.03  # from where and how fast the shaft was in its first so many [s], five rows at least
+START_DURATION = 0.03  # from where and how fast the shaft was in its first so many [s], five rows at least
 
 
-def motor_of(base: Mapping[str, Any] | None) -> Any:
+def base_motor(base: Mapping[str, Any] | None) -> Any:
     """Return the `GearMotor` of a drive's mapping; None if it has none."""
     from codrl_mj.actuators import Drive, actuator_from_mapping
 
@@ -29,9 +29,9 @@ def motor_of(base: Mapping[str, Any] | None) -> Any:
     return drive.motor if isinstance(drive, Drive) else None
 
 
-def missing(names: Collection[str], base: Mapping[str, Any] | None) -> str | None:
+def missing_parameters(names: Collection[str], base: Mapping[str, Any] | None) -> str | None:
     """Which numbers of a motor are neither among these nor in a base, and what to do; None: none."""
-    motor = motor_of(base)
+    motor = base_motor(base)
     if (
         motor is not None
         and motor.rotor_inertia == 0.0
@@ -94,7 +94,7 @@ class Trace(NamedTuple):
     starts: np.ndarray  # rows at which pieces begin
 
 
-def traced(
+def make_trace(
     log: str, part: str, output: str, segments: Sequence[Segment], made: Sequence[np.ndarray]
 ) -> Trace:
     """A trace of segments of a log, beside what a simulation made of each, of shape (m,)."""
@@ -122,14 +122,14 @@ class Prediction:
 
 def predict(fit: Fit, log: Log) -> Prediction:
     """Errors of a fitted shaft's simulations of a log."""
-    model, simulate, errors, made = fit.model, fit.model.at(fit.values), [], []
+    model, simulate, errors, made = fit.model, fit.model.simulator(fit.values), [], []
     segments = dataclasses.replace(model, segment=HORIZON).segments([log])
     for segment in segments:
-        known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
-        made.append(simulate(segment, settled_state(model, fit.values, segment.first(known))))
+        known = max(int(np.searchsorted(segment.times, segment.times[0] + START_DURATION)), 5)
+        made.append(simulate(segment, best_initial_state(model, fit.values, segment.first(known))))
         errors.append(np.abs(made[-1] - segment.measured)[known:])
     foretold, error = (
-        traced(log.name, "shaft", model.output, segments, made),
+        make_trace(log.name, "shaft", model.output, segments, made),
         float(np.concatenate(errors).mean()),
     )
     return Prediction(log.name, model.output, error, closed_loop_error(fit, log), foretold)
@@ -142,7 +142,7 @@ def closed_loop_error(fit: Fit, log: Log) -> float | None:
     input is not at its limit: a voltage's `bus`, or the largest that the log has. None where the
     log has no command that explains it.
     """
-    from codrl_mj.identify.simulation import served
+    from codrl_mj.identify.simulation import simulate_servo
 
     model = fit.model
     if model.output != "position" or not log.has("command", model.driven_by):
@@ -161,10 +161,10 @@ def closed_loop_error(fit: Fit, log: Log) -> float | None:
     lawful = np.clip(law * error, -limits, limits)
     if not np.mean((given - lawful) ** 2) < 0.25 * np.mean(given**2):
         return None
-    moved, found = model.moved(fit.values), []
-    for stretch in usable(log):
+    moved, found = model.shaft_parameters(fit.values), []
+    for stretch in gapless_stretches(log):
         position, speed = initial_state(log, stretch)
-        simulated = served(
+        simulated = simulate_servo(
             log.time[stretch], wanted[stretch], limits[stretch], law, position, speed, moved
         )
         found.append(np.abs(simulated - log.signals["position"][stretch]))
@@ -182,7 +182,7 @@ def fitted_traces(part: str, fit: Fit) -> Iterator[Trace]:
             if one.log == place
         ]
         if own:
-            yield traced(log.name, part, fit.model.output, *zip(*own, strict=True))
+            yield make_trace(log.name, part, fit.model.output, *zip(*own, strict=True))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,7 +231,7 @@ class Identified:
 
     def problem(self) -> str | None:
         """What stands against an actuator of these numbers, with a remedy; None: nothing."""
-        if self.unexplained > MISUNDERSTOOD:
+        if self.unexplained > MAX_UNEXPLAINED:
             return (
                 f"the fit leaves {self.unexplained:.0%} of what moves in a log unexplained, so that"
                 " numbers mean little. Correct the columns, their units and signs, or the rig:"
@@ -249,7 +249,7 @@ class Identified:
             return (
                 f"{told}. Give {them} with --known {' '.join(f'{one.name}=VALUE' for one in bad)}"
             )
-        return missing([one.name for one in self.estimates], self.base)
+        return missing_parameters([one.name for one in self.estimates], self.base)
 
     @property
     def supply_text(self) -> str | None:
@@ -269,7 +269,7 @@ class Identified:
     @property
     def base_text(self) -> str | None:
         """The numbers of the actuator that are the base's and not of the logs; None without a base or an actuator."""
-        motor = motor_of(self.base)
+        motor = base_motor(self.base)
         if motor is None or self.problem() is not None:
             return None
         own = {*DEFAULTS, *(one.name for one in self.estimates)}

@@ -15,10 +15,10 @@ import numpy as np
 from codrl_mj.actuators import shaft
 from codrl_mj.compile_cache import njit
 
-LONGEST_SUBSTEP = 1e-3  # longer intervals between rows are cut into pieces of at most this [s]
+MAX_SUBSTEP = 1e-3  # longer intervals between rows are cut into pieces of at most this [s]
 
 
-class Moved(NamedTuple):
+class ShaftParameters(NamedTuple):
     """What is moved, and what brakes it, all at the motor's output."""
 
     inertia: float  # [kg*m^2], > 0
@@ -37,10 +37,10 @@ class Moved(NamedTuple):
     braking: float
 
 
-def moved(number: Mapping[str, float], gain: float, braking: float = 0.0) -> Moved:
+def shaft_parameters(number: Mapping[str, float], gain: float, braking: float = 0.0) -> ShaftParameters:
     """By parameters as they are called in `PARAMETERS`, those of a motor at its rotor."""
     ratio = number["gear_ratio"]
-    return Moved(
+    return ShaftParameters(
         number["inertia"],
         number["mgl"],
         number["constant_torque"],
@@ -57,7 +57,7 @@ def moved(number: Mapping[str, float], gain: float, braking: float = 0.0) -> Mov
 
 
 @njit(nogil=True, error_model="numpy")
-def winding(
+def simulate_winding(
     times: np.ndarray,
     volts: np.ndarray,
     speeds: np.ndarray,
@@ -81,7 +81,7 @@ _Shaft: Any = shaft.Shaft
 
 
 @njit(nogil=True, error_model="numpy")
-def turned(
+def step_shaft(
     duration: float, given: float, slope: float, position: float, speed: float, moved: Any
 ) -> tuple[float, float]:
     """Position [rad] and speed [rad/s] after a duration [s] under an input that grows by `slope` [1/s].
@@ -89,7 +89,7 @@ def turned(
     Gravity acts in the middle of a substep, and viscous friction by its mean speed: both to second
     order; dry friction is an implicit step, and never chatters.
     """
-    pieces = max(math.ceil(duration / LONGEST_SUBSTEP - 1e-6), 1)
+    pieces = max(math.ceil(duration / MAX_SUBSTEP - 1e-6), 1)
     step = duration / pieces
     damped = 0.5 * step * (moved.viscous + moved.braking) / moved.inertia
     inertia = moved.inertia * (
@@ -115,7 +115,7 @@ def turned(
 
 
 @njit(nogil=True, error_model="numpy")
-def moving(
+def simulate_shaft(
     times: np.ndarray,
     inputs: np.ndarray,
     slopes: np.ndarray,
@@ -127,7 +127,7 @@ def moving(
     positions, speeds = np.empty(len(times)), np.empty(len(times))
     positions[0], speeds[0] = position, speed
     for row in range(len(times) - 1):
-        position, speed = turned(
+        position, speed = step_shaft(
             times[row + 1] - times[row], inputs[row], slopes[row], position, speed, moved
         )
         positions[row + 1], speeds[row + 1] = position, speed
@@ -135,7 +135,7 @@ def moving(
 
 
 @njit(nogil=True, error_model="numpy")
-def served(
+def simulate_servo(
     times: np.ndarray,
     targets: np.ndarray,
     limits: np.ndarray,
@@ -149,13 +149,13 @@ def served(
     positions[0] = position
     for row in range(len(times) - 1):
         given = min(max(law * (targets[row] - position), -limits[row]), limits[row])
-        position, speed = turned(times[row + 1] - times[row], given, 0.0, position, speed, moved)
+        position, speed = step_shaft(times[row + 1] - times[row], given, 0.0, position, speed, moved)
         positions[row + 1] = position
     return positions
 
 
 @njit(nogil=True, error_model="numpy")
-def driven(
+def simulate_samples(
     period: float,
     shares: np.ndarray,
     limit: float,
@@ -178,9 +178,9 @@ def driven(
         voltage = shares[row] * bus
         states[row] = voltage, current, speed, position, bus
         if not locked:
-            position, speed = turned(0.5 * period, current, 0.0, position, speed, moved)
+            position, speed = step_shaft(0.5 * period, current, 0.0, position, speed, moved)
         reached = (voltage - constant * speed) / resistance
         current = reached + (current - reached) * decay
         if not locked:
-            position, speed = turned(0.5 * period, current, 0.0, position, speed, moved)
+            position, speed = step_shaft(0.5 * period, current, 0.0, position, speed, moved)
     return states

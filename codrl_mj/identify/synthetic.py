@@ -15,7 +15,7 @@ import numpy as np
 from codrl_mj.actuators import Drive
 from codrl_mj.actuators.shaft import resistance_at
 from codrl_mj.fields import Checked, check_memory, check_names, real
-from codrl_mj.identify.columns import KINDS
+from codrl_mj.identify.columns import COLUMN_UNITS
 from codrl_mj.identify.log import Log
 from codrl_mj.runs.files import writing
 
@@ -99,7 +99,7 @@ class Load(Checked):
 
 
 FREE = Load()  # nothing but the rotor
-SEEN = (
+SIMULATED_SIGNALS = (
     "current",
     "position",
     "velocity",
@@ -131,7 +131,7 @@ class Sensor(Checked):
     outliers: float = real(0.0, least=0.0, most=1.0)
     """Share of values, in [0, 1], that are off by 3 to 10 of the signal's standard deviations."""
 
-    def seen(self, values: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    def measure(self, values: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """What is read of values, shape (n,), that are as old as they are."""
         seen = self.gain * values + self.bias + self.noise * random.standard_normal(len(values))
         wrong = random.random(len(values)) < self.outliers
@@ -156,7 +156,7 @@ class Sampler(Checked):
     """Whether the voltage is the mean from a row to the next, and not what it is at the row."""
 
 
-def run(
+def simulate_drive(
     drive: Drive, excitation: Excitation | np.ndarray, load: Load = FREE, position: float = 0.0
 ) -> Log:
     """What a drive does, without its loop, under a voltage, or its values [V] in each sample, from standstill.
@@ -164,7 +164,7 @@ def run(
     A row is a sample of the drive, its `command` the voltage [V] asked for. A bridge makes the
     voltage u of a share d = u/V of the supply, which sags by its resistance times d*i.
     """
-    from codrl_mj.identify.simulation import driven, moved
+    from codrl_mj.identify.simulation import simulate_samples, shaft_parameters
 
     period, limit, motor = 1.0 / drive.controller.sample_rate, drive.voltage_limit, drive.motor
     locked = load.locked
@@ -189,8 +189,8 @@ def run(
         "mgl": load.gravity,
         "constant_torque": load.against,
     }
-    parts = winding, moved(numbers, motor.torque_constant * motor.gear_ratio)
-    states = driven(period, shares, float(limit), float(drive.sag), parts, locked, float(position))
+    parts = winding, shaft_parameters(numbers, motor.torque_constant * motor.gear_ratio)
+    states = simulate_samples(period, shares, float(limit), float(drive.sag), parts, locked, float(position))
     names = "voltage", "current", "velocity", "position", "bus"
     signals = dict(zip(names, states.T, strict=True))
     return Log("course", period * np.arange(len(shares)), {**signals, "command": commanded})
@@ -228,8 +228,8 @@ def simulate(
     """
     if isinstance(excitation, Excitation):
         check_size(drive, excitation.duration, sampler.rate)
-    course = run(drive, excitation, load, position)
-    check_names(sensors or {}, SEEN, "signal")
+    course = simulate_drive(drive, excitation, load, position)
+    check_names(sensors or {}, SIMULATED_SIGNALS, "signal")
     random = np.random.default_rng(seed)
     period = 1.0 / sampler.rate
     time = period * np.arange(math.floor(course.time[-1] / period + 1e-9) + 1)
@@ -241,7 +241,7 @@ def simulate(
     commanded, known = course.signals["command"], {**course.signals, "torque": torque}
     flux = np.concatenate([[0.0], np.cumsum(np.diff(course.time) * commanded[:-1])])
     found = {}
-    for signal in SEEN:
+    for signal in SIMULATED_SIGNALS:
         sensor = (sensors or {}).get(signal, Sensor())
         past = time - sensor.delay
         if signal in ("voltage", "duty"):  # what was asked for holds for a sample of the drive
@@ -254,7 +254,7 @@ def simulate(
             values = values if signal == "voltage" else 1.0 / drive.voltage_limit * values
         else:
             values = np.interp(past, course.time, known[signal])
-        found[signal] = sensor.seen(values, random) if signal in (sensors or {}) else values
+        found[signal] = sensor.measure(values, random) if signal in (sensors or {}) else values
     kept = random.random(len(time)) >= sampler.dropped
     kept[[0, -1]] = True
     found = {signal: values[kept] for signal, values in found.items()}
@@ -273,4 +273,4 @@ def write_log(path: Path, log: Log) -> str:
     texts = {
         name: f"mean({name})" if log.mean_voltage and name == "voltage" else name for name in names
     }
-    return ",".join(f"{name}={text}:{KINDS[name] or '1'}" for name, text in texts.items())
+    return ",".join(f"{name}={text}:{COLUMN_UNITS[name] or '1'}" for name, text in texts.items())

@@ -6,7 +6,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from codrl_mj.identify import Log, read_log
-from codrl_mj.identify.simulation import Moved, moving
+from codrl_mj.identify.simulation import ShaftParameters, simulate_shaft
 from tests.published import folder_of
 
 PENDULUM = "time=time:s,position=position:rad,torque=torque:N*m"
@@ -83,9 +83,9 @@ def geared_pendulum(efficiency, seed=0):
         ],
         axis=0,
     )
-    moved = Moved(0.19, 3.6, 0.0, 0.05, 0.01, efficiency, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
+    moved = ShaftParameters(0.19, 3.6, 0.0, 0.05, 0.01, efficiency, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
     position = (
-        np.round(moving(time, torque, np.zeros(12001), 0.0, 0.0, moved)[0][::4] / 3e-3) * 3e-3
+        np.round(simulate_shaft(time, torque, np.zeros(12001), 0.0, 0.0, moved)[0][::4] / 3e-3) * 3e-3
     )
     return Log(
         f"geared{seed}",

@@ -14,7 +14,7 @@ import numpy as np
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
 from codrl_mj.identify import identify
 from codrl_mj.identify.checks import check
-from codrl_mj.identify.synthetic import Excitation, Sampler, Sensor, run, simulate
+from codrl_mj.identify.synthetic import Excitation, Sampler, Sensor, simulate_drive, simulate
 
 VOLTS = 12.0
 NAMES = {
@@ -97,7 +97,7 @@ def logged(
     excitation = Excitation(
         kind, 0.5 * VOLTS, 3.0, frequency=2.0 if kind == "square" else 0.5, clock=clock
     )
-    peak = float(np.abs(run(drive, excitation).signals["current"]).max())
+    peak = float(np.abs(simulate_drive(drive, excitation).signals["current"]).max())
     seen = {"current": Sensor(0.01 * peak), "position": Sensor(resolution=2.0 * math.pi / encoder)}
     for name, changes in sensors.items():
         seen[name] = dataclasses.replace(seen.get(name, Sensor()), **changes)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from codrl_mj.identify import Log, identify, trust
+from codrl_mj.identify import Log, identify, uncertainty
 from codrl_mj.identify.estimate import Fit
-from codrl_mj.identify.identify import distinct
-from codrl_mj.identify.log import moves, replaced
+from codrl_mj.identify.identify import separate_logs
+from codrl_mj.identify.log import has_motion, replace_signal
 from tests.identify import bench, draws
 
 WINDING = {"resistance": bench.RESISTANCE, "inductance": bench.INDUCTANCE}
@@ -79,7 +79,7 @@ def test_a_late_voltage_is_found_late(rows):
     late = np.append(
         log.signals["voltage"][rows:], np.zeros(rows)
     )  # the log's voltage comes some rows early
-    found = identify([replaced(log, "voltage", late)])
+    found = identify([replace_signal(log, "voltage", late)])
     assert found.delays["winding"] == rows
     assert statuses(found, WINDING) == {"identified"}
     assert found["inductance"].value == pytest.approx(bench.INDUCTANCE, rel=0.02)
@@ -183,7 +183,7 @@ def test_each_measurement_counts_once_whatever_its_name(fitted, held_out, left):
             Log(f"{name}{k}", time + k, {"current": values[name]}) for k, name in enumerate(names)
         ]
 
-    kept, predicted, said = distinct(logs(fitted), logs(held_out))
+    kept, predicted, said = separate_logs(logs(fitted), logs(held_out))
     assert tuple("".join(log.name[0] for log in several) for several in (kept, predicted)) == left
     assert len(said) == len(fitted + held_out) - len("".join(left))
 
@@ -221,7 +221,7 @@ def test_without_a_known_mass_a_torques_gain_is_not_told_apart(swings):
 def test_with_a_known_mass_a_torques_gain_is_found(swings):
     gain, log = 1.25, swings[0]
     told = identify(
-        [replaced(log, "torque", log.signals["torque"] / gain)],
+        [replace_signal(log, "torque", log.signals["torque"] / gain)],
         "pendulum",
         {"mgl": 3.6},
         estimated=["torque_gain"],
@@ -244,17 +244,17 @@ def test_a_velocity_alone_is_enough():
 
 def test_noise_of_a_velocity_is_no_motion(swings):
     time, random = swings[0].time, np.random.default_rng(0)
-    assert not moves(Log("held", time, {"velocity": np.round(random.standard_normal(len(time)))}))
-    assert moves(
+    assert not has_motion(Log("held", time, {"velocity": np.round(random.standard_normal(len(time)))}))
+    assert has_motion(
         Log("turned", time, {"velocity": np.gradient(swings[0].signals["position"], time)})
     )
-    assert not moves(Log("nothing", time, {"torque": swings[0].signals["torque"]}))
+    assert not has_motion(Log("nothing", time, {"torque": swings[0].signals["torque"]}))
 
 
 @pytest.mark.matrix
 def test_a_torque_that_is_logged_too_changes_nothing_of_the_winding():
     log = bench.motor_log(step=2.0 * np.pi / 4096)
-    found = identify([replaced(log, "torque", bench.CONSTANT * log.signals["current"])], "free")
+    found = identify([replace_signal(log, "torque", bench.CONSTANT * log.signals["current"])], "free")
     assert found["torque_constant"].why == "taken as the back-EMF constant"
     near(found, {"resistance": bench.RESISTANCE, "back_emf_constant": bench.CONSTANT})
     near(found, {"inductance": bench.INDUCTANCE}, 0.01)
@@ -318,7 +318,7 @@ def test_what_is_known_worst_is_not_lost_beside_what_is_known_best():
         (jacobian,),
         (np.zeros(1),),
     )
-    found = trust.half_widths(fit, np.ones(2), np.eye(2), 0)["curvature"]
+    found = uncertainty.resampled_half_widths(fit, np.ones(2), np.eye(2), 0)["curvature"]
     np.testing.assert_allclose(found, [1.96e-6, 1.96 * 0.05], rtol=0.05)
 
 
@@ -366,7 +366,7 @@ def test_bad_input_says_what_to_do(swings, arguments, says):
     logs = {
         "swing0": log,
         "still": Log("still", log.time, {"position": position}),
-        "slow": log.part(slice(None, None, 50)),
+        "slow": log.slice_rows(slice(None, None, 50)),
         "velocity": Log("velocity", log.time, {"velocity": position, "torque": torque}),
     }
     with pytest.raises(ValueError, match=says):

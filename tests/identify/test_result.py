@@ -13,8 +13,8 @@ from codrl_mj.cli import main
 from codrl_mj.cli.environments import environment
 from codrl_mj.cli.train import train_verb
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.identify.identify import checked, foreseen, identify
-from codrl_mj.identify.log import replaced
+from codrl_mj.identify.identify import check_arguments, predict_missing, identify
+from codrl_mj.identify.log import replace_signal
 from codrl_mj.identify.result import Estimate, Identified
 from tests.identify import bench
 
@@ -90,7 +90,7 @@ def test_a_motor_with_a_gear_is_identified_at_its_rotor(known):
     """A log of the output: kE of 1 V*s/rad there is 0.05 at the rotor of a gear of 20; of a wrong gear it is none."""
     base = Drive().replaced({"motor.gear_ratio": 20.0 if not known else 1.0}).as_mapping()
     log = bench.motor_log("sine", 2000)
-    log = replaced(log, "position", log.signals["position"] / 20.0)
+    log = replace_signal(log, "position", log.signals["position"] / 20.0)
     found = identify([log], "free", {**known, "load_inertia": 0.0}, base=base)
     assert (found["gear_ratio"].value, found["gear_ratio"].status) == (20.0, "given")
     assert found["back_emf_constant"].value == pytest.approx(bench.CONSTANT, rel=0.01)
@@ -148,12 +148,12 @@ def test_a_rig_that_is_not_said_and_what_will_be_missing_are_told_before_the_fit
     with pytest.raises(
         ValueError, match=r"--rig on the command line, rig= in Python.*pendulum, free or load"
     ):
-        checked([log])
-    assert "rotor_inertia" in foreseen([log], {}, None)
-    assert "0 for a motor alone" in foreseen([log], {}, None)
+        check_arguments([log])
+    assert "rotor_inertia" in predict_missing([log], {}, None)
+    assert "0 for a motor alone" in predict_missing([log], {}, None)
     assert (
-        foreseen([log], {"load_inertia": 0.0}, None)
-        is foreseen([log], {}, Drive().as_mapping())
+        predict_missing([log], {"load_inertia": 0.0}, None)
+        is predict_missing([log], {}, Drive().as_mapping())
         is None
     )
 
@@ -176,7 +176,7 @@ def write_csv(path, log):
 def test_the_command_line_identifies_and_draws_within_the_intervals(tmp_path, capsys):
     log = write_csv(tmp_path / "bench.csv", bench.motor_log("locked", 2000, 2.5))
     wrong = bench.motor_log("locked", 2000, 1.0)
-    wrong = write_csv(tmp_path / "wrong.csv", replaced(wrong, "current", -wrong.signals["current"]))
+    wrong = write_csv(tmp_path / "wrong.csv", replace_signal(wrong, "current", -wrong.signals["current"]))
     columns = "time=t:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
     known = "torque_constant=0.05 back_emf_constant=0.05 rotor_inertia=2e-5"
     line, out = f"identify {log} --columns {columns} --known", tmp_path / "motor"

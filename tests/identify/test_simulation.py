@@ -8,13 +8,13 @@ from scipy.integrate import solve_ivp
 
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.result import closed_loop_error
-from codrl_mj.identify.simulation import Moved, moving, served, winding
+from codrl_mj.identify.simulation import ShaftParameters, simulate_shaft, simulate_servo, simulate_winding
 
-STILL = Moved(0.2, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
+STILL = ShaftParameters(0.2, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
 
 
 def simulate(moved, times, inputs, position=0.0, speed=0.0):
-    return moving(
+    return simulate_shaft(
         times,
         np.broadcast_to(inputs, times.shape).astype(float),
         np.zeros(len(times)),
@@ -28,7 +28,7 @@ def test_the_winding_is_exact_over_uneven_steps():
     random = np.random.default_rng(0)
     times = np.cumsum(random.uniform(1e-4, 2e-3, 40))
     volts, speeds = random.uniform(-5.0, 5.0, 40), random.uniform(-50.0, 50.0, 40)
-    currents = winding(times, volts, speeds, 0.3, 1.2, 6e-4, 0.05)
+    currents = simulate_winding(times, volts, speeds, 0.3, 1.2, 6e-4, 0.05)
     here = 0.3
     for row in range(39):
         duration = times[row + 1] - times[row]
@@ -62,7 +62,7 @@ def test_a_servo_holds_what_its_law_says():
     times = np.linspace(0.0, 20.0, 4001)
     moved = STILL._replace(gravity=1.0, viscous=1.0)
     targets, limits = np.full(4001, 0.5), np.full(4001, 5.0)
-    position = served(times, targets, limits, 4.0, 0.0, 0.0, moved)[-1]
+    position = simulate_servo(times, targets, limits, 4.0, 0.0, 0.0, moved)[-1]
     assert 4.0 * (0.5 - position) == pytest.approx(np.sin(position), rel=1e-6)
 
 
@@ -70,13 +70,13 @@ def test_a_supply_limits_what_a_servo_commands_only_where_that_is_a_voltage():
     """Of a torque of more N*m than the supply has volts the same is foretold with the supply and without."""
     times = np.linspace(0.0, 20.0, 4001)
     targets, moved = 20.0 * np.sign(np.sin(times)), STILL._replace(viscous=1.0)
-    position = served(times, targets, np.full(4001, 100.0), 4.0, 0.0, 0.0, moved)
+    position = simulate_servo(times, targets, np.full(4001, 100.0), 4.0, 0.0, 0.0, moved)
     signals = {
         "command": targets,
         "position": position,
         "torque": np.clip(4.0 * (targets - position), -100.0, 100.0),
     }
-    model = types.SimpleNamespace(driven_by="torque", output="position", moved=lambda _: moved)
+    model = types.SimpleNamespace(driven_by="torque", output="position", shaft_parameters=lambda _: moved)
     logs = (
         Log("plain", times, signals),
         Log("of a bus", times, signals | {"bus": np.full(4001, 12.0)}),

@@ -10,10 +10,10 @@ import pytest
 
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
 from codrl_mj.identify import identify
-from codrl_mj.identify.checks import FACTORS, check, name_of_factor
+from codrl_mj.identify.checks import FACTORS, check, explain_factor
 from codrl_mj.identify.log import Log
-from codrl_mj.identify.simulation import Moved, moving
-from codrl_mj.identify.synthetic import Excitation, Load, Sampler, Sensor, run, simulate
+from codrl_mj.identify.simulation import ShaftParameters, simulate_shaft
+from codrl_mj.identify.synthetic import Excitation, Load, Sampler, Sensor, simulate_drive, simulate
 from tests.identify.draws import scaled
 from tests.matrix import but
 
@@ -46,7 +46,7 @@ def logged(motor="small", kind="prbs", sag=0.0, jitter=0.0, dropped=0.0, seed=0,
     """A log with noise and quantisation, and a fault: (signal, field, value)."""
     one, drive = MOTORS[motor], drive_of(motor, sag)
     load = Load(3.0 * one.rotor_inertia * one.gear_ratio**2 + 1e-4)
-    course = run(drive, excitation_of(motor, kind), load)
+    course = simulate_drive(drive, excitation_of(motor, kind), load)
     peak, fastest = (
         np.abs(course.signals["current"]).max(),
         np.abs(course.signals["velocity"]).max(),
@@ -198,8 +198,8 @@ def test_the_current_alone_needs_a_datasheet_for_its_unit():
     ],
 )
 def test_factors_have_names(ratio, name):
-    assert name in name_of_factor(ratio)
-    assert "rpm" not in name_of_factor(9.43, angle=False)  # resistances have no angle
+    assert name in explain_factor(ratio)
+    assert "rpm" not in explain_factor(9.43, angle=False)  # resistances have no angle
 
 
 @pytest.mark.parametrize(
@@ -391,8 +391,8 @@ def pushed(name, seed=0):
     """A pendulum that a torque holds, or moves slowly: friction and gravity take nearly all of it."""
     (inertia, mgl, coulomb, viscous), torque, signals = PUSHED[name]
     time, random = np.arange(0.0, 4.0, 1e-3), np.random.default_rng(seed)
-    moved = Moved(inertia, mgl, 0.0, coulomb, viscous, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
-    position, velocity = moving(time, torque(time), 0.0 * time, 0.0, 0.0, moved)
+    moved = ShaftParameters(inertia, mgl, 0.0, coulomb, viscous, 1.0, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
+    position, velocity = simulate_shaft(time, torque(time), 0.0 * time, 0.0, 0.0, moved)
     noisy = {
         "position": STEP * np.round(position / STEP),
         "velocity": velocity + 0.02 * random.standard_normal(4000),

@@ -20,7 +20,7 @@ TABLE |= {"lists[0]": np.array([1.0, 3.0]), "lists[1]": np.array([2.0, 4.0])}
 
 def value(entry):
     name = entry.partition("=")[0]
-    return parse_columns(f"time=t:s,{entry}")[name].value({**TABLE, "k": 4.0})
+    return parse_columns(f"time=t:s,{entry}")[name].evaluate({**TABLE, "k": 4.0})
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_registers_are_cast_angles_unwrapped_and_voltages_declared_means():
         twos_complement(numbers, 16), numbers.astype(np.uint16).astype(np.int16)
     )
     angle = np.linspace(0.0, 2000.0, 101)
-    found = parse_columns("time=t:s,position=unwrap(q, 360):deg")["position"].value(
+    found = parse_columns("time=t:s,position=unwrap(q, 360):deg")["position"].evaluate(
         {"t": angle, "q": angle % 360.0}
     )
     np.testing.assert_allclose(found, np.deg2rad(angle), atol=1e-12)
@@ -121,7 +121,7 @@ def test_mappings_are_as_good_as_text():
 )
 def test_what_is_refused_says_why(text, says):
     with pytest.raises(ValueError, match=re.escape(says)):
-        parse_columns(text)["current"].value(TABLE)
+        parse_columns(text)["current"].evaluate(TABLE)
 
 
 PROPOSED = {

@@ -11,7 +11,7 @@ import pytest
 
 from codrl_mj.cli import main
 from codrl_mj.identify import check, propose_columns, read_log
-from codrl_mj.identify.identify import checked
+from codrl_mj.identify.identify import check_arguments
 from codrl_mj.identify.log import SIGNALS
 
 ROWS = np.arange(600)
@@ -227,7 +227,7 @@ def test_a_log_of_somebody_is_proposed_and_taken_once_its_units_are_filled_in(tm
             read_log(tmp_path / "log.csv", expected)
     log = read_log(tmp_path / "log.csv", filled(expected, "ms"))
     assert {one.check for one in check(log)}.isdisjoint({"signals", "rows", "wrapped"})
-    checked([log], "free", {"load_inertia": 0.0})
+    check_arguments([log], "free", {"load_inertia": 0.0})
 
 
 MOTION = {"position_rad": ANGLE, "velocity_rad_s": SPEED}
@@ -257,12 +257,12 @@ def test_what_is_proposed_and_passed_by_the_check_is_what_the_fit_takes(
     log = read_log(path, found.columns)
     assert bool({one.check for one in check(log)} & {"signals", "rows"}) is not bool(possible)
     if possible:
-        checked([log], "free", {"load_inertia": 0.0})
+        check_arguments([log], "free", {"load_inertia": 0.0})
         return
     with pytest.raises(
         ValueError, match=r"nothing can be identified|a row every 0.1 s, must be at most|12 rows in"
     ):
-        checked([log], "free", {"load_inertia": 0.0})
+        check_arguments([log], "free", {"load_inertia": 0.0})
 
 
 def said(capsys, *words):

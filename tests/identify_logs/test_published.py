@@ -9,7 +9,7 @@ import pytest
 
 from codrl_mj.cli import main
 from codrl_mj.identify import published as module
-from codrl_mj.identify.published import fetch, published
+from codrl_mj.identify.published import fetch, published_datasets
 from tests.published import folder_of
 
 LOG = b"time,position\n0,0\n"
@@ -62,15 +62,15 @@ def test_a_file_that_was_changed_since_or_cannot_be_had_is_refused(served, tmp_p
 def test_what_there_is_is_listed_and_an_unknown_name_is_not_looked_for(capsys):
     assert main(["data"]) == 0
     listed = capsys.readouterr().out
-    for name, about in published().items():
+    for name, about in published_datasets().items():
         assert name in listed
         assert about["licence"] in listed
     assert main(["data", "dfki"]) == 2
     assert "did you mean 'dfki_pendulum'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", published())
+@pytest.mark.parametrize("name", published_datasets())
 def test_the_digests_are_those_of_the_files(name):
     folder = folder_of(name)
-    for file, about in published()[name]["files"].items():
+    for file, about in published_datasets()[name]["files"].items():
         assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == about["sha256"], file

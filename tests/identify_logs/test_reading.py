@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from codrl_mj.identify.log import Log, find_resolution, usable
+from codrl_mj.identify.log import Log, find_resolution, gapless_stretches
 from codrl_mj.identify.reading import read_log
 from codrl_mj.identify.synthetic import write_log
 
@@ -104,7 +104,7 @@ def test_only_leaves_out_rows_and_leaves_a_gap(tmp_path):
     lines = ["t,i,on"] + [f"{k},{k},{'false' if 20 <= k < 40 else 'true'}" for k in range(60)]
     log = read_log(write(tmp_path, "\n".join(lines)), f"{COLUMNS},only=on")
     assert len(log.time) == 40
-    assert usable(log) == [slice(0, 20), slice(20, 40)]
+    assert gapless_stretches(log) == [slice(0, 20), slice(20, 40)]
 
 
 def test_a_register_with_a_sign_is_seen(tmp_path):
@@ -225,7 +225,7 @@ TIME = np.arange(5.0)
 def test_a_log_holds_what_it_says(time, signal, values, says):
     with pytest.raises(ValueError, match=says):
         Log("x", time, {signal: values})
-    part = Log("x", TIME, {"current": TIME}).part(slice(2, 4))
+    part = Log("x", TIME, {"current": TIME}).slice_rows(slice(2, 4))
     np.testing.assert_array_equal(part.row_numbers, [3, 4])
     np.testing.assert_array_equal(part.signals["current"], [2.0, 3.0])
 
@@ -233,7 +233,7 @@ def test_a_log_holds_what_it_says(time, signal, values, says):
 def test_usable_stretches_have_no_gap_and_two_rows_at_least():
     time = np.array([0.0, 1.0, 2.0, 4.0, 5.0, 20.0, 40.0, 41.0, 42.0])
     log = Log("x", time, {"current": time})
-    assert usable(log) == [slice(0, 5), slice(6, 9)]
+    assert gapless_stretches(log) == [slice(0, 5), slice(6, 9)]
 
 
 @pytest.mark.parametrize("step", [2.0 * np.pi / 4096, 0.0088, 3.0])

@@ -13,7 +13,7 @@ from codrl_mj.identify.synthetic import (
     Load,
     Sampler,
     Sensor,
-    run,
+    simulate_drive,
     simulate,
 )
 
@@ -31,7 +31,7 @@ def changed(**fields):
 @pytest.mark.parametrize("load", [LOAD, Load(1e-3, gravity=0.4), Load(1e-3, against=0.05)])
 def test_motion_is_what_scipy_integrates(load):
     drive = changed(coulomb_friction=0.0)
-    course = run(drive, Excitation("chirp", 12.0, 0.5, highest=50.0), load, position=0.3)
+    course = simulate_drive(drive, Excitation("chirp", 12.0, 0.5, highest=50.0), load, position=0.3)
     motor, ratio = drive.motor, drive.motor.gear_ratio
     inertia = motor.rotor_inertia + load.inertia / ratio**2
 
@@ -56,21 +56,21 @@ def test_motion_is_what_scipy_integrates(load):
 
 
 def test_a_locked_winding_is_exact():
-    course = run(DRIVE, Excitation("square", 6.0, 0.4, frequency=2.0), Load(locked=True))
+    course = simulate_drive(DRIVE, Excitation("square", 6.0, 0.4, frequency=2.0), Load(locked=True))
     half = course.time < 0.25
     expected = 6.0 / 0.9 * -np.expm1(-course.time[half] * 0.9 / 4e-4)
     np.testing.assert_allclose(course.signals["current"][half], expected, rtol=1e-12)
     assert not course.signals["position"].any()
-    bare = run(
+    bare = simulate_drive(
         changed(rotor_inertia=0.0), Excitation("locked_prbs", 6.0, 0.1)
     )  # which needs no inertia
     assert not bare.signals["position"].any()
 
 
 def test_friction_holds_slows_and_heats_what_it_has_to():
-    held = run(DRIVE, Excitation("square", 0.07, 0.4, frequency=1.0), LOAD)  # 0.07/0.9*0.036 < 3e-3
+    held = simulate_drive(DRIVE, Excitation("square", 0.07, 0.4, frequency=1.0), LOAD)  # 0.07/0.9*0.036 < 3e-3
     assert not held.signals["position"].any()
-    course = run(DRIVE, Excitation("square", 6.0, 4.0, frequency=0.1), LOAD)
+    course = simulate_drive(DRIVE, Excitation("square", 6.0, 4.0, frequency=0.1), LOAD)
     # steady: kT*i = c + b*omega and u = R*i + kE*omega
     speed = (6.0 - 0.9 * 3e-3 / 0.036) / (0.036 + 0.9 * 2e-5 / 0.036)
     assert course.signals["velocity"][-1] * 5.0 == pytest.approx(speed, rel=1e-6)
@@ -79,13 +79,13 @@ def test_friction_holds_slows_and_heats_what_it_has_to():
 
 def test_a_gear_loses_its_share():
     drive = changed(gear_efficiency=0.8, coulomb_friction=0.0, viscous_friction=0.0)
-    course = run(drive, Excitation("square", 6.0, 4.0, frequency=0.1), Load(1e-3, against=0.3))
+    course = simulate_drive(drive, Excitation("square", 6.0, 4.0, frequency=0.1), Load(1e-3, against=0.3))
     assert course.signals["current"][-1] * 0.036 * 5.0 * 0.8 == pytest.approx(0.3, rel=1e-6)
 
 
 def test_a_supply_sags_by_what_it_gives():
     drive = dataclasses.replace(DRIVE, supply=Supply(24.0, 0.3))
-    course = run(drive, Excitation("square", 12.0, 0.2, frequency=1.0), Load(locked=True))
+    course = simulate_drive(drive, Excitation("square", 12.0, 0.2, frequency=1.0), Load(locked=True))
     current = course.signals["current"][-2]
     assert course.signals["bus"][-2] == pytest.approx(24.0 - 0.3 * 0.5 * current)
     assert current == pytest.approx(0.5 * course.signals["bus"][-2] / 0.9)
@@ -127,7 +127,7 @@ def test_samplers_jitter_drop_and_average():
     assert 2001 - len(log.time) == pytest.approx(100, abs=40)
     whole = np.diff(log.time)[np.diff(log.row_numbers) == 1]
     assert np.std(whole) == pytest.approx(0.1e-3 * np.sqrt(2.0), rel=0.1)
-    course = run(DRIVE, excitation, LOAD)
+    course = simulate_drive(DRIVE, excitation, LOAD)
     for row in np.flatnonzero(np.diff(log.row_numbers) == 1)[
         ::97
     ]:  # the mean, by sums over a fine grid
@@ -177,7 +177,7 @@ def test_a_chirp_reaches_its_frequency():
         (lambda: Excitation("prbz"), "did you mean prbs"),
         (lambda: Excitation("prbs", 0.0), "amplitude"),
         (
-            lambda: run(changed(rotor_inertia=0.0), Excitation()),
+            lambda: simulate_drive(changed(rotor_inertia=0.0), Excitation()),
             "one must be > 0.*load its inertia",
         ),
         (
@@ -194,7 +194,7 @@ def test_bad_excitations_shafts_and_sensors_are_refused(act, says):
 def test_a_motor_that_is_warm_from_the_start_has_the_resistance_of_that():
     """35 K above the 25 degC of datasheets copper has 13.8 % more: a held shaft takes V/R as long as it is held."""
     warm = DRIVE.replaced({"motor.ambient_temperature": 60.0})
-    current = run(warm, np.full(20001, 2.0), Load(locked=True)).signals["current"][-1]
+    current = simulate_drive(warm, np.full(20001, 2.0), Load(locked=True)).signals["current"][-1]
     assert current == pytest.approx(
         2.0 / (DRIVE.motor.resistance * (1.0 + 0.00393 * 35.0)), rel=1e-6
     )

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, fit_warnings, refit
-from codrl_mj.identify.log import BLOCK, Log, halved, moves, replaced
+from codrl_mj.identify.estimate import Fit, fit_warnings, optimize
+from codrl_mj.identify.log import BLOCK_DURATION, Log, halve_rate, has_motion, replace_signal
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import DEFAULTS, FRICTION, OF_WINDING, PARAMETERS
-from codrl_mj.identify.result import MISUNDERSTOOD, USABLE, Estimate, Status
+from codrl_mj.identify.result import MAX_UNEXPLAINED, USABLE, Estimate, Status
 
-LEAST_LOGS = 5  # from so many logs on whole logs are resampled; below, blocks of them
+MIN_LOGS = 5  # from so many logs on whole logs are resampled; below, blocks of them
 DRAWS = 500
 # of parameters in units in which each alone is known to 1, a direction counts as known to 1e6 at
 # worst
@@ -61,7 +61,7 @@ CAUSES = {
 AT_BOUND = 1e-3  # nearer to a bound, in the parameter's scale, a value is at it
 
 
-def judged(
+def assess_fits(
     parts: Mapping[str, Fit],
     given: Mapping[str, float],
     defaults: Mapping[str, float],
@@ -88,7 +88,7 @@ def judged(
         _completed(estimates, given, defaults),
         max(unlike.values(), default=0.0),
     )
-    if unexplained > MISUNDERSTOOD:
+    if unexplained > MAX_UNEXPLAINED:
         why = f"the fit leaves {unexplained:.0%} of what moves in a log unexplained"
         completed = [
             one if one.status == "given" else dataclasses.replace(one, status="refused", why=why)
@@ -118,8 +118,8 @@ def _of_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estimate]
             np.append(values, friction),
         )
         sizes, units = (np.append(one, all_of["friction_torque"]) for one in (sizes, units))
-    by_cause, tested = causes(fit, values, scales, of, seed, on_step)
-    directions = unknown_directions(fit, scales)
+    by_cause, tested = interval_causes(fit, values, scales, of, seed, on_step)
+    directions = unidentifiable_directions(fit, scales)
     on_step()
     changes = [
         slopes * scales @ [one.get(name, 0.0) for name in model.names] / sizes[-1]
@@ -143,7 +143,7 @@ def _of_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estimate]
     for place, (name, value, half) in enumerate(
         zip(names, map(float, values), map(float, halves), strict=True)
     ):
-        ends = max(value - half, PARAMETERS[name].least), min(value + half, PARAMETERS[name].most)
+        ends = max(value - half, PARAMETERS[name].lower), min(value + half, PARAMETERS[name].upper)
         own_causes = {cause: float(several[place]) for cause, several in by_cause.items()}
         estimate = Estimate(name, value, *ends, "identified", "", own_causes)
         together = (
@@ -177,8 +177,8 @@ def _verdict(
     name, value, least, most = (
         found.name,
         found.value,
-        PARAMETERS[found.name].least,
-        PARAMETERS[found.name].most,
+        PARAMETERS[found.name].lower,
+        PARAMETERS[found.name].upper,
     )
     none, share = most if name == "gear_efficiency" else least, 100.0 * half / size
     at_bound = min(value - least, most - value) <= AT_BOUND * unit
@@ -187,7 +187,7 @@ def _verdict(
     if math.isinf(found.causes["resampling"]):
         return (
             "refused",
-            f"there are no two stretches of {BLOCK:g} s to resample: give a longer log",
+            f"there are no two stretches of {BLOCK_DURATION:g} s to resample: give a longer log",
         )
     if not half / size <= widest:
         if not found.causes["self_test"] <= BIASED * widest * size:
@@ -226,8 +226,8 @@ def _with_constant(
             anchored and one.name != "torque_constant"
         )
         own = 0.0 if fixed else one.value * relative
-        low = max(one.value - math.hypot(one.value - one.low, own), PARAMETERS[one.name].least)
-        high = min(one.value + math.hypot(one.high - one.value, own), PARAMETERS[one.name].most)
+        low = max(one.value - math.hypot(one.value - one.low, own), PARAMETERS[one.name].lower)
+        high = min(one.value + math.hypot(one.high - one.value, own), PARAMETERS[one.name].upper)
         one = dataclasses.replace(
             one, low=low, high=high, causes={**one.causes, "torque_constant": own}
         )
@@ -280,7 +280,7 @@ def _friction(fit: Fit) -> tuple[float, dict[str, float], dict[str, float]]:
     speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-9) * number["gear_ratio"]
     inputs = np.concatenate([one.inputs for one in fit.segments])
     torque = (
-        float(np.sqrt(np.mean(inputs**2))) * model.moved(fit.values).gain / number["gear_ratio"]
+        float(np.sqrt(np.mean(inputs**2))) * model.shaft_parameters(fit.values).gain / number["gear_ratio"]
     )
     slopes = {"coulomb_friction": 1.0, "viscous_friction": speed, "gear_efficiency": -torque}
     lost = slopes["gear_efficiency"] * (number["gear_efficiency"] - 1.0)
@@ -356,7 +356,7 @@ def _inverse(matrix: np.ndarray, scales: np.ndarray) -> np.ndarray:
     return np.asarray((vectors / np.maximum(values, FLAT)) @ vectors.T * np.outer(units, units))
 
 
-def causes(
+def interval_causes(
     fit: Fit,
     values: np.ndarray,
     scales: np.ndarray,
@@ -366,7 +366,7 @@ def causes(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Half-widths by cause of `values` (q,), which are `of` @ the parameters, and what the self-test finds for them."""
     electrical = isinstance(fit.model, WindingModel)
-    found = half_widths(fit, scales, of, seed)
+    found = resampled_half_widths(fit, scales, of, seed)
     on_step()
     # two fits to what the fit would have made of its logs, of opposed residuals: in their mean what
     # is random cancels
@@ -377,7 +377,7 @@ def causes(
     on_step()
     # an error that goes with a row's time is half as large at the rate of the logs, one with its
     # root more than that
-    halves = _again(fit, [halved(log) for log in fit.logs])
+    halves = _again(fit, [halve_rate(log) for log in fit.logs])
     found["half_rate"] = (2.0 if electrical else 1.0) * np.abs(of @ (halves - fit.values))
     on_step()
     found["self_test"] = np.abs(tested - values)
@@ -395,7 +395,7 @@ def causes(
     return found, tested
 
 
-def half_widths(fit: Fit, scales: np.ndarray, of: np.ndarray, seed: int) -> dict[str, np.ndarray]:
+def resampled_half_widths(fit: Fit, scales: np.ndarray, of: np.ndarray, seed: int) -> dict[str, np.ndarray]:
     """Half-widths of 95 % intervals by cause, each of shape (q,), of `of` @ the parameters with `of` of shape (q, p).
 
     `curvature`: were the model exact and each residual by itself: never less, however few the
@@ -413,7 +413,7 @@ def half_widths(fit: Fit, scales: np.ndarray, of: np.ndarray, seed: int) -> dict
     logs, count = np.zeros(len(of)), len(by_log[0])
     if count > 1:
         logs = 2.0 * (count * by_log[0] @ inverse @ of.T).std(axis=0, ddof=1) / np.sqrt(count)
-    gradients, matrices = by_log if count >= LEAST_LOGS else by_block
+    gradients, matrices = by_log if count >= MIN_LOGS else by_block
     resampling, count = np.full(len(of), np.inf), len(gradients)
     if count > 1:
         drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1.0 / count), DRAWS)
@@ -441,7 +441,7 @@ def correlations(fit: Fit) -> dict[str, dict[str, float]]:
     }
 
 
-def unknown_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, float]]:
+def unidentifiable_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, float]]:
     """Directions in which the parameters may go, and nobody would notice: parameter -> share, the largest 1.
 
     In the direction that the derivatives say is the weakest, the parameter that has most of it is
@@ -460,7 +460,7 @@ def unknown_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, float]]:
         place = int(np.argmax(np.abs(direction)))
         step = UNKNOWN * own[place] * np.sign(direction[place])
         bounds = PARAMETERS[model.names[place]]
-        if not bounds.least <= values[place] + step <= bounds.most:
+        if not bounds.lower <= values[place] + step <= bounds.upper:
             step = -step
         start = np.clip(
             values + step / own[place] / direction[place] * direction * own, 0.2 * values, None
@@ -471,7 +471,7 @@ def unknown_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, float]]:
             known={**model.known, model.names[place]: float(values[place] + step)},
             scales=np.delete(model.scales, place),
         )
-        other = refit(rest, here.segments, np.delete(start, place), 20, here.scale)
+        other = optimize(rest, here.segments, np.delete(start, place), 20, here.scale)
         if other.costs(here.scale).sum() > here.cost + _noticed(here):
             break
         changes = (other.values - np.delete(values, place)) / np.delete(own, place)
@@ -503,7 +503,7 @@ def _noticed(fit: Fit) -> float:
 
 def _again(fit: Fit, logs: Sequence[Log]) -> np.ndarray:
     """The parameters that other logs give, from where a fit ended."""
-    return refit(fit.model, fit.model.segments(logs), fit.values, 20).values
+    return optimize(fit.model, fit.model.segments(logs), fit.values, 20).values
 
 
 def _pretended(fit: Fit, sign: float) -> list[Log]:
@@ -512,7 +512,7 @@ def _pretended(fit: Fit, sign: float) -> list[Log]:
     Residuals keep order and size, stretch by stretch with a random sign, so that they belong
     together as in the logs.
     """
-    output, simulate = fit.model.output, fit.model.at(fit.values)
+    output, simulate = fit.model.output, fit.model.simulator(fit.values)
     signals = [log.signals[output].copy() for log in fit.logs]
     speeds = [np.zeros(len(log.time)) for log in fit.logs]
     signs = np.random.default_rng(1).choice([-1.0, 1.0], len(fit.segments)) * sign
@@ -526,7 +526,7 @@ def _pretended(fit: Fit, sign: float) -> list[Log]:
     made = []
     for log, values, speed in zip(fit.logs, signals, speeds, strict=True):
         made.append(_rounded(log, output, values))
-        if isinstance(fit.model, WindingModel) and log.has("position") and moves(log):
+        if isinstance(fit.model, WindingModel) and log.has("position") and has_motion(log):
             turns = np.append(0.0, np.cumsum(speed[:-1] * np.diff(log.time)))
             made[-1] = _rounded(made[-1], "position", log.signals["position"][0] + turns)
     return made
@@ -535,4 +535,4 @@ def _pretended(fit: Fit, sign: float) -> list[Log]:
 def _rounded(log: Log, name: str, values: np.ndarray) -> Log:
     """A log with another signal, rounded as its sensor rounds."""
     step = log.resolution.get(name, 0.0)
-    return replaced(log, name, np.round(values / step) * step if step > 0.0 else values)
+    return replace_signal(log, name, np.round(values / step) * step if step > 0.0 else values)
