@@ -31,7 +31,7 @@ def test_the_published_pendulum_foretells_its_own_logs_badly():
 
 def test_the_bad_log_is_said_to_be_bad_and_nothing_of_it_is_used():
     found = identify([bench.pendulum_log("sysid")], "pendulum")
-    assert any("log sysid: residuals are" in text for text in found.warnings)
+    assert any("log sysid: mean residuals are" in text for text in found.warnings)
     assert "identified" not in {one.status for one in found.estimates}
 
 

@@ -103,7 +103,7 @@ def test_mappings_are_as_good_as_text():
         ("time=t:s,current=a[0]", "current=a[0]:A"),
         (
             "time=t:s,current=lists:A",
-            "lists holds lists of 2 numbers; write the one you want, such as lists[0]",
+            "lists holds lists of 2 numbers; choose an entry, such as lists[0]",
         ),
         (
             "time=t:s,position=a:UNIT",

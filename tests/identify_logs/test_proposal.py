@@ -359,7 +359,7 @@ def test_an_entry_of_a_list_is_a_column(tmp_path, monkeypatch, kind):
     np.testing.assert_allclose(log.signals["position"], np.deg2rad(ANGLE[:90] - 1.0))
     with pytest.raises(
         ValueError,
-        match=r"action holds lists of 2 numbers; write the one you want, such as action\[0\]",
+        match=r"action holds lists of 2 numbers; choose an entry, such as action\[0\]",
     ):
         read_log(path, LISTED + "command=action:deg")
     found = propose_columns(path)
