@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.log import Log, sensor_deviation, gapless_stretches
+from codrl_mj.identify.log import Log, gapless_stretches, sensor_deviation
 
 _MIN_ROWS = 12  # of a window
 _MAX_LAG_ROWS = 20_000  # rows of a log from its start that a lag is estimated from

@@ -18,12 +18,12 @@ from codrl_mj.identify.log import (
     SIGNALS,
     Finding,
     Log,
-    find_resolution,
-    is_supply_voltage,
-    has_motion,
     find_obstacle,
-    replace_signal,
+    find_resolution,
     find_turn_jumps,
+    has_motion,
+    is_supply_voltage,
+    replace_signal,
 )
 from codrl_mj.identify.parameters import PARAMETERS
 from codrl_mj.identify.signal_checks import signal_findings

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, optimize, fit_from_starts
+from codrl_mj.identify.estimate import Fit, fit_from_starts, optimize
 from codrl_mj.identify.log import SIGNALS, Log
 from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.result import predict

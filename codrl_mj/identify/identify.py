@@ -15,10 +15,10 @@ from codrl_mj.identify.friction import choose_friction, load_hint
 from codrl_mj.identify.log import (
     SEGMENT_DURATION,
     Log,
-    has_motion,
-    find_obstacle,
-    shift_signal,
     assign_logs,
+    find_obstacle,
+    has_motion,
+    shift_signal,
 )
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import (
@@ -35,12 +35,12 @@ from codrl_mj.identify.result import (
     Estimate,
     Identified,
     Prediction,
+    base_motor,
     fitted_traces,
     missing_parameters,
-    base_motor,
     predict,
 )
-from codrl_mj.identify.uncertainty import correlations, assess_fits
+from codrl_mj.identify.uncertainty import assess_fits, correlations
 
 STEPS_PER_PART = 8 + 4
 """Progress steps of a part: its fit, and the assessment of its uncertainty."""

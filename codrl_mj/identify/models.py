@@ -16,13 +16,13 @@ from codrl_mj.identify.log import (
     Log,
     Segment,
     cut_segments,
-    initial_state,
+    gapless_stretches,
     has_motion,
+    initial_state,
+    remove_spikes,
     sensor_deviation,
     shift_signal,
     smoothed_speeds,
-    gapless_stretches,
-    remove_spikes,
 )
 from codrl_mj.identify.parameters import ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
 

@@ -28,9 +28,9 @@ from codrl_mj.identify.synthetic import (
     Load,
     Sampler,
     check_size,
-    simulate_drive,
     sample_times,
     simulate,
+    simulate_drive,
 )
 from codrl_mj.runs.files import writing
 

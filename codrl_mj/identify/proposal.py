@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.columns import EXAMPLES, COLUMN_UNITS, OPEN_UNIT, Column, parse_columns
+from codrl_mj.identify.columns import COLUMN_UNITS, EXAMPLES, OPEN_UNIT, Column, parse_columns
 from codrl_mj.identify.log import (
     counts_per_turn,
-    find_resolution,
-    is_supply_voltage,
     find_obstacle,
+    find_resolution,
     find_turn_jumps,
+    is_supply_voltage,
 )
 from codrl_mj.identify.reading import STAMP, Table, read_table, table_to_log
 

@@ -14,7 +14,7 @@ import numpy as np
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
 from codrl_mj.identify import identify
 from codrl_mj.identify.checks import check
-from codrl_mj.identify.synthetic import Excitation, Sampler, Sensor, simulate_drive, simulate
+from codrl_mj.identify.synthetic import Excitation, Sampler, Sensor, simulate, simulate_drive
 
 VOLTS = 12.0
 NAMES = {

@@ -13,7 +13,7 @@ from codrl_mj.cli import main
 from codrl_mj.cli.environments import environment
 from codrl_mj.cli.train import train_verb
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.identify.identify import check_arguments, predict_missing, identify
+from codrl_mj.identify.identify import check_arguments, identify, predict_missing
 from codrl_mj.identify.log import replace_signal
 from codrl_mj.identify.result import Estimate, Identified
 from tests.identify import bench
@@ -77,7 +77,7 @@ def test_a_number_that_was_not_identified_is_refused_until_it_is_given(tmp_path,
 
 def test_what_the_logs_do_not_tell_is_asked_for_or_taken_from_a_motor():
     friction = Estimate("coulomb_friction", 1e-3, 5e-4, 2e-3, "identified")
-    with pytest.raises(ValueError, match=r"resistance, .*: these logs say nothing of them"):
+    with pytest.raises(ValueError, match=r"resistance, .*: these logs do not determine them"):
         identified(friction).actuator()
     whole = identified(friction, base=Drive().as_mapping()).actuator()
     assert whole == Drive().replaced({"motor.coulomb_friction": 1e-3})
@@ -106,14 +106,14 @@ def test_all_that_is_refused_and_all_that_is_missing_is_named_at_once():
     assert problem.endswith("Give them with --known resistance=VALUE coulomb_friction=VALUE")
     for whole in (motor(**bad), motor()):  # also where every single number looks good
         lost = dataclasses.replace(whole, unexplained=0.89).problem()
-        assert "leaves 89% of what moves" in lost
+        assert "leaves 89% of a log's variation" in lost
         assert "--known" not in lost
     none = identified(Estimate("resistance", 1.0, 0.9, 1.1, "identified")).problem()
     assert (
-        "inductance, torque_constant, back_emf_constant, rotor_inertia: these logs say nothing of"
+        "inductance, torque_constant, back_emf_constant, rotor_inertia: these logs do not determine"
         " them" in none
     )
-    assert "load_inertia=VALUE, 0 for a motor alone" in none
+    assert "load_inertia=VALUE, 0 for a motor without load" in none
 
 
 def test_a_rotor_inertia_that_the_datasheet_does_not_know_is_not_taken_for_zero():
@@ -150,7 +150,7 @@ def test_a_rig_that_is_not_said_and_what_will_be_missing_are_told_before_the_fit
     ):
         check_arguments([log])
     assert "rotor_inertia" in predict_missing([log], {}, None)
-    assert "0 for a motor alone" in predict_missing([log], {}, None)
+    assert "0 for a motor without load" in predict_missing([log], {}, None)
     assert (
         predict_missing([log], {"load_inertia": 0.0}, None)
         is predict_missing([log], {}, Drive().as_mapping())

@@ -13,8 +13,8 @@ from codrl_mj.identify.synthetic import (
     Load,
     Sampler,
     Sensor,
-    simulate_drive,
     simulate,
+    simulate_drive,
 )
 
 MOTOR = GearMotor(
