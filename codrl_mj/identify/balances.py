@@ -76,7 +76,7 @@ class Windows:
         )
 
     def mean_held(self, signal: str, lag: float = 0.0) -> np.ndarray:
-        """Return the weighted mean of a signal that is held until the next row, shape (windows,)."""
+        """Return the weighted mean of a signal held until the next row, shape (windows,)."""
         values, time = self._log.signals[signal], self._log.time
         # A lag moves rows from beside a window into it.
         reach = 0 if lag == 0.0 else math.ceil(abs(lag) / self._log.step) + 1
@@ -138,7 +138,7 @@ def regress(
 
 
 def _speed(log: Log, windows: Windows, order: int = 0) -> np.ndarray:
-    """Return the weighted mean of the speed or its derivative, from the position if it is logged."""
+    """Return the weighted mean of the speed or its derivative, from the position if logged."""
     return (
         windows.mean("position", order + 1)
         if log.has("position")
@@ -234,7 +234,7 @@ class Shift(NamedTuple):
 
 
 def velocity_lag(log: Log) -> Shift | None:
-    """Return the lag, up to 0.1 s, and the gain of the velocity over the differentiated position."""
+    """Return lag (up to 0.1 s) and gain of the velocity against the differentiated position."""
     log = log.slice_rows(slice(0, _MAX_LAG_ROWS))
     windows = Windows(log, max(0.05, 4.0 * log.step), _MAX_LAG_WINDOWS)
     rate = windows.mean("position", 1)

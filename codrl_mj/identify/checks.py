@@ -1,4 +1,4 @@
-"""Checks of a log before a fit: a table of functions, each with the signals and facts that it needs."""
+"""Checks of a log before a fit, each with the signals and facts that it needs."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -209,8 +209,8 @@ def _sizes(facts: LogFacts) -> Iterator[Finding]:
         unit = SIGNALS[signal] or "of 1"
         if largest > _MAX_VALUES[signal]:
             text = (
-                f"the {signal} is up to {largest:.4g} {unit}, must be at most {_MAX_VALUES[signal]:g}"
-                f" {unit} on a bench"
+                f"the {signal} is up to {largest:.4g} {unit}, must be at most"
+                f" {_MAX_VALUES[signal]:g} {unit} on a bench"
             )
             example = "percent" if signal == "duty" else f"m{unit}"
             yield Finding(
@@ -254,7 +254,7 @@ def _sizes(facts: LogFacts) -> Iterator[Finding]:
 
 @_needs("position")
 def _degrees(facts: LogFacts) -> Iterator[Finding]:
-    """Find a position in degrees, by the torque of gravity or by an encoder whose step divides 360."""
+    """Find a position in degrees, by gravity or by an encoder whose step divides 360."""
     log, effort, remedy = facts.log, facts.effort, "write position=column:deg"
     if {"effort", "moves", "hangs"} <= facts.conditions:
         converted = replace_signal(log, "position", np.deg2rad(log.signals["position"]))
@@ -501,10 +501,10 @@ def _mechanical(facts: LogFacts) -> Iterator[Finding]:
 
 
 def _explain_sign(log: Log, effort: str, rig: str | None) -> str:
-    """Return how much better a minus before the effort fits inertia and friction; else an empty text.
+    """Return how much better the effort fits with a minus, or an empty text.
 
-    The check by standard errors alone may be wrong where static friction holds the shaft, or where a
-    controller produces the effort from the motion.
+    The check by standard errors alone may be wrong where static friction holds the shaft, or where
+    a controller produces the effort from the motion.
     """
     for seconds in (0.3, 0.03):
         original, flipped = (
@@ -514,7 +514,10 @@ def _explain_sign(log: Log, effort: str, rig: str | None) -> str:
         if original is None or flipped is None or original.unexplained < 0.03:
             continue
         if flipped.residual < _MAX_FLIPPED_RESIDUAL * original.residual:
-            shares = f"{original.unexplained:.1%} of it unexplained, with a minus {flipped.unexplained:.2%}"
+            shares = (
+                f"{original.unexplained:.1%} of it unexplained, with a minus"
+                f" {flipped.unexplained:.2%}"
+            )
             return f"inertia and friction leave {shares}"
     return ""
 

@@ -45,7 +45,7 @@ def twos_complement(values: Any, bits: Any) -> Any:
 
 
 def sign_magnitude(values: Any, bits: Any) -> Any:
-    """Return the signed values of numbers whose highest bit is the sign: 1324 of 11 bits is -300."""
+    """Return the values of numbers whose highest bit is the sign: 1324 of 11 bits is -300."""
     half = 2.0 ** (float(bits) - 1.0)
     return np.where(np.asarray(values) >= half, half - np.asarray(values), values)
 
@@ -167,9 +167,10 @@ class Column:
                     self._compile(right),
                     _OPERATORS[type(operator)],
                 )
-                return lambda table: apply(
-                    left_value(table), right_value(table)
-                ), left_names | right_names
+                return (
+                    lambda table: apply(left_value(table), right_value(table)),
+                    left_names | right_names,
+                )
             case ast.Call(func=ast.Name(id=function_name), args=arguments, keywords=[]):
                 check_names([function_name], FUNCTIONS, "function")
                 count, function = FUNCTIONS[function_name]
@@ -206,7 +207,7 @@ class Column:
 
 
 def parse_columns(mapping: str | Mapping[str, str]) -> dict[str, Column]:
-    """Parse `signal=formula:unit` separated by commas, or a mapping of signals to `formula:unit`."""
+    """Parse a mapping of signals, as a text `signal=formula:unit,...` or as a dictionary."""
     if isinstance(mapping, str):
         pairs = [_split(entry, "=") for entry in _split(mapping, ",") if entry.strip()]
     else:

@@ -217,7 +217,7 @@ class _Problem:
         return self.solution[1]
 
     def choose_best_states(self, values: np.ndarray) -> None:
-        """Take the better initial state of each segment: from the solution, or from its own guess."""
+        """Take the better initial state of each segment, from the solution or from its guess."""
         pairs = zip(
             self.solve(values),
             self.fit_states(values, [segment.state for segment in self.segments]),
@@ -360,10 +360,10 @@ def refit_model(fit: Fit, model: Model) -> Fit:
 def fit_model(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fit:
     """Fit a model to logs from several starts, and then the delay of its input.
 
-    For a winding, delays of half a row are tried too. If they fit worse than whole rows, the voltage
-    is held from row to row: then it is also the mean between rows, of which a log at half the rate
-    can be made. If a half row fits better, the voltage was sampled at the times of the rows, and is
-    delayed accordingly.
+    For a winding, delays of half a row are tried too. If they fit worse than whole rows, the
+    voltage is held from row to row: then it is also the mean between rows, of which a log at half
+    the rate can be made. If a half row fits better, the voltage was sampled at the times of the
+    rows, and is delayed accordingly.
     """
     segments = model.segments(logs)
     model, starts = model.initial_guess(segments)
@@ -446,9 +446,9 @@ def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
     warnings = []
     if 1 < len(unexplained) == len(fit.logs):
         warnings.append(
-            "the model does not explain any of the logs within the noise of their sensors: the mean"
-            f" residuals of the first log are {next(iter(unexplained.values()))}. Fit more friction,"
-            " or find out what else moved"
+            "the model does not explain any of the logs within the noise of their sensors: the"
+            f" mean residuals of the first log are {next(iter(unexplained.values()))}. Fit more"
+            " friction, or find out what else moved"
         )
     else:
         warnings += [

@@ -18,7 +18,7 @@ _LOADED = {"coulomb": "load", "stribeck": "both"}
 """Friction model -> the same model with an efficiency of the gear."""
 # A hint has to pass both limits.
 _MAX_COST_RATIO = 0.9
-"""Largest cost with an efficiency, in total and in the median of the segments, over that without."""
+"""Largest ratio of costs with and without an efficiency, in total and in the median segment."""
 _MIN_DIFFERENCE = 0.05
 """Smallest difference between the fitted efficiency and the known one."""
 
@@ -36,18 +36,18 @@ def choose_friction(
 ) -> FrictionChoice:
     """Return a shaft with the requested friction model or, for `auto`, with the best one.
 
-    `auto` leaves out one log at a time and predicts it from a fit to the others. A richer model than
-    viscous and Coulomb friction is chosen if it reduces the mean error by more than two standard
-    deviations of that mean. With fewer than three logs the model is `coulomb`.
+    `auto` leaves out one log at a time and predicts it from a fit to the others. A richer model
+    than viscous and Coulomb friction is chosen if it reduces the mean error by more than two
+    standard deviations of that mean. With fewer than three logs the model is `coulomb`.
     """
     if friction != "auto":
         return FrictionChoice(dataclasses.replace(model, friction=friction), "")
     if len(logs) < MIN_LOGS:
         return FrictionChoice(
             model,
-            f"friction: coulomb, because auto needs {MIN_LOGS} logs that move, to compare the errors"
-            f" on logs left out, and there {'is' if len(logs) == 1 else 'are'} {len(logs)}. Add logs,"
-            " or choose --friction load, stribeck or both",
+            f"friction: coulomb, because auto needs {MIN_LOGS} logs that move, to compare the"
+            f" errors on logs left out, and there {'is' if len(logs) == 1 else 'are'} {len(logs)}."
+            " Add logs, or choose --friction load, stribeck or both",
         )
     errors = {"coulomb": _left_out_errors(model, logs, on_step)}
     best = model

@@ -99,14 +99,22 @@ def identify(
         return lambda: on_progress(task, min(next(counter), total), total)
 
     # The winding is fitted first, because the shaft needs its torque constant or resistance. Then
-    # the winding is fitted again with the speed of the fitted shaft, and the shaft with the constants
-    # of that winding.
+    # the winding is fitted again with the speed of the fitted shaft, and the shaft with the
+    # constants of that winding.
     parts: dict[str, Fit] = {}
     if electrical:
         parts["winding"] = fit_model(WindingModel(known=fixed), electrical, step("winding"))
     if driven_by:
-        shaft = ShaftModel(rig=rig, friction="coulomb", driven_by=driven_by, output=output, known=fixed,
-                           defaults=defaults, estimated=tuple(estimated), segment=segment)  # fmt: skip
+        shaft = ShaftModel(
+            rig=rig,
+            friction="coulomb",
+            driven_by=driven_by,
+            output=output,
+            known=fixed,
+            defaults=defaults,
+            estimated=tuple(estimated),
+            segment=segment,
+        )
         choice = choose_friction(
             _with_winding(shaft, parts.get("winding")), moving, friction, step("friction")
         )
@@ -153,7 +161,7 @@ def identify(
 
 
 def _may_need_voltage(identified: Identified, moving: Sequence[Log]) -> bool:
-    """Return True if a shaft under the current has no usable constant, but the voltage was logged."""
+    """Return True if the shaft has no usable constant under the current, but a logged voltage."""
     is_refused = any(
         estimate.name == "back_emf_constant" and estimate.status not in USABLE
         for estimate in identified.estimates
@@ -169,7 +177,7 @@ def _without_current(log: Log) -> Log:
 
 
 def _better_identified(under_current: Identified, under_voltage: Identified) -> Identified:
-    """Return the winding with the current and the shaft without it, if fewer numbers are refused."""
+    """Return the shaft from the fit with fewer refusals, with the winding under the current."""
     refused = [
         sum(
             estimate.status not in USABLE and estimate.name != "inductance"
@@ -219,7 +227,7 @@ def _with_winding(shaft: ShaftModel, winding: Fit | None) -> ShaftModel:
 def separate_logs(
     logs: Sequence[Log], held_out: Sequence[Log]
 ) -> tuple[list[Log], list[Log], list[str]]:
-    """Return the logs to fit and the logs held out without duplicates, and a note on each duplicate.
+    """Return the logs to fit and held out without duplicates, and a note on each duplicate.
 
     Duplicates are recognized by their content, because copies may have other names. A log that is
     both fitted and held out is only held out.
@@ -286,7 +294,7 @@ def check_arguments(
     segment: float = SEGMENT_DURATION,
     base: Mapping[str, Any] | None = None,
 ) -> dict[str, float]:
-    """Validate the arguments of `identify`, and return the known parameters with the base's gear."""
+    """Validate the arguments of `identify`, and return the known parameters and gear ratio."""
     motor = base_motor(base)
     # Without the ratio of its gear, a motor's parameters would be fitted at the output.
     ratio = 1.0 if motor is None else motor.gear_ratio
@@ -308,8 +316,8 @@ def check_arguments(
         parameter = PARAMETERS[name]
         if not (math.isfinite(value) and parameter.lower <= value <= parameter.upper):
             raise ValueError(
-                f"known {name} = {value!r}: must be from {parameter.lower:g} to {parameter.upper:g} "
-                f"{parameter.unit}; give {parameter.description}".strip()
+                f"known {name} = {value!r}: must be from {parameter.lower:g} to {parameter.upper:g}"
+                f" {parameter.unit}; give {parameter.description}".strip()
             )
     if obstacle := find_obstacle(logs):
         signals = "; ".join(f"{log.name}: {', '.join(log.signals) or 'nothing'}" for log in logs)
@@ -319,7 +327,8 @@ def check_arguments(
     contradictory = sorted({*known} & {*estimated})
     if contradictory:
         raise ValueError(
-            f"{', '.join(contradictory)}: must not be both known and estimated; remove one of the two"
+            f"{', '.join(contradictory)}: must not be both known and estimated; remove one of"
+            " the two"
         )
     possible = [name for name, only in ESTIMABLE.items() if only is None or only == driven_by]
     if driven_by is not None or estimated:
@@ -335,8 +344,8 @@ def check_arguments(
     if rig is None and "mgl" not in known and driven_by is not None:
         raise ValueError(
             "rig is not given (--rig on the command line, rig= in Python): it decides which"
-            " parameters are fitted, must be pendulum, free or load; a motor without a load is free,"
-            " with load_inertia=0 known"
+            " parameters are fitted, must be pendulum, free or load; a motor without a load is"
+            " free, with load_inertia=0 known"
         )
     return {name: float(value) for name, value in known.items()}
 

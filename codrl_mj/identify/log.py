@@ -1,4 +1,4 @@
-"""A bench log in SI units, properties of its sensors and its motion, and the segments it is cut into."""
+"""Bench logs in SI units, properties of their sensors and motion, and segments of them."""
 
 import dataclasses
 import itertools
@@ -168,7 +168,7 @@ def find_turn_jumps(values: np.ndarray, period: float) -> np.ndarray:
 
 
 def counts_per_turn(step: float, period: float) -> int | None:
-    """Return the counts of an encoder per turn; None if its step may as well be a file's rounding."""
+    """Return an encoder's counts per turn; None if its step may as well be a file's rounding."""
     if step <= 0.0 or round(step / 10.0 ** math.floor(math.log10(step)), 5) in _ROUND_DIGITS:
         return None
     count = round(period / step)
@@ -358,7 +358,8 @@ def replace_signal(log: Log, name: str, values: np.ndarray) -> Log:
 def remove_spikes(values: np.ndarray) -> np.ndarray:
     """Return a signal whose spikes of single rows are replaced by the nearer neighbor.
 
-    The robust loss tolerates outliers of an output, but the input of a simulation must not have any.
+    The robust loss tolerates outliers of an output, but the input of a simulation must not have
+    any.
     """
     # The median of three rows is the row itself, unless it is above or below both neighbors.
     median = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
@@ -423,8 +424,8 @@ def smoothed_speeds(
     nearest = np.clip(np.searchsorted(times, centers), 1, count - 1)
     first = np.clip(np.minimum(first, nearest - 1), 0, max(count - 2, 0))
     last = np.clip(np.maximum(last, nearest + 1), first + 2, count)
-    # Differences of cumulative sums give the sums of all windows at once. Offsets from the first row
-    # keep the sums small, and their differences accurate.
+    # Differences of cumulative sums give the sums of all windows at once. Offsets from the first
+    # row keep the sums small, and their differences accurate.
     offsets, turns = times - times[0], positions - positions[0]
     cumulative = [
         np.concatenate([[0.0], np.cumsum(values)])
@@ -454,7 +455,7 @@ def cut_segments(log: Log, duration: float) -> list[slice]:
 
 
 def initial_state(log: Log, rows: slice) -> np.ndarray:
-    """Return the position and the speed at the first row, from a parabola through the rows around it.
+    """Return the position and the speed at the first row, from a parabola around it.
 
     The parabola is fitted to the rows within 15 ms, or to five rows.
     """

@@ -195,7 +195,7 @@ class ShaftModel(Model):
         return shaft_parameters(parameters, gain, braking)
 
     def simulator(self, values: np.ndarray) -> Simulate:
-        """Return a function that simulates positions [rad] or speeds [rad/s] with parameters (p,)."""
+        """Return a function that simulates positions [rad] or speeds [rad/s] of a segment."""
         from codrl_mj.identify.simulation import simulate_shaft
 
         shaft, output_index = self.shaft_parameters(values), int(self.output == "velocity")
@@ -394,7 +394,8 @@ def _shaft_regression(
                 segment.state[0] + integrate(segment.measured, times),
                 segment.measured,
             )
-        # The columns are gravity, a constant load, Coulomb friction, viscous friction and the input.
+        # The columns are gravity, a constant load, Coulomb friction, viscous friction and the
+        # input.
         columns = (
             np.sin(position),
             np.ones(len(times)),

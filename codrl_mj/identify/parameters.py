@@ -75,7 +75,7 @@ OF_MOTOR = (
 )
 """Fields of `GearMotor` that are identified or known."""
 OF_LOSS = ("gear_efficiency", "stribeck_friction", "stribeck_speed", "stribeck_exponent")
-"""Fields of `GearMotor` that a shaft takes from a base drive if they are neither fitted nor known."""
+"""Fields of `GearMotor` that a shaft takes from a base if they are neither fitted nor known."""
 OF_WINDING = {
     "current": ("torque_constant", "back_emf_constant"),
     "voltage": ("resistance", "resistance"),

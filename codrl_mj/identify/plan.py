@@ -232,8 +232,15 @@ def _expected_errors(
     known |= {"mgl": load.gravity, "constant_torque": load.against}
     known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
     losses = {name: truth[name] for name in OF_LOSS}
-    shaft = ShaftModel(rig="free", friction="coulomb", driven_by="current", output="position", known=known,
-                       defaults=DEFAULTS | losses, segment=_SEGMENT)  # fmt: skip
+    shaft = ShaftModel(
+        rig="free",
+        friction="coulomb",
+        driven_by="current",
+        output="position",
+        known=known,
+        defaults=DEFAULTS | losses,
+        segment=_SEGMENT,
+    )
     shaft_errors = _fit_errors(
         truth, shaft, shaft.segments([log]), 2.0 * math.pi / sensing.encoder / math.sqrt(12.0)
     )

@@ -1,4 +1,4 @@
-"""Proposals for `--columns` from the names, units and values of a file's columns, for the user to complete."""
+"""Proposals for `--columns` from the names, units and values of a file's columns."""
 
 import json
 import keyword
@@ -250,7 +250,7 @@ def _finite_values(name: str, table: Table) -> np.ndarray:
 def _infer_unit(
     signal: str, name: str, formula: str, values: np.ndarray, table: Table
 ) -> tuple[str, str]:
-    """Return a unit that is inferred from a column's values, or an open one, and a doubt about it."""
+    """Infer the unit of a column from its values; return it, or an open one, and a doubt."""
     if signal == "time" and any(
         isinstance(cell, str) and STAMP.match(cell) for cell in table.columns[name][:2]
     ):
@@ -264,9 +264,10 @@ def _infer_unit(
     size = f"values up to {largest:.4g}"
     units = _time_units(values) if signal == "time" else []
     if len(units) == 1:
-        return units[
-            0
-        ], f"no unit is stated, {units[0]} is inferred from the steps ({size}): check it"
+        return (
+            units[0],
+            f"no unit is stated, {units[0]} is inferred from the steps ({size}): check it",
+        )
     for unit, turn in _TURNS.items() if signal == "position" and values.size else ():
         if find_turn_jumps(values, turn).size and np.ptp(values) <= 1.1 * turn:
             return (

@@ -228,8 +228,8 @@ def _find_unsigned(
             if high.any() and low.any() and np.all(plausible | np.isnan(numbers)):
                 row = int(row_numbers[np.flatnonzero(high)[0]])
                 text = (
-                    f"{name} is below {range_size / 4:.0f} or above {3 * range_size / 4:.0f}: does it"
-                    f" have {bits} bits and a sign?"
+                    f"{name} is below {range_size / 4:.0f} or above {3 * range_size / 4:.0f}: does"
+                    f" it have {bits} bits and a sign?"
                 )
                 yield Finding(
                     "error", "register", row, text, f"write twos_complement({name}, {bits})"

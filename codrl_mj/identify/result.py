@@ -44,8 +44,8 @@ def missing_parameters(names: Collection[str], base: Mapping[str, Any] | None) -
         return (
             "rotor_inertia is unknown (0) in the datasheet, and the logs show only the inertia of"
             " all that moves. Give the inertia at the output without the motor's: --known"
-            " load_inertia=VALUE; or --known rotor_inertia=0 if the model that you train in contains"
-            " the rotor"
+            " load_inertia=VALUE; or --known rotor_inertia=0 if the model that you train in"
+            " contains the rotor"
         )
     needed = ("resistance", "inductance", "torque_constant", "back_emf_constant", "rotor_inertia")
     lacking = [name for name in needed if name not in names]
@@ -59,8 +59,8 @@ def missing_parameters(names: Collection[str], base: Mapping[str, Any] | None) -
             " 0 for a motor without load"
         )
     return (
-        f"{', '.join(lacking)}: these logs do not determine {'it' if len(lacking) == 1 else 'them'}."
-        f" Give {remedy}"
+        f"{', '.join(lacking)}: these logs do not determine"
+        f" {'it' if len(lacking) == 1 else 'them'}. Give {remedy}"
     )
 
 
@@ -120,7 +120,7 @@ class Prediction:
     open_loop: float
     """Error over `HORIZON` under the logged input, from states fitted to `START_DURATION`."""
     closed_loop: float | None
-    """Error over the whole log under the servo's proportional law; None if the log has no such law."""
+    """Error over the whole log under the servo's proportional law; None without such a law."""
     trace: Trace | None = dataclasses.field(default=None, compare=False, repr=False)
     """Simulation of `open_loop`; not written to files."""
 
@@ -245,7 +245,7 @@ class Identified:
         raise KeyError(name)
 
     def problem(self) -> str | None:
-        """Return the reason against an actuator with these parameters, and a remedy; None if none."""
+        """Return the reason why there is no actuator, with a remedy; None if there is one."""
         if self.unexplained > MAX_UNEXPLAINED:
             return (
                 f"the fit leaves {self.unexplained:.0%} of a log's variation unexplained, so that"
@@ -268,7 +268,10 @@ class Identified:
         )
         if unusable:
             pronoun = "it" if len(unusable) == 1 else "them"
-            return f"{reasons}. Give {pronoun} with --known {' '.join(f'{estimate.name}=VALUE' for estimate in unusable)}"
+            return (
+                f"{reasons}. Give {pronoun} with --known"
+                f" {' '.join(f'{estimate.name}=VALUE' for estimate in unusable)}"
+            )
         return missing_parameters([estimate.name for estimate in self.estimates], self.base)
 
     @property
@@ -291,7 +294,7 @@ class Identified:
 
     @property
     def base_text(self) -> str | None:
-        """Parameters of the actuator from the base, as a sentence; None without base or actuator."""
+        """Parameters of the actuator from the base, as a sentence; None if there are none."""
         motor = base_motor(self.base)
         if motor is None or self.problem() is not None:
             return None
@@ -302,13 +305,14 @@ class Identified:
             if name not in identified
         ]
         return (
-            f"not from these logs but the motor's, by --motor: {', '.join(map(str.strip, parameters))}"
+            "not from these logs but the motor's, by --motor:"
+            f" {', '.join(map(str.strip, parameters))}"
             if parameters
             else None
         )
 
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """Return the intervals of the usable parameters, by field of a drive; known values have none."""
+        """Return the intervals of usable parameters by field of a drive, without known values."""
         return {
             f"motor.{estimate.name}": (estimate.low, estimate.high)
             for estimate in self.estimates
@@ -352,8 +356,8 @@ class Identified:
         """Write result.json and, without a problem, actuator.yaml into a folder, each atomically.
 
         The actuator's file has a drive's fields, and their intervals under `identified`. With a
-        problem, the actuator.yaml of an earlier fit is removed, because it would be mistaken for the
-        result of this fit.
+        problem, the actuator.yaml of an earlier fit is removed, because it would be mistaken for
+        the result of this fit.
 
         Returns:
             The paths of the files written.

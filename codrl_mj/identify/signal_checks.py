@@ -10,7 +10,7 @@ _MEASURED = "position", "velocity", "current", "torque"
 
 
 def signal_findings(log: Log) -> Iterator[Finding]:
-    """Check each signal; only measured signals are checked for repeated rows, clipping and outliers."""
+    """Check each signal by itself."""
     for signal in log.signals:
         yield from _resolution(log, signal)
         # Commanded signals, such as the voltage, may rest at a limit or change seldom.
@@ -34,16 +34,14 @@ def _resolution(log: Log, signal: str) -> Iterator[Finding]:
         )
         remedies = {
             "position": "move further, or use a finer encoder",
-            "velocity": (
-                "leave it out and use the position, or smooth it over several milliseconds"
-            ),
+            "velocity": "leave it out and use the position, or smooth it over several milliseconds",
         }
         remedy = remedies.get(signal, "measure in a smaller range, or drive harder")
         yield Finding("warning", "resolution", None, text, remedy)
 
 
 def _repeated(log: Log, signal: str) -> Iterator[Finding]:
-    """Find a signal that is read less often than rows are written, so that rows repeat what was read before."""
+    """Find a signal that is sampled less often than rows are written, so that values repeat."""
     steps = np.diff(log.signals[signal])
     changes = np.flatnonzero(steps)
     if len(changes) < 20:
@@ -75,8 +73,8 @@ def _saturation(log: Log, signal: str) -> Iterator[Finding]:
         if clipped.sum() >= 10 and clipped.sum() > 3 * nearby.sum() and abs(bound) > 0.2 * spread:
             row = int(log.row_numbers[np.flatnonzero(clipped)[0]])
             text = (
-                f"{int(clipped.sum())} rows are at the {name} {signal}, {bound:.4g} {SIGNALS[signal]},"
-                " the first one here"
+                f"{int(clipped.sum())} rows are at the {name} {signal}, {bound:.4g}"
+                f" {SIGNALS[signal]}, the first one here"
             )
             remedy = (
                 "if the sensor is clipped there, measure in a larger range, or leave these rows out"

@@ -190,8 +190,8 @@ def simulate_samples(
 ) -> np.ndarray:
     """Simulate a drive, and return its states at each sample, shape (n, 5).
 
-    The winding is exact between two samples at the speed in their middle; the shaft moves for half a
-    sample before and after it (Strang splitting, of second order).
+    The winding is exact between two samples at the speed in their middle; the shaft moves for half
+    a sample before and after it (Strang splitting, of second order).
 
     Args:
         period: of the samples [s].

@@ -155,7 +155,7 @@ class Sampler(Checked):
     dropped: float = real(0.0, least=0.0, most=0.9)
     """Share of rows that are lost, in [0, 0.9]."""
     mean_voltage: bool = False
-    """True if a row has the mean voltage until the next row; else it has the voltage at its time."""
+    """True if a row has the mean voltage until the next row, False if the instantaneous one."""
 
 
 def simulate_drive(
@@ -217,7 +217,7 @@ def sample_times(drive: Drive, duration: float) -> np.ndarray:
 
 
 def check_size(drive: Drive, duration: float, rate: float) -> None:
-    """Raise an error if a simulation of a duration [s] with rows at a rate [Hz] exceeds the memory."""
+    """Raise an error if a simulation of a duration [s] at a rate [Hz] exceeds the memory."""
     samples, rows = duration * drive.controller.sample_rate, duration * rate
     size = f"{duration:,g} s are {samples:,.0f} samples of the drive and {rows:,.0f} rows"
     remedy = "shorten the duration (--duration), or lower the rate of the rows"

@@ -32,18 +32,18 @@ ATTENUATION = 6.0
 SLACK = 1e-3
 """Share of the cost by which a fit may be better by chance."""
 UNKNOWN = 0.5
-"""Relative change along a direction; if it does not change the cost, the direction is unidentified."""
+"""Relative change along a direction that must change the cost; else it is unidentifiable."""
 MIN_SHARE = 0.1
 """Smallest share of a parameter in a direction that is reported."""
 MAX_HALF_WIDTH = 0.3
-"""Largest relative half-width of a usable interval; for friction, relative to the whole friction."""
+"""Largest relative half-width of a usable interval, for friction relative to its sum."""
 MAX_IDENTIFIED = {
     "resistance": 0.05,
     "back_emf_constant": 0.05,
     "torque_constant": 0.05,
     "inductance": 0.15,
 }
-"""Parameter -> relative half-width beyond which it is rough; others are identified up to the limit."""
+"""Parameter -> relative half-width beyond which it is rough; for others `MAX_HALF_WIDTH`."""
 # Sensors are not calibrated any better.
 MIN_HALF_WIDTH = 0.002
 """Smallest relative half-width of an interval."""
@@ -53,7 +53,7 @@ MIN_HALF_WIDTHS = {"inductance": 0.02}
 MAX_FRICTION = 0.1
 """Relative half-width beyond which a friction parameter is rough."""
 MAX_BIAS = 0.5
-"""Largest error of the self-test, over the largest half-width, that is not the reason of a refusal."""
+"""Largest error of the self-test, over the largest half-width, that is not reported."""
 CAUSES = {
     "curvature": "the logs hardly depend on it",
     "resampling": "parts of the logs disagree",
@@ -106,16 +106,18 @@ def assess_fits(
     if unexplained > MAX_UNEXPLAINED:
         reason = f"the fit leaves {unexplained:.0%} of a log's variation unexplained"
         completed = [
-            estimate
-            if estimate.status == "given"
-            else dataclasses.replace(estimate, status="refused", why=reason)
+            (
+                estimate
+                if estimate.status == "given"
+                else dataclasses.replace(estimate, status="refused", why=reason)
+            )
             for estimate in completed
         ]
     return completed, warnings, unexplained
 
 
 def _assess_part(fit: Fit, seed: int, on_step: Callable[[], None]) -> list[Estimate]:
-    """Return the free parameters of a part and the sum of its friction, with intervals and status."""
+    """Return a part's free parameters and its total friction, with intervals and status."""
     model, names = fit.model, fit.model.names
     if not names:
         return []
@@ -407,8 +409,8 @@ def _complete(
             status = "refused"
             share = 100.0 * (high - value) / max(value, 1e-300)
             reason = (
-                f"the total inertia of {total.value:.4g} kg*m^2 without the load's {load:.4g} kg*m^2"
-                f" is known only to {share:.3g} %"
+                f"the total inertia of {total.value:.4g} kg*m^2 without the load's {load:.4g}"
+                f" kg*m^2 is known only to {share:.3g} %"
             )
         ends = max(low, 0.0), max(high, 0.0)
         by_name["rotor_inertia"] = Estimate("rotor_inertia", max(value, 0.0), *ends, status, reason)
@@ -416,7 +418,7 @@ def _complete(
 
 
 def _gauss_newton_sums(fit: Fit, groups: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gradient (c, p) and the Gauss-Newton matrix (c, p, p) of each group of segments."""
+    """Return gradient (c, p) and Gauss-Newton matrix (c, p, p) of each group of segments."""
     count, size = len(set(groups)), len(fit.values)
     gradients, matrices = np.zeros((count, size)), np.zeros((count, size, size))
     group_index = {group: index for index, group in enumerate(dict.fromkeys(groups))}
@@ -468,8 +470,8 @@ def interval_causes(
     is_winding = isinstance(fit.model, WindingModel)
     causes = resampled_half_widths(fit, scales, matrix, seed)
     on_step()
-    # The self-test fits two simulations of the logs with opposite residuals: random errors cancel in
-    # the mean of both fits, and a bias remains.
+    # The self-test fits two simulations of the logs with opposite residuals: random errors cancel
+    # in the mean of both fits, and a bias remains.
     self_test_values = values + matrix @ (
         np.asarray(
             0.5 * sum(_refit_values(fit, _simulated_logs(fit, sign)) for sign in (1.0, -1.0))
@@ -477,8 +479,9 @@ def interval_causes(
         - fit.values
     )
     on_step()
-    # If an error is proportional to the time step, the fit at half the rate changes by as much as the
-    # error at the full rate; if it grows with the root of the step, the error is larger than that.
+    # If an error is proportional to the time step, the fit at half the rate changes by as much as
+    # the error at the full rate; if it grows with the root of the step, the error is larger than
+    # that.
     half_rate_values = _refit_values(fit, [halve_rate(log) for log in fit.logs])
     causes["half_rate"] = (2.0 if is_winding else 1.0) * np.abs(
         matrix @ (half_rate_values - fit.values)
@@ -486,8 +489,8 @@ def interval_causes(
     on_step()
     causes["self_test"] = np.abs(self_test_values - values)
     # Errors of the input, as those of a voltage that changes between the rows, attenuate its factor
-    # by a multiple of their share of the variance: 2 to 4.6 for a PRBS whose clock is 1 to 4 rows. A
-    # fit of fewer rows does not show this.
+    # by a multiple of their share of the variance: 2 to 4.6 for a PRBS whose clock is 1 to 4 rows.
+    # A fit of fewer rows does not show this.
     residual_squares = sum(
         segment.deviation**2 * float(fit.weights(i) @ fit.residuals[i] ** 2)
         for i, segment in enumerate(fit.segments)
@@ -561,9 +564,9 @@ def unidentifiable_directions(fit: Fit, scales: np.ndarray) -> list[dict[str, fl
     """Return the directions in which the parameters can change without a worse fit.
 
     The weakest direction follows from the derivatives. Its largest parameter is changed by half its
-    scale, and all others are fitted again: if the fit is then as good, the changes of all parameters
-    are an unidentifiable direction. Derivatives alone do not suffice, because dry friction makes the
-    cost rough, so that a flat direction looks identified.
+    scale, and all others are fitted again: if the fit is then as good, the changes of all
+    parameters are an unidentifiable direction. Derivatives alone do not suffice, because dry
+    friction makes the cost rough, so that a flat direction looks identified.
 
     Args:
         fit: to assess.
