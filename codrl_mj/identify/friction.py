@@ -45,9 +45,9 @@ def choose_friction(
     if len(logs) < MIN_LOGS:
         return FrictionChoice(
             model,
-            f"friction: coulomb, because auto needs {MIN_LOGS} logs that move, to compare the"
-            f" errors on logs left out, and there {'is' if len(logs) == 1 else 'are'} {len(logs)}."
-            " Add logs, or choose --friction load, stribeck or both",
+            f"friction: coulomb, because auto needs {MIN_LOGS} logs that move, and there"
+            f" {'is' if len(logs) == 1 else 'are'} {len(logs)}: it compares the errors on logs left"
+            " out. Add logs, or choose --friction load, stribeck or both",
         )
     errors = {"coulomb": _left_out_errors(model, logs, on_step)}
     best = model

@@ -14,7 +14,7 @@ from codrl_mj.identify.checks import FACTORS, check, explain_factor
 from codrl_mj.identify.log import Log
 from codrl_mj.identify.simulation import ShaftParameters, simulate_shaft
 from codrl_mj.identify.synthetic import Excitation, Load, Sampler, Sensor, simulate, simulate_drive
-from tests.identify.draws import scaled
+from tests.identify.draws import scale_signals
 from tests.matrix import but
 
 MOTORS = {
