@@ -1,4 +1,4 @@
-"""A geared motor of the catalog: simulated by MuJoCo, identified with its datasheet, and replayed."""
+"""A geared catalog motor: simulated by MuJoCo, identified with its datasheet, and replayed."""
 
 import mujoco
 import numpy as np
@@ -69,7 +69,7 @@ def test_a_geared_motor_is_identified_with_its_datasheet(geared):
 
 
 def test_the_written_actuator_reproduces_the_prediction(geared, swings, tmp_path):
-    """A simulation of the whole log has the report's error, so that friction is not applied twice."""
+    """A simulation of the whole log has the reported error: friction is not applied twice."""
     path, _ = geared.write(tmp_path)
     log = swings[1]
     replayed = simulate_pendulum(resolve(str(path), None, "a test"), log.signals["voltage"])

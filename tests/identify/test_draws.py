@@ -1,4 +1,4 @@
-"""Identification of random motors: intervals contain the truth, and only visible parameters count."""
+"""Identification of random motors: intervals contain the truth."""
 
 import itertools
 

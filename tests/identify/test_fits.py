@@ -196,7 +196,7 @@ def test_raises_if_all_logs_are_held_out(swings):
 
 
 def test_a_free_swing_with_known_weight_determines_the_inertia():
-    """The swing from scipy has no torque: mgl/J is 64.1 1/s^2, and the damping over J is 0.3 1/s."""
+    """The swing is from scipy without torque: mgl/J is 64.1 1/s^2, and damping/J is 0.3 1/s."""
     time = np.arange(0.0, 3.0, 2e-3)
     swing = solve_ivp(
         lambda _, y: (y[1], -64.1 * np.sin(y[0]) - 0.3 * y[1]),

@@ -126,7 +126,7 @@ def test_all_refused_and_all_missing_parameters_are_named_together():
 
 
 def test_an_unknown_rotor_inertia_of_the_datasheet_is_not_zero():
-    """The logs show only the total inertia: the user has to give the load's or the rotor's share."""
+    """The logs show only the total inertia: the load's or the rotor's has to be known."""
     estimates = [estimate for estimate in motor().estimates if estimate.name != "rotor_inertia"]
     bare = Drive().replaced({"motor.rotor_inertia": 0.0}).as_mapping()
     assert "--known load_inertia=VALUE" in make_identified(*estimates, base=bare).problem()

@@ -72,7 +72,7 @@ def test_a_servo_holds_a_load_by_its_proportional_law():
 
 
 def test_a_supply_limits_the_input_of_a_servo_only_if_it_is_a_voltage():
-    """A torque in N*m may exceed the supply's voltage in V: the prediction is the same with a bus."""
+    """The number of a torque may exceed that of the supply's voltage: they are not compared."""
     times = np.linspace(0.0, 20.0, 4001)
     targets, shaft = 20.0 * np.sign(np.sin(times)), STILL._replace(viscous=1.0)
     position = simulate_servo(times, targets, np.full(4001, 100.0), 4.0, 0.0, 0.0, shaft)
