@@ -140,18 +140,12 @@ def table_to_log(name: str, table: Table, mapping: Mapping[str, Column]) -> Log:
         for signal, column in mapping.items()
     }
     time, selected = signals.pop("time"), signals.pop("only", np.ones(count)) != 0.0
-    finite = np.isfinite(time) & np.all(
-        [np.isfinite(signal) for signal in signals.values()], axis=0
-    )
+    finite = np.isfinite(time) & np.all([np.isfinite(each) for each in signals.values()], axis=0)
     rows = np.flatnonzero(selected & finite)
     forward = time[rows] > np.append(-np.inf, np.maximum.accumulate(time[rows])[:-1])
     findings = [
         *_find_unsigned(values, mapping, row_numbers),
-        *_left_out(
-            row_numbers[selected & ~finite],
-            "missing",
-            "have no number in some column, and are left out",
-        ),
+        *_left_out(row_numbers[selected & ~finite], "missing", "lack a number, and are left out"),
         *_left_out(
             row_numbers[rows[~forward]],
             "stamps",
@@ -169,9 +163,7 @@ def table_to_log(name: str, table: Table, mapping: Mapping[str, Column]) -> Log:
             if column.unit is None and SIGNALS.get(column.signal)
         ),
         *_left_out(
-            np.array(table.ragged),
-            "missing",
-            "do not have as many cells as there are columns, and are left out",
+            np.array(table.ragged), "missing", "have too few or too many cells, and are left out"
         ),
     ]
     unusable = int((selected & ~finite).sum() + (~forward).sum())
