@@ -1,4 +1,4 @@
-"""What docs/tutorial_datasheet_to_board.md tells a reader to type works, but for the length of the training."""
+"""The commands of docs/tutorial_datasheet_to_board.md run, with a shorter training."""
 
 import json
 import re
@@ -15,14 +15,14 @@ from codrl_mj.deploy.board import missing_tools
 PAGE = (Path(__file__).parent.parent / "docs" / "tutorial_datasheet_to_board.md").read_text()
 FILES = dict(re.findall(r"```(?:yaml|toml)\n# (\S+)\n(.*?)```", PAGE, re.DOTALL))
 LINES = re.findall(r"^\$ (.*)$", PAGE, re.MULTILINE)
-IN_PARTS = re.findall(r"^codrl-mj (.*)$", PAGE, re.MULTILINE)
-"""What needs a board."""
+BOARD_COMMANDS = re.findall(r"^codrl-mj (.*)$", PAGE, re.MULTILINE)
+"""Commands that need a board."""
 
 
 @pytest.mark.parametrize(
-    "command", [*(line for line in LINES if line.startswith("codrl-mj")), *IN_PARTS]
+    "command", [*(line for line in LINES if line.startswith("codrl-mj")), *BOARD_COMMANDS]
 )
-def test_the_commands_are_understood(command, monkeypatch, tmp_path):
+def test_the_commands_are_valid(command, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     for name, text in FILES.items():
         Path(name).write_text(text)
@@ -39,17 +39,16 @@ def test_the_commands_are_understood(command, monkeypatch, tmp_path):
 @pytest.mark.skipif(
     bool(missing_tools("host")), reason="NOT RUN: no C compiler: apt-get install gcc"
 )
-def test_it_can_be_followed_to_its_end(monkeypatch, tmp_path, capsys):
+def test_all_commands_run(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     for name, text in FILES.items():
         Path(name).write_text(text)
     errors = []
     for line in LINES:
         if not line.startswith("codrl-mj"):
-            done = subprocess.run(line, shell=True, check=True, capture_output=True, text=True)
-            assert (
-                float(done.stdout.split()[-1]) < 1e-6
-            )  # the largest difference of the golden commands
+            process = subprocess.run(line, shell=True, check=True, capture_output=True, text=True)
+            # The program prints the largest difference to the golden commands.
+            assert float(process.stdout.split()[-1]) < 1e-6
             continue
         words = shlex.split(line)[1:]
         if "cortex-m4f" in words and missing_tools("cortex-m4f"):
@@ -65,7 +64,7 @@ def test_it_can_be_followed_to_its_end(monkeypatch, tmp_path, capsys):
         assert main([*words, *["--json"] * compares]) == 0, line
         if compares:
             errors.append(
-                {one["name"]: one["error"] for one in json.loads(capsys.readouterr().out)}
+                {row["name"]: row["error"] for row in json.loads(capsys.readouterr().out)}
             )
     with_datasheet, identified = errors
     assert with_datasheet["arm_velocity"] > 2.0 * identified["arm_velocity"]

@@ -1,4 +1,4 @@
-"""What docs/tutorial_log_to_policy.md tells a reader to type works as it stands, and finds the motor that it names."""
+"""The commands of docs/tutorial_log_to_policy.md run as printed, and identify the motor."""
 
 import json
 import re
@@ -14,21 +14,22 @@ from codrl_mj.cli import main
 PAGE = (Path(__file__).parent.parent / "docs" / "tutorial_log_to_policy.md").read_text()
 FILES = dict(re.findall(r"```yaml\n# (\S+)\n(.*?)```", PAGE, re.DOTALL))
 COMMANDS = re.findall(r"^\$ codrl-mj (.*)$", PAGE, re.MULTILINE)
-TRAINING = next(place for place, command in enumerate(COMMANDS) if command.startswith("train"))
+TRAINING = next(index for index, command in enumerate(COMMANDS) if command.startswith("train"))
 SHORT = {"6000": "300", "20": "1"}
-"""Numbers of steps and episodes -> those of the tests, whose machine has other things to do."""
+"""Numbers of steps and episodes -> smaller numbers, which make the tests fast."""
 
 
 def run(command, **short):
+    """Run a command with smaller numbers as values of its flags."""
     words = shlex.split(command)
-    for place in range(1, len(words)):
-        if words[place - 1].startswith("--"):
-            words[place] = short.get(words[place], words[place])
+    for index in range(1, len(words)):
+        if words[index - 1].startswith("--"):
+            words[index] = short.get(words[index], words[index])
     assert main(words) == 0
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_commands_are_understood(command, monkeypatch, tmp_path):
+def test_the_commands_are_valid(command, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     Path("motor").mkdir()
     for name, text in (FILES | {"motor/actuator.yaml": FILES["real.yaml"]}).items():
@@ -42,7 +43,7 @@ def test_the_commands_are_understood(command, monkeypatch, tmp_path):
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    """A folder in which the page has been followed until the training; logs of 2 s."""
+    """Run the commands before the training with logs of 2 s, and yield the folder."""
     folder = tmp_path_factory.mktemp("bench")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -54,18 +55,19 @@ def bench(tmp_path_factory):
 
 
 @pytest.mark.matrix
-def test_the_fit_finds_the_motor_of_the_bench(bench, monkeypatch):
+def test_the_fit_identifies_the_motor(bench, monkeypatch):
     monkeypatch.chdir(bench)
     real = yaml.safe_load(FILES["real.yaml"])["motor"]
-    found = {
-        one["name"]: one for one in json.loads(Path("motor/result.json").read_text())["estimates"]
+    estimates = {
+        estimate["name"]: estimate
+        for estimate in json.loads(Path("motor/result.json").read_text())["estimates"]
     }
     for name in ("resistance", "torque_constant", "back_emf_constant"):
-        assert found[name]["low"] <= real[name] <= found[name]["high"]
+        assert estimates[name]["low"] <= real[name] <= estimates[name]["high"]
 
 
 @pytest.mark.matrix
-def test_the_rest_of_it_runs(bench, monkeypatch):
+def test_the_training_and_the_evaluations_run(bench, monkeypatch):
     monkeypatch.chdir(bench)
     for command in COMMANDS[TRAINING:]:
         run(command, **SHORT)

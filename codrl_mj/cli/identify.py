@@ -87,7 +87,7 @@ class Identify:
 
     def run(self) -> tuple[int, Any]:
         """Check the logs, fit, print a table, write the files."""
-        from codrl_mj.identify.identify import checked, foreseen, identify
+        from codrl_mj.identify.identify import check_arguments, predict_missing, identify
         from codrl_mj.identify.reading import read_log
         from codrl_mj.identify.result import ACTUATOR
         from codrl_mj.sizing import find_drive
@@ -101,8 +101,8 @@ class Identify:
             base = base.replaced({"motor.gear_ratio": known["gear_ratio"]})
         mapping = base and base.as_mapping()
         wanted = logs, self.rig, known, self.friction
-        known_too = checked(*wanted, self.estimate, self.segment, mapping)
-        if lacking := foreseen(logs, known_too, mapping):
+        known_too = check_arguments(*wanted, self.estimate, self.segment, mapping)
+        if lacking := predict_missing(logs, known_too, mapping):
             say(f"there will be no actuator. {lacking}", style="yellow")
         held_out = self._check(logs, held_out, base)
         with progress_bar("{task.completed}/{task.total}") as bar:

@@ -127,17 +127,17 @@ class Data:
 
     def run(self) -> int:
         """List, or fetch."""
-        from codrl_mj.identify.published import fetch, published
+        from codrl_mj.identify.published import fetch, published_datasets
 
         if self.name is None:
-            rows = [(name, one["title"], one["licence"]) for name, one in published().items()]
+            rows = [(name, one["title"], one["licence"]) for name, one in published_datasets().items()]
             print_table("", ("name", "motor and rig", "licence"), rows)
-            print("\n".join(f"{name}: {one['source']}" for name, one in published().items()))
+            print("\n".join(f"{name}: {one['source']}" for name, one in published_datasets().items()))
             return 0
         files = fetch(self.name, self.out)
         for file in files:
             print(file)
-        known = published()[self.name]
+        known = published_datasets()[self.name]
         say(
             f"{known['licence']}, {known['source']} at {known['commit'][:10]}; columns:"
             f" {known['columns']}"

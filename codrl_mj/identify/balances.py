@@ -1,9 +1,10 @@
-"""Voltage and torque balances of a log by linear regression, without differentiating anything; lags by them.
+"""Voltage and torque balances of a log by linear regression without differentiation, and lags.
 
-Both balances are multiplied by functions phi that vanish with their slope at both ends of a window,
-and integrated: the derivatives go over to phi. Source: Shinbrot, *On the Analysis of Linear and
-Nonlinear Systems* (1957), the method of modulating functions. Good for signs, orders of magnitude
-and starts; noise in what is regressed on biases it.
+Both balances are multiplied by functions phi whose value and slope vanish at both ends of a window,
+and integrated by parts: the derivatives move from the signals to phi. Source: Shinbrot, *On the
+Analysis of Linear and Nonlinear Systems* (1957), the method of modulating functions. The results
+are good enough for signs, orders of magnitude and initial guesses; noise in the regressors biases
+them.
 """
 
 import math
@@ -12,43 +13,46 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.log import Log, sensor_deviation, usable
+from codrl_mj.identify.log import Log, gapless_stretches, sensor_deviation
 
-_ROWS = 12  # rows of a window, at least
-_LONGEST = 20_000  # rows of a log beyond which a lag is not looked for
-_WINDOWS = 400  # more tell no more of a lag
+_MIN_ROWS = 12  # of a window
+_MAX_LAG_ROWS = 20_000  # rows of a log from its start that a lag is estimated from
+_MAX_LAG_WINDOWS = 400  # more windows do not make a lag more accurate
+# The power of s - s^2 is so high that the trapezoidal rule is accurate for phi'' too.
 _BUMP = np.polynomial.Polynomial([0.0, 1.0, -1.0]) ** 5
-"""s - s^2 to a power so high that the trapezoidal rule is good for phi'' too."""
 _UNIT = _BUMP / _BUMP.integ()(1.0)
 _PHI = {-1: _UNIT.integ(), 0: _UNIT, 1: _UNIT.deriv(), 2: _UNIT.deriv(2)}
-"""Order of the derivative by the phase -> polynomial; -1: its integral."""
-BODY = (
-    "inertia",
-    "viscous",
-    "coulomb",
-)  # terms of a torque balance that no body and no friction has negative
+"""Order of phi's derivative with respect to the phase -> polynomial; -1: its integral."""
+NONNEGATIVE_TERMS = ("inertia", "viscous", "coulomb")
+"""Terms of a torque balance that are never negative for a physical body and its friction."""
 
 
 class Balance(NamedTuple):
-    """A regression over the windows of a log."""
+    """The result of a regression over the windows of a log."""
 
     values: Mapping[str, float]  # term -> its coefficient
     certainty: Mapping[str, float]  # term -> its coefficient over its standard error
-    unexplained: float  # root mean square of the residual over that of what was to be explained
-    residual: float  # root mean square of the residual, in the unit of what was to be explained
+    unexplained: float  # root mean square of the residual over that of the target
+    residual: float  # root mean square of the residual, in the unit of the target
 
 
 class Windows:
-    """A log cut into overlapping windows, in each of which signals are weighted by phi ~ (s - s^2)^5, s in [0, 1]."""
+    """Overlapping windows of a log, which weight signals by phi ~ (s - s^2)^5, s in [0, 1]."""
 
-    def __init__(self, log: Log, duration: float = 0.0, most: int = 20_000) -> None:
-        """Cut it."""
+    def __init__(self, log: Log, duration: float = 0.0, max_windows: int = 20_000) -> None:
+        """Cut a log into windows of a duration [s], or of the smallest number of rows."""
+        # At least ten windows have to fit into the log.
         duration = min(duration, float(log.time[-1] - log.time[0]) / 10.0)
-        count = max(math.ceil(duration / log.step), _ROWS)
-        every = np.concatenate(
-            [np.arange(one.start, one.stop - count, max(count // 4, 1)) for one in usable(log)]
+        count = max(math.ceil(duration / log.step), _MIN_ROWS)
+        first_rows = np.concatenate(
+            [
+                np.arange(rows.start, rows.stop - count, max(count // 4, 1))
+                for rows in gapless_stretches(log)
+            ]
         )
-        self.rows = every[:: math.ceil(len(every) / most) or 1, None] + np.arange(count + 1)
+        self.rows = first_rows[:: math.ceil(len(first_rows) / max_windows) or 1, None] + np.arange(
+            count + 1
+        )
         self._log = log
         time = log.time[self.rows] if self.rows.size else np.zeros(self.rows.shape)
         self.begin, self.length = time[:, :1], time[:, -1:] - time[:, :1]
@@ -57,9 +61,11 @@ class Windows:
         self._weights: dict[int, np.ndarray] = {}
 
     def mean(self, signal: str | np.ndarray, order: int = 0) -> np.ndarray:
-        """The weighted mean of a signal's derivative of some order, shape (windows,)."""
+        """Return the weighted mean of a signal's derivative of an order, shape (windows,)."""
         values = (self._log.signals[signal] if isinstance(signal, str) else signal)[self.rows]
-        if order > 0:  # what is constant counts for nothing, and would only be rounded
+        # A constant has no derivative: subtracting the mean avoids the rounding errors of a large
+        # offset.
+        if order > 0:
             values = values - values.mean(axis=1, keepdims=True)
         if order not in self._weights:
             self._weights[order] = _PHI[order](self._phase) * (-1.0 / self.length) ** order
@@ -70,11 +76,13 @@ class Windows:
         )
 
     def mean_held(self, signal: str, lag: float = 0.0) -> np.ndarray:
-        """The weighted mean of a signal that is held from a row to the next, shape (windows,)."""
+        """Return the weighted mean of a signal held until the next row, shape (windows,)."""
         values, time = self._log.signals[signal], self._log.time
+        # A lag moves rows from beside a window into it.
         reach = 0 if lag == 0.0 else math.ceil(abs(lag) / self._log.step) + 1
         rows = np.arange(-reach, self.rows.shape[1] - 1 + reach) + self.rows[:, :1]
         rows = np.clip(rows, 0, len(time) - 2)
+        # A held signal is integrated exactly, by the integral of phi between the edges of its rows.
         edges = [
             np.clip((time[rows + k] + lag - self.begin) / self.length, 0.0, 1.0) for k in (0, 1)
         ]
@@ -82,12 +90,15 @@ class Windows:
 
 
 def regress(
-    target: np.ndarray, terms: Mapping[str, np.ndarray], least: float = -np.inf
+    target: np.ndarray, terms: Mapping[str, np.ndarray], lower_bound: float = -np.inf
 ) -> Balance | None:
-    """Least squares that outliers do not move; None where there are too few windows, or terms say the same.
+    """Fit terms to a target by robust least squares.
 
-    Inertia and friction (`BODY`) get coefficients of at least `least`; terms that are 0 throughout
-    are left out.
+    The coefficients of inertia and friction (`NONNEGATIVE_TERMS`) are at least `lower_bound`; terms
+    that are 0 in all windows are left out.
+
+    Returns:
+        None if there are too few windows, or if the terms are linearly dependent.
     """
     from scipy.optimize import lsq_linear
 
@@ -97,34 +108,37 @@ def regress(
     matrix = np.column_stack(list(terms.values()))
     scales = np.sqrt(np.mean(matrix**2, axis=0))
     matrix = matrix / scales
-    bounds = [least if name in BODY else -np.inf for name in terms], np.inf
+    bounds = [lower_bound if name in NONNEGATIVE_TERMS else -np.inf for name in terms], np.inf
     weights = np.ones(len(target))
-    for _ in range(8 if least == -np.inf else 1):  # Huber's weights, reweighted
+    # Eight iterations of reweighting by Huber's weights suffice; the bounded problem, which is
+    # slower, is solved once without weights.
+    for _ in range(8 if lower_bound == -np.inf else 1):
         solution, _, rank, _ = np.linalg.lstsq(
             matrix * weights[:, None], target * weights, rcond=1e-9
         )
-        if least > -np.inf:
+        if lower_bound > -np.inf:
             solution = lsq_linear(matrix * weights[:, None], target * weights, bounds).x
         residual = target - matrix @ solution
+        # 1.4826 times the median absolute deviation is the standard deviation of normal noise.
         scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-12 * float(np.abs(target).max())
         weights = np.sqrt(np.minimum(1.0, 2.0 * scale / np.maximum(np.abs(residual), 1e-300)))
     if rank < len(terms):
         return None
     error = math.sqrt(float(np.mean((weights * residual) ** 2)))
-    # phi is about half as wide as its window, and so overlaps by half with the next one: they count
-    # for half
+    # phi is about half as wide as its window, so that neighboring windows share about half of their
+    # rows. Only half of the windows count as independent.
     variance = 2.0 * error**2 * np.sum(np.linalg.pinv(matrix * weights[:, None]) ** 2, axis=1)
-    certain = solution / np.sqrt(np.maximum(variance, 1e-300))
+    certainty = solution / np.sqrt(np.maximum(variance, 1e-300))
     return Balance(
         dict(zip(terms, map(float, solution / scales), strict=True)),
-        dict(zip(terms, map(float, certain), strict=True)),
+        dict(zip(terms, map(float, certainty), strict=True)),
         error / math.sqrt(float(np.mean((weights * target) ** 2))),
         error,
     )
 
 
 def _speed(log: Log, windows: Windows, order: int = 0) -> np.ndarray:
-    """The weighted mean of the speed, or of its derivative; by the position if there is one."""
+    """Return the weighted mean of the speed or its derivative, from the position if logged."""
     return (
         windows.mean("position", order + 1)
         if log.has("position")
@@ -137,42 +151,44 @@ def _voltage_terms(log: Log, windows: Windows, sag: bool = False) -> dict[str, n
     if log.has("position") or log.has("velocity"):
         terms["back_emf_constant"] = _speed(log, windows)
     if sag:
+        # A bridge draws the share u/V of the current i from the supply, and passes on the same
+        # share of the supply's voltage drop: the drop at the motor grows with the squared share.
         share = log.signals["voltage"] / max(float(np.abs(log.signals["voltage"]).max()), 1e-300)
         terms["supply_resistance"] = windows.mean(share**2 * log.signals["current"])
     return terms
 
 
 def voltage_balance(log: Log, duration: float = 0.0, sag: bool = False) -> Balance | None:
-    """Fits `resistance`*i + `inductance`*di/dt + `back_emf_constant`*omega, of the output, to the voltage; all SI.
+    """Fit `resistance`*i + `inductance`*di/dt + `back_emf_constant`*omega to the voltage.
 
-    Without a motion the shaft counts as locked. `sag`: on (u/max u)^2*i too, which a
-    `supply_resistance` takes.
+    All values are in SI units, and the speed omega is that of the output. Without a logged motion
+    the shaft counts as locked. `sag` adds the term `supply_resistance`*(u/max u)^2*i.
     """
     windows = Windows(log, duration)
     return regress(windows.mean_held("voltage"), _voltage_terms(log, windows, sag))
 
 
 def _torque_terms(
-    log: Log, windows: Windows, aside: bool = False, rig: str | None = None
+    log: Log, windows: Windows, is_tilted: bool = False, rig: str | None = None
 ) -> dict[str, np.ndarray]:
     from scipy.integrate import cumulative_trapezoid
 
-    speed, one = _speed(log, windows), windows.mean(np.ones(len(log.time)))
+    speed, constant = _speed(log, windows), windows.mean(np.ones(len(log.time)))
     terms = {
         "inertia": _speed(log, windows, 1),
         "viscous": speed,
-        "coulomb": np.sign(speed) * one,
-        "constant": one,
+        "coulomb": np.sign(speed) * constant,
+        "constant": constant,
     }
     if rig in (None, "pendulum"):
-        known = log.has("position")
+        has_position = log.has("position")
         angle = (
             log.signals["position"]
-            if known
+            if has_position
             else cumulative_trapezoid(log.signals["velocity"], log.time, initial=0)
         )
         terms["gravity"] = windows.mean(np.sin(angle))
-        if aside:
+        if is_tilted:
             terms["gravity_aside"] = windows.mean(np.cos(angle))
     return terms
 
@@ -181,95 +197,123 @@ def torque_balance(
     log: Log,
     effort: str = "torque",
     duration: float = 0.3,
-    aside: bool = False,
+    is_tilted: bool = False,
     rig: str | None = None,
     sign: float = 0.0,
 ) -> Balance | None:
-    """Fits `inertia`*alpha + `gravity`*sin(q) + `viscous`*omega + `coulomb`*sign(omega) + `constant` to the effort.
+    """Fit inertia, gravity, friction and a constant load to the effort.
 
-    A velocity alone counts from where the pendulum hangs; a `rig` without gravity has no term of
-    it. A `sign` is that of the effort, with which inertia and friction must not be negative; 0:
-    they may be. Windows have a `duration` [s].
+    The terms are `inertia`*alpha + `gravity`*sin(q) + `viscous`*omega + `coulomb`*sign(omega) +
+    `constant`.
+
+    Args:
+        log: with the effort, and a position or a velocity. A velocity without a position is
+            integrated from the angle 0, at which the pendulum hangs.
+        effort: `torque`, `current` or `voltage`.
+        duration: of the windows [s].
+        is_tilted: whether to add `gravity_aside`*cos(q), for a pendulum that hangs beside 0.
+        rig: without gravity (`free`, `load`) there is no term of gravity; None counts as a
+            pendulum.
+        sign: 1 or -1 multiplies the effort, and forbids negative inertia and friction; 0 allows
+            them.
     """
     windows = Windows(log, duration)
-    terms = _torque_terms(log, windows, aside, rig)
-    given = windows.mean_held(effort) if effort == "voltage" else windows.mean(effort)
-    return regress(sign * given, terms, 0.0) if sign else regress(given, terms)
+    terms = _torque_terms(log, windows, is_tilted, rig)
+    target = windows.mean_held(effort) if effort == "voltage" else windows.mean(effort)
+    return regress(sign * target, terms, 0.0) if sign else regress(target, terms)
 
 
 class Shift(NamedTuple):
-    """The shift of time by which two signals agree best."""
+    """The time shift at which two signals agree best."""
 
     lag: float  # [s]
-    improvement: float  # residual at that shift over the one without
-    gain: float  # factor between the two
-    unexplained: float  # residual at that shift over what was to be explained, root mean squares
-    noise: float = 0.0  # noise or step of the worse sensor over what it sees
+    improvement: float  # residual at that shift over the residual without a shift
+    gain: float  # factor between the two signals
+    unexplained: float  # residual at that shift over the target, root mean squares
+    noise: float = 0.0  # noise or resolution of the worse sensor over its signal
 
 
 def velocity_lag(log: Log) -> Shift | None:
-    """How late, up to 0.1 s, the velocity is against the differentiated position, and its gain over that."""
-    log = log.part(slice(0, _LONGEST))
-    windows = Windows(log, max(0.05, 4.0 * log.step), _WINDOWS)
+    """Return lag (up to 0.1 s) and gain of the velocity against the differentiated position."""
+    log = log.slice_rows(slice(0, _MAX_LAG_ROWS))
+    windows = Windows(log, max(0.05, 4.0 * log.step), _MAX_LAG_WINDOWS)
     rate = windows.mean("position", 1)
     velocity, time = log.signals["velocity"], log.time
     if not np.any(rate) or not np.any(velocity):
         return None
 
     def compare(lag: float) -> tuple[float, float, float]:
-        seen = windows.mean(np.interp(time + lag, time, velocity))
-        gain = float(seen @ rate / (rate @ rate))
-        left = float(np.linalg.norm(seen - gain * rate)) / max(float(np.linalg.norm(seen)), 1e-300)
-        return left, gain, left
+        shifted = windows.mean(np.interp(time + lag, time, velocity))
+        gain = float(shifted @ rate / (rate @ rate))
+        unexplained = float(np.linalg.norm(shifted - gain * rate)) / max(
+            float(np.linalg.norm(shifted)), 1e-300
+        )
+        return unexplained, gain, unexplained
 
-    longest = min(0.1, 0.1 * float(time[-1]))
-    size, seen = (float(np.sqrt(np.mean(one**2))) for one in (rate, windows.mean("velocity")))
-    noisy = sensor_deviation(log, "velocity") * math.sqrt(2.0 / windows.rows.shape[1])
-    blurred = 4.0 * sensor_deviation(log, "position") / float(windows.length.mean())
-    noise = max(noisy / max(seen, 1e-300), blurred / size)
-    return _least(compare, log.step, longest, longest)._replace(noise=noise)
+    max_lag = min(0.1, 0.1 * float(time[-1]))
+    rate_rms, velocity_rms = (
+        float(np.sqrt(np.mean(values**2))) for values in (rate, windows.mean("velocity"))
+    )
+    # A window averages the noise of its rows, of which phi uses about half; it differentiates the
+    # position over about a quarter of its length.
+    velocity_noise = sensor_deviation(log, "velocity") * math.sqrt(2.0 / windows.rows.shape[1])
+    rate_noise = 4.0 * sensor_deviation(log, "position") / float(windows.length.mean())
+    noise = max(velocity_noise / max(velocity_rms, 1e-300), rate_noise / rate_rms)
+    return _search_lag(compare, log.step, max_lag, max_lag)._replace(noise=noise)
 
 
 def effort_lag(log: Log, effort: str) -> Shift | None:
-    """How late what follows is against the effort, by their balance.
+    """Return the lag of a response to an effort, by the residual of their balance.
 
-    That is the current, up to 20 rows, against a `voltage`; the motion, up to 60 ms, against a
-    `torque`.
+    The response to a `voltage` is the current, with a lag of up to 20 rows; the response to a
+    `torque` is the motion, with a lag of up to 60 ms.
     """
-    log = log.part(slice(0, _LONGEST))
+    log = log.slice_rows(slice(0, _MAX_LAG_ROWS))
     if effort == "voltage":
-        windows, ahead, behind = Windows(log, most=_WINDOWS), 3.0 * log.step, 20.0 * log.step
+        windows, max_lead, max_lag = (
+            Windows(log, max_windows=_MAX_LAG_WINDOWS),
+            3.0 * log.step,
+            20.0 * log.step,
+        )
         terms = _voltage_terms(log, windows)
     else:
-        windows, ahead, behind = Windows(log, 0.3, _WINDOWS), 0.06, 0.06
+        windows, max_lead, max_lag = Windows(log, 0.3, _MAX_LAG_WINDOWS), 0.06, 0.06
         terms = _torque_terms(log, windows)
 
     def compare(lag: float) -> tuple[float, float, float]:
         balance = regress(windows.mean_held(effort, lag), terms)
-        # of a nearly sinusoidal current a delay looks like more inductance, and too long a one like
-        # less than none
+        # With a nearly sinusoidal current a delay cannot be distinguished from a larger inductance,
+        # and too long a delay is compensated by a negative inductance.
         if balance is None or (lag > 0.0 and balance.certainty.get("inductance", 0.0) < -3.0):
             return np.inf, 1.0, 1.0
         return balance.residual, 1.0, balance.unexplained
 
-    return _least(compare, log.step, ahead, behind) if np.isfinite(compare(0.0)[0]) else None
+    return (
+        _search_lag(compare, log.step, max_lead, max_lag) if np.isfinite(compare(0.0)[0]) else None
+    )
 
 
-def _least(
-    compare: Callable[[float], tuple[float, float, float]], step: float, ahead: float, behind: float
+def _search_lag(
+    compare: Callable[[float], tuple[float, float, float]],
+    step: float,
+    max_lead: float,
+    max_lag: float,
 ) -> Shift:
-    """The shift of the least residual, to a quarter of a step: by long steps, then by shorter ones beside the best.
+    """Return the shift with the smallest residual, to a quarter of a step.
 
-    Of a lag `compare` says residual, gain and what is left unexplained.
+    A coarse grid is refined around its best point. `compare` returns the residual, the gain and the
+    unexplained share at a lag.
     """
+    # At most 40 points of the coarse grid cover the range.
     shift = step
-    while ahead + behind > 40.0 * shift:
+    while max_lead + max_lag > 40.0 * shift:
         shift *= 2.0
-    places = shift * np.arange(-max(round(ahead / shift), 4), max(round(behind / shift), 4) + 1)
+    lags = shift * np.arange(-max(round(max_lead / shift), 4), max(round(max_lag / shift), 4) + 1)
     while True:
-        best = min((compare(place)[0], abs(place), place) for place in places)[2]
+        # Of equal residuals the shorter shift wins.
+        best = min((compare(lag)[0], abs(lag), lag) for lag in lags)[2]
         if shift <= 0.3 * step:
             residual, gain, unexplained = compare(best)
             return Shift(float(best), residual / max(compare(0.0)[0], 1e-300), gain, unexplained)
         shift /= 2.0
-        places = best + shift * np.arange(-2, 3)
+        lags = best + shift * np.arange(-2, 3)

@@ -1,4 +1,4 @@
-"""What is wrong with a log before anything is fitted to it: a table of checks, each with what it needs of the log."""
+"""Checks of a log before a fit, each with the signals and facts that it needs."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -14,24 +14,33 @@ from codrl_mj.identify.balances import (
     voltage_balance,
 )
 from codrl_mj.identify.log import (
-    LONGEST_STEP,
+    GAP_STEPS,
     SIGNALS,
     Finding,
     Log,
+    find_obstacle,
     find_resolution,
-    is_supply,
-    moves,
-    obstacle,
-    replaced,
-    turn_jumps,
+    find_turn_jumps,
+    has_motion,
+    is_supply_voltage,
+    replace_signal,
 )
 from codrl_mj.identify.parameters import PARAMETERS
 from codrl_mj.identify.signal_checks import signal_findings
 
-_DROPPED = 1.5  # median steps, from which on rows are missing
-_MOST_LISTED = 10
-_MOST = {"duty": 1.1, "voltage": 1e3, "bus": 1e3, "current": 1e3, "velocity": 2e4, "torque": 1e4}
-"""In SI: a share with its rounding; beyond the largest motors of robots, and beyond 190,000 rpm."""
+_DROPPED_STEPS = 1.5  # median steps; rows are missing within a longer step
+_MAX_LISTED = 10  # gaps that are reported one by one
+# The limits are beyond the largest motors of robots and beyond 190,000 rpm. A duty of 1 may be
+# rounded up.
+_MAX_VALUES = {
+    "duty": 1.1,
+    "voltage": 1e3,
+    "bus": 1e3,
+    "current": 1e3,
+    "velocity": 2e4,
+    "torque": 1e4,
+}
+"""Signal -> largest plausible value in SI units."""
 FACTORS = {
     "degrees for radians": 180.0 / math.pi,
     "rpm for rad/s": 30.0 / math.pi,
@@ -42,59 +51,72 @@ FACTORS = {
     "degrees for turns": 360.0,
     "rpm for turn/s": 60.0,
 }
-"""What a factor between two numbers that should be equal may tell, one for the other or the other way round."""
-_RESISTANCES = (
-    5e-3,
-    1e4,
-)  # of motors on a bench [ohm]: at 5 V the least would draw 1 kA; micromotors have some hundreds
-_CERTAIN = 10.0  # coefficient over its standard error
-_TURNED = 2.0 / 3.0  # of the residual, that a sign must leave at most to be the right one
-_DROWNED = 0.1  # noise over the motion, beyond which no error of speeds is claimed
-_TILTED = 0.03  # rad, by which a pendulum hangs beside position 0
+"""Confusion of units -> factor, or its inverse, between two numbers that should be equal."""
+# The smallest resistance would draw 1 kA at 5 V; micromotors have some hundreds of ohms.
+_RESISTANCES = (5e-3, 1e4)
+"""Range of plausible resistances of motors on a bench [ohm]."""
+_MIN_CERTAINTY = 10.0  # coefficient over its standard error
+_MAX_FLIPPED_RESIDUAL = 2.0 / 3.0  # share of the residual that remains if a flipped sign is right
+_MAX_NOISE = 0.1  # noise over motion; beyond it no error of the velocity is reported
+_MIN_TILT = 0.03  # angle [rad] between the hanging pendulum and position 0 that is reported
 
 
-class Seen(NamedTuple):
-    """A log under examination, beside a datasheet's `GearMotor` and on a rig, where given."""
+class LogFacts(NamedTuple):
+    """A log under examination, with all that several checks use."""
 
     log: Log
-    motor: Any
+    motor: Any  # the `GearMotor` of a datasheet, or None
     rig: str | None
-    effort: str  # what drives it, the nearest to the shaft that it has
-    holds: set[str]  # words of `CHECKS`: signals, and what is known of them
-    winding: Balance | None  # R, L and kE by the voltage; None where it does not change
+    effort: str  # the logged input that is nearest to the shaft; empty without one
+    conditions: set[str]  # words of `CHECKS`: signals, and facts about them
+    winding: Balance | None  # R, L and kE by the voltage; None if the voltage does not change
 
 
-CHECKS: list[tuple[set[str], Callable[[Seen], Iterator[Finding]]]] = []
-"""What a check needs of a log, and what finds and words what it finds; in this order."""
+CHECKS: list[tuple[set[str], Callable[[LogFacts], Iterator[Finding]]]] = []
+"""Conditions of each check, and its function, in the order in which they run."""
 
 
 def _needs(words: str) -> Callable[[Any], Any]:
-    def add(found: Any) -> Any:
-        CHECKS.append(({*words.split()}, found))
-        return found
+    """Return a decorator that adds a check to `CHECKS`, with conditions separated by spaces."""
+
+    def add(function: Any) -> Any:
+        CHECKS.append(({*words.split()}, function))
+        return function
 
     return add
 
 
 def check(log: Log, motor: Any = None, rig: str | None = None) -> list[Finding]:
-    """What is noteworthy about a log, errors first; beside a datasheet's `GearMotor` and on a rig, where given."""
+    """Return all findings about a log, errors first.
+
+    Args:
+        log: as it was read.
+        motor: the `GearMotor` of a datasheet, to compare with; None skips these checks.
+        rig: `pendulum`, `free` or `load`; None counts as a pendulum.
+    """
+    # The torque is nearest to the shaft: the later signals act through the winding.
     effort = next((name for name in ("torque", "current", "voltage") if log.has(name)), "")
-    holds = {*log.signals, *(["effort"] if effort else []), *(["datasheet"] if motor else [])}
+    conditions = {*log.signals, *(["effort"] if effort else []), *(["datasheet"] if motor else [])}
     if log.has("position") or log.has("velocity"):
-        holds |= {"motion", "moves" if moves(log) else "stands"}
-    holds |= {"hangs"} if rig in (None, "pendulum") else set()
+        conditions |= {"motion", "moves" if has_motion(log) else "stands"}
+    conditions |= {"hangs"} if rig in (None, "pendulum") else set()
     winding = voltage_balance(log) if log.has("voltage", "current") else None
-    seen = Seen(log, motor, rig, effort, holds, winding)
+    facts = LogFacts(log, motor, rig, effort, conditions, winding)
     findings = [
         *log.findings,
-        *(one for needs, found in CHECKS if needs <= holds for one in found(seen)),
+        *(
+            finding
+            for needs, function in CHECKS
+            if needs <= conditions
+            for finding in function(facts)
+        ),
     ]
     order = ("error", "warning", "info")
-    return sorted(findings, key=lambda one: order.index(one.severity))
+    return sorted(findings, key=lambda finding: order.index(finding.severity))
 
 
-def name_of_factor(ratio: float, angle: bool = True) -> str:
-    """What a ratio, or its inverse, could be: all confusions within 8 %, else a scale or a gear."""
+def explain_factor(ratio: float, angle: bool = True) -> str:
+    """Return explanations of a ratio: confused units within 8 % of it, a scale or a gear."""
     size = abs(math.log(abs(ratio)))
     near = [
         f"{name} ({factor:.4g})"
@@ -107,31 +129,29 @@ def name_of_factor(ratio: float, angle: bool = True) -> str:
 
 
 @_needs("")
-def _obstacle(seen: Seen) -> Iterator[Finding]:
-    """Find what a fit of this log alone would refuse."""
-    if found := obstacle([seen.log]):
-        yield found
+def _obstacle(facts: LogFacts) -> Iterator[Finding]:
+    """Find the reason for which a fit of this log would be refused."""
+    if finding := find_obstacle([facts.log]):
+        yield finding
 
 
 @_needs("")
-def _times(seen: Seen) -> Iterator[Finding]:
-    """Gaps, dropped rows, jitter, and stamps in another unit."""
-    log, usual, rows = seen.log, seen.log.step, seen.log.row_numbers
+def _times(facts: LogFacts) -> Iterator[Finding]:
+    """Find gaps, dropped rows, jitter, and time stamps in a wrong unit."""
+    log, usual, rows = facts.log, facts.log.step, facts.log.row_numbers
     steps = np.diff(log.time)
-    gaps = np.flatnonzero(steps > LONGEST_STEP * usual)
-    for place in gaps[:_MOST_LISTED]:
+    gaps = np.flatnonzero(steps > GAP_STEPS * usual)
+    for row in gaps[:_MAX_LISTED]:
         text = (
-            f"a gap of {steps[place]:.4g} s after {log.time[place]:.4g} s,"
-            f" {steps[place] / usual:.0f} usual steps"
+            f"a gap of {steps[row]:.4g} s after {log.time[row]:.4g} s,"
+            f" {steps[row] / usual:.0f} usual steps"
         )
+        yield Finding("warning", "gap", int(rows[row + 1]), text, "nothing is simulated across it")
+    if gaps.size > _MAX_LISTED:
         yield Finding(
-            "warning", "gap", int(rows[place + 1]), text, "nothing is simulated across it"
+            "warning", "gap", None, f"{gaps.size - _MAX_LISTED} more gaps", "see the first ones"
         )
-    if gaps.size > _MOST_LISTED:
-        yield Finding(
-            "warning", "gap", None, f"{gaps.size - _MOST_LISTED} more gaps", "see the first ones"
-        )
-    dropped = np.flatnonzero((steps > _DROPPED * usual) & (steps <= LONGEST_STEP * usual))
+    dropped = np.flatnonzero((steps > _DROPPED_STEPS * usual) & (steps <= GAP_STEPS * usual))
     if dropped.size:
         missing = int(np.sum(np.round(steps[dropped] / usual) - 1.0))
         share = missing / (len(log.time) + missing)
@@ -140,14 +160,17 @@ def _times(seen: Seen) -> Iterator[Finding]:
             " here"
         )
         remedy = (
-            "keep the stamps: they are gone by; as if the rows were uniform, the fit would be wrong"
+            "keep the time stamps, which the fit uses: with uniform steps the fit would be wrong"
         )
         severity = "warning" if share > 0.01 else "info"
         yield Finding(severity, "dropped rows", int(rows[dropped[0] + 1]), text, remedy)
-    regular = steps[steps <= _DROPPED * usual]
+    # The steps in which rows are missing would count as jitter.
+    regular = steps[steps <= _DROPPED_STEPS * usual]
     jitter = float(np.std(regular)) / usual
     if jitter > 0.02:
-        worst = int(np.argmax(np.where(steps <= _DROPPED * usual, np.abs(steps - usual), 0.0)))
+        worst = int(
+            np.argmax(np.where(steps <= _DROPPED_STEPS * usual, np.abs(steps - usual), 0.0))
+        )
         text = (
             f"steps of {regular.min():.3g} to {regular.max():.3g} s about {usual:.3g} s,"
             f" {jitter:.0%} of it"
@@ -157,49 +180,51 @@ def _times(seen: Seen) -> Iterator[Finding]:
             "warning" if jitter > 0.3 else "info", "jitter", int(rows[worst + 1]), text, remedy
         )
     if not 2e-6 <= usual <= 0.5:
-        text = f"a row every {usual:.3g} s is unusual: is the time in another unit?"
+        text = f"a row every {usual:.3g} s is unusual: the unit of time is probably wrong"
         yield Finding("error", "unit", None, text, "write time=column:ms, or us, or ns")
 
 
 @_needs("")
-def _signals(seen: Seen) -> Iterator[Finding]:
-    """Each signal by itself."""
-    yield from signal_findings(seen.log)
+def _signals(facts: LogFacts) -> Iterator[Finding]:
+    """Find faults of each signal by itself."""
+    yield from signal_findings(facts.log)
 
 
 @_needs("position")
-def _wrapped(seen: Seen) -> Iterator[Finding]:
-    """A position that jumps by a turn."""
-    jumps = turn_jumps(seen.log.signals["position"], 2.0 * math.pi)
+def _wrapped(facts: LogFacts) -> Iterator[Finding]:
+    """Find a position that jumps by a turn."""
+    jumps = find_turn_jumps(facts.log.signals["position"], 2.0 * math.pi)
     if jumps.size:
         text = f"the position jumps by a turn, {jumps.size} times, first here"
         remedy = "write position=unwrap(column, 2*pi):rad, or unwrap(column, 360):deg"
-        yield Finding("error", "wrapped", int(seen.log.row_numbers[jumps[0] + 1]), text, remedy)
+        yield Finding("error", "wrapped", int(facts.log.row_numbers[jumps[0] + 1]), text, remedy)
 
 
 @_needs("")
-def _sizes(seen: Seen) -> Iterator[Finding]:
-    """Values that no bench has: more voltage than the supply has, too, and what looks like a duty."""
-    for signal in _MOST.keys() & seen.log.signals.keys():
-        largest = float(np.quantile(np.abs(seen.log.signals[signal]), 0.99))  # not an outlier
+def _sizes(facts: LogFacts) -> Iterator[Finding]:
+    """Find implausibly large values, voltages above the supply's, and a duty taken as voltage."""
+    for signal in _MAX_VALUES.keys() & facts.log.signals.keys():
+        # The quantile ignores outliers.
+        largest = float(np.quantile(np.abs(facts.log.signals[signal]), 0.99))
         unit = SIGNALS[signal] or "of 1"
-        if largest > _MOST[signal]:
+        if largest > _MAX_VALUES[signal]:
             text = (
-                f"the {signal} is up to {largest:.4g} {unit}, must be at most {_MOST[signal]:g}"
-                f" {unit} on a bench"
+                f"the {signal} is up to {largest:.4g} {unit}, must be at most"
+                f" {_MAX_VALUES[signal]:g} {unit} on a bench"
             )
-            other = "percent" if signal == "duty" else f"m{unit}"
+            example = "percent" if signal == "duty" else f"m{unit}"
             yield Finding(
-                "error", "unit", None, text, f"correct its unit, such as {signal}=column:{other}"
+                "error", "unit", None, text, f"correct its unit, such as {signal}=column:{example}"
             )
-    if not seen.log.has("voltage"):
+    if not facts.log.has("voltage"):
         return
-    log, voltage = seen.log, np.abs(seen.log.signals["voltage"])
-    others = [log.signals[one] for one in ("current", "torque", "velocity") if log.has(one)]
-    if log.has("position"):  # over many rows, in which an encoder's flicker is nothing
+    log, voltage = facts.log, np.abs(facts.log.signals["voltage"])
+    responses = [log.signals[name] for name in ("current", "torque", "velocity") if log.has(name)]
+    if log.has("position"):
+        # The flicker of an encoder is negligible beside the motion over many rows.
         rows, position = max(len(log.time) // 20, 1), log.signals["position"]
-        others.append(position[rows:] - position[:-rows])
-    if is_supply(log.signals["voltage"], others):
+        responses.append(position[rows:] - position[:-rows])
+    if is_supply_voltage(log.signals["voltage"], responses):
         text = (
             f"the voltage stays near {np.median(voltage):.3g} V while the motor goes both ways: it"
             " is the supply's"
@@ -218,9 +243,9 @@ def _sizes(seen: Seen) -> Iterator[Finding]:
             text = f"the voltage is up to {excess[row]:.3g} times that of the supply"
             remedy = "correct the scale of the duty, or of the bus"
             yield Finding("error", "unit", int(log.row_numbers[row]), text, remedy)
-    elif seen.motor is None and (0.0 < voltage.max() <= 1.0 or voltage.max() > 100.0):
-        of = "a duty" if voltage.max() <= 1.0 else "of a duty in percent, or in mV"
-        text = f"the voltage is at most {voltage.max():.3g} V: is it {of}?"
+    elif facts.motor is None and (0.0 < voltage.max() <= 1.0 or voltage.max() > 100.0):
+        guess = "a duty" if voltage.max() <= 1.0 else "a duty in percent, or in mV"
+        text = f"the voltage is at most {voltage.max():.3g} V: is it {guess}?"
         remedy = (
             "if so, write voltage=duty*24:V, with a duty from -1 to 1 and the volts of the supply"
         )
@@ -228,70 +253,82 @@ def _sizes(seen: Seen) -> Iterator[Finding]:
 
 
 @_needs("position")
-def _degrees(seen: Seen) -> Iterator[Finding]:
-    """A position in degrees: gravity pulls as at a fraction of it, or its encoder divides 360 and not 2 pi."""
-    log, effort, remedy = seen.log, seen.effort, "write position=column:deg"
-    if {"effort", "moves", "hangs"} <= seen.holds:
-        turned = replaced(log, "position", np.deg2rad(log.signals["position"]))
-        now, then = (torque_balance(one, effort, aside=True) for one in (log, turned))
-        pulls = then is not None and then.certainty.get("gravity", 0.0) > _CERTAIN
-        if now and then and pulls and then.residual < 0.5 * now.residual and now.unexplained > 0.1:
+def _degrees(facts: LogFacts) -> Iterator[Finding]:
+    """Find a position in degrees, by gravity or by an encoder whose step divides 360."""
+    log, effort, remedy = facts.log, facts.effort, "write position=column:deg"
+    if {"effort", "moves", "hangs"} <= facts.conditions:
+        converted = replace_signal(log, "position", np.deg2rad(log.signals["position"]))
+        radians, degrees = (
+            torque_balance(variant, effort, is_tilted=True) for variant in (log, converted)
+        )
+        pulls = degrees is not None and degrees.certainty.get("gravity", 0.0) > _MIN_CERTAINTY
+        if (
+            radians
+            and degrees
+            and pulls
+            and degrees.residual < 0.5 * radians.residual
+            and radians.unexplained > 0.1
+        ):
             text = (
-                f"gravity pulls as if the position were in degrees: so {then.unexplained:.0%} of"
-                f" the {effort} are "
+                "gravity acts as if the position were in degrees: degrees leave"
+                f" {degrees.unexplained:.0%} of the {effort}"
             )
-            text += f"not explained, of radians {now.unexplained:.0%}"
+            text += f" unexplained, radians {radians.unexplained:.0%}"
             yield Finding("error", "unit", None, text, remedy)
             return
     step = log.resolution.get("position", 0.0) or find_resolution(log.signals["position"])
-    if step > 0.0 and 8.0 < (turns := 360.0 / step) < 1e5:
-        count, of_radians = round(turns), 2.0 * math.pi / step
-        if abs(turns - count) < 1e-6 * turns and abs(of_radians - round(of_radians)) > 1e-3:
+    if step > 0.0 and 8.0 < (steps_per_turn := 360.0 / step) < 1e5:
+        count, radian_count = round(steps_per_turn), 2.0 * math.pi / step
+        if (
+            abs(steps_per_turn - count) < 1e-6 * steps_per_turn
+            and abs(radian_count - round(radian_count)) > 1e-3
+        ):
             text = (
                 f"the position's steps of {step:.4g} are 1/{count} of 360, not of 2 pi: is it in"
                 " degrees?"
             )
+            # A file that rounds radians to decimals has such steps too: then it is only a warning.
             decimal = round(step / 10.0 ** math.floor(math.log10(step)), 5) in (1.0, 2.0, 2.5, 5.0)
             encoder = not decimal and (count % 100 == 0 or count & (count - 1) == 0)
             yield Finding("error" if encoder else "warning", "unit", None, text, remedy)
 
 
 @_needs("position velocity moves")
-def _velocity(seen: Seen) -> Iterator[Finding]:
-    """The velocity against the differentiated position."""
-    found = velocity_lag(seen.log)
-    if found is None:
+def _velocity(facts: LogFacts) -> Iterator[Finding]:
+    """Compare the velocity with the differentiated position."""
+    shift = velocity_lag(facts.log)
+    if shift is None:
         return
-    clear = found.noise < _DROWNED
-    if found.unexplained > 0.5:
+    clear = shift.noise < _MAX_NOISE
+    if shift.unexplained > 0.5:
         text = (
-            f"velocity and differentiated position have nothing in common ({found.unexplained:.0%}"
-            " is left over)"
+            "velocity and differentiated position have nothing in common: the position leaves"
+            f" {shift.unexplained:.0%} of the velocity unexplained"
         )
         if clear:
             yield Finding(
                 "error", "velocity", None, text, "check both columns; leave the velocity out"
             )
         return
-    if clear and found.gain < 0.0:
-        text = "the velocity falls where the position grows"
+    if clear and shift.gain < 0.0:
+        text = "the velocity is negative where the position increases"
         yield Finding(
             "error", "sign", None, text, "give one of them a minus: velocity=-column:unit"
         )
-    # noise of the one takes from its factor, of the other it adds to it: the true one is between
-    # both regressions
-    ends = [math.log(abs(found.gain)), math.log(abs(found.gain) / (1.0 - found.unexplained**2))]
+    # Noise of the position makes the regression's gain too small, noise of the velocity makes the
+    # inverse regression's gain too large: the true gain is between them.
+    ends = [math.log(abs(shift.gain)), math.log(abs(shift.gain) / (1.0 - shift.unexplained**2))]
     if clear and (min(ends) > 0.1 or max(ends) < -0.1):
         text = (
-            f"the velocity is {abs(found.gain):.4g} times what the position says:"
-            f" {name_of_factor(found.gain)}"
+            f"the velocity is {abs(shift.gain):.4g} times the derivative of the position:"
+            f" {explain_factor(shift.gain)}"
         )
         yield Finding("error", "unit", None, text, "correct the unit of velocity, position or time")
-    rows = abs(found.lag) / seen.log.step
-    if (rows > 0.75 and found.improvement < 0.7) or (rows > 2.0 and found.improvement < 0.85):
-        late = "after" if found.lag > 0.0 else "before"
+    rows = abs(shift.lag) / facts.log.step
+    if (rows > 0.75 and shift.improvement < 0.7) or (rows > 2.0 and shift.improvement < 0.85):
+        late = "after" if shift.lag > 0.0 else "before"
         text = (
-            f"the velocity comes {1e3 * abs(found.lag):.3g} ms {late} the differentiated position"
+            f"the velocity comes {1e3 * abs(shift.lag):.3g} ms {late} the differentiated position"
             f" ({rows:.2g} rows)"
         )
         remedy = "leave the velocity out, so that the position alone is fitted, or fit its delay"
@@ -299,11 +336,11 @@ def _velocity(seen: Seen) -> Iterator[Finding]:
 
 
 @_needs("voltage current")
-def _electrical(seen: Seen) -> Iterator[Finding]:
-    """Signs and certainty of R, L and kE."""
-    balance = seen.winding
+def _electrical(facts: LogFacts) -> Iterator[Finding]:
+    """Check the signs and the certainty of R, L and kE."""
+    balance = facts.winding
     if balance is None:
-        text = "voltage or current do not change, or there are too few rows in a row"
+        text = "voltage or current do not change, or too few rows follow each other without a gap"
         yield Finding(
             "error",
             "excitation",
@@ -312,15 +349,15 @@ def _electrical(seen: Seen) -> Iterator[Finding]:
             "log while the voltage changes; see codrl-mj identify plan",
         )
         return
-    values, certain = balance.values, balance.certainty
-    if certain["resistance"] < -_CERTAIN:
+    values, certainty = balance.values, balance.certainty
+    if certainty["resistance"] < -_MIN_CERTAINTY:
         text = (
             f"the resistance would be {values['resistance']:.3g} ohm: the current flows against the"
             " voltage"
         )
         yield Finding("error", "sign", None, text, "give one of them a minus: current=-column:A")
     elif (
-        certain["resistance"] > _CERTAIN
+        certainty["resistance"] > _MIN_CERTAINTY
         and not _RESISTANCES[0] <= values["resistance"] <= _RESISTANCES[1]
     ):
         text = (
@@ -329,20 +366,20 @@ def _electrical(seen: Seen) -> Iterator[Finding]:
         )
         remedy = "correct the unit of voltage or current: current=column:mA if it is in mA"
         yield Finding("error", "unit", None, text, remedy)
-    elif certain.get("back_emf_constant", 0.0) < -_CERTAIN:
+    elif certainty.get("back_emf_constant", 0.0) < -_MIN_CERTAINTY:
         text = (
             f"the back-EMF constant would be {values['back_emf_constant']:.3g} V*s/rad: the motor"
             " turns against it"
         )
         remedy = "give position and velocity a minus, or voltage and current"
         yield Finding("error", "sign", None, text, remedy)
-    for name, what in (
+    for name, change in (
         ("inductance", "quickly: a PRBS"),
         ("back_emf_constant", "speed: a slow sine"),
     ):
-        if name in values and abs(certain[name]) < _CERTAIN:
+        if name in values and abs(certainty[name]) < _MIN_CERTAINTY:
             text = (
-                f"the {name.replace('_', ' ')} hardly shows: it is {abs(certain[name]):.2g}"
+                f"the {name.replace('_', ' ')} hardly shows: it is {abs(certainty[name]):.2g}"
                 " standard errors"
             )
             yield Finding(
@@ -350,30 +387,30 @@ def _electrical(seen: Seen) -> Iterator[Finding]:
                 "excitation",
                 None,
                 text,
-                f"add a log that changes {what}, or give it by --known",
+                f"add a log that changes {change}, or give it by --known",
             )
     if balance.unexplained > 0.3:
         text = (
             f"R*i + L*di/dt + kE*speed leaves {balance.unexplained:.0%} of the voltage unexplained"
         )
         remedy = (
-            "check that the voltage is that of the terminals, and that rows are as frequent as it"
-            " changes"
+            "check that the voltage is that at the terminals, and that there is a row for each of"
+            " its changes"
         )
         yield Finding("warning", "voltage", None, text, remedy)
 
 
 @_needs("voltage current")
-def _delay(seen: Seen) -> Iterator[Finding]:
-    """The current against the voltage."""
-    log, found = seen.log, effort_lag(seen.log, "voltage")
-    if found is None or found.unexplained > 0.3:
+def _delay(facts: LogFacts) -> Iterator[Finding]:
+    """Find a lag between the voltage and the current."""
+    log, shift = facts.log, effort_lag(facts.log, "voltage")
+    if shift is None or shift.unexplained > 0.3:
         return
-    rows = found.lag / log.step
-    if abs(rows) >= 0.7 and found.improvement < 0.55:
+    rows = shift.lag / log.step
+    if abs(rows) >= 0.7 and shift.improvement < 0.55:
         late = "after" if rows > 0.0 else "before"
         text = (
-            f"the current comes {abs(rows):.2g} rows ({1e3 * abs(found.lag):.3g} ms) {late} the"
+            f"the current comes {abs(rows):.2g} rows ({1e3 * abs(shift.lag):.3g} ms) {late} the"
             " voltage"
         )
         yield Finding(
@@ -383,64 +420,71 @@ def _delay(seen: Seen) -> Iterator[Finding]:
             text,
             "fit with a scan over delays, or shift a column of the log",
         )
-    elif -0.8 < rows < -0.2 and found.improvement < 0.8:
+    # A voltage that was sampled at the row's time is on average that of half a row earlier and half
+    # a row later, whereas the balance integrates it from the row on.
+    elif -0.8 < rows < -0.2 and shift.improvement < 0.8:
         declared = (
             "declared as the mean to the next row" if log.mean_voltage else "held to the next row"
         )
         text = (
-            f"the voltage fits better about half a row earlier than {declared}: it seems to be read"
-            " at the row"
+            f"the voltage fits better about half a row earlier than {declared}: it was probably"
+            " sampled at the row's time"
         )
-        remedy = "log the mean of the voltage, or rows as frequent as it changes"
+        remedy = "log the mean of the voltage, or a row for each of its changes"
         if log.mean_voltage:
             remedy = "write voltage=column:V without mean(); or log the mean"
         yield Finding("warning" if log.mean_voltage else "info", "voltage", None, text, remedy)
 
 
 @_needs("voltage current")
-def _sag(seen: Seen) -> Iterator[Finding]:
-    """A supply that gives way, where the share of its voltage changes; at one share it looks as the winding does."""
-    balance, share = seen.winding, np.abs(seen.log.signals["voltage"])
+def _sag(facts: LogFacts) -> Iterator[Finding]:
+    """Find a supply whose voltage sags under load."""
+    balance, share = facts.winding, np.abs(facts.log.signals["voltage"])
+    # At a constant duty the supply's resistance cannot be distinguished from the winding's.
     sagging = (
-        voltage_balance(seen.log, sag=True)
+        voltage_balance(facts.log, sag=True)
         if float(np.std(share)) > 0.1 * float(share.max())
         else None
     )
     if balance is None or sagging is None or sagging.residual > 0.96 * balance.residual:
         return
     supply, winding = sagging.values["supply_resistance"], sagging.values["resistance"]
-    if sagging.certainty["supply_resistance"] > _CERTAIN and supply > 0.03 * winding > 0.0:
-        text = f"the voltage sags as behind {supply:.2g} ohm, beside a winding of {winding:.2g} ohm"
+    if sagging.certainty["supply_resistance"] > _MIN_CERTAINTY and supply > 0.03 * winding > 0.0:
+        text = (
+            f"the voltage sags as with {supply:.2g} ohm in the supply, beside {winding:.2g} ohm in"
+            " the winding"
+        )
         remedy = "log the voltage of the supply, and write voltage=duty*bus:V"
         yield Finding("warning", "sag", None, text, remedy)
 
 
 @_needs("effort moves")
-def _mechanical(seen: Seen) -> Iterator[Finding]:
-    """Signs of inertia and gravity; whether the motion follows from the torque."""
-    log, effort, rig = seen.log, seen.effort, seen.rig
-    # where it shakes, shorter windows show more of the inertia
+def _mechanical(facts: LogFacts) -> Iterator[Finding]:
+    """Check the signs of inertia and gravity, and that the motion follows from the torque."""
+    log, effort, rig = facts.log, facts.effort, facts.rig
+    # Shorter windows show more of the inertia in fast motions.
     balances = [
-        one
+        fit
         for seconds in (0.3, 0.03)
-        if (one := torque_balance(log, effort, seconds, rig=rig)) is not None
+        if (fit := torque_balance(log, effort, seconds, rig=rig)) is not None
     ]
     if not balances:
         return
-    balance, certain = balances[0], balances[0].certainty
-    both = [one.certainty.get("inertia", 0.0) for one in balances]
-    heavy = max(both, key=abs) if max(both) < 3.0 else 0.0
-    wrong = heavy < -_CERTAIN or (certain.get("gravity", 0.0) < -_CERTAIN and heavy < -3.0)
-    if wrong and (told := _told_sign(log, effort, rig)):
+    balance, certainty = balances[0], balances[0].certainty
+    inertias = [fit.certainty.get("inertia", 0.0) for fit in balances]
+    inertia = max(inertias, key=abs) if max(inertias) < 3.0 else 0.0
+    is_negative = inertia < -_MIN_CERTAINTY or (
+        certainty.get("gravity", 0.0) < -_MIN_CERTAINTY and inertia < -3.0
+    )
+    if is_negative and (shares := _explain_sign(log, effort, rig)):
         remedy = f"give the {effort}, or position and velocity, a minus"
         yield Finding(
-            "error", "sign", None, f"the {effort} accelerates the wrong way: {told}", remedy
+            "error", "sign", None, f"the {effort} accelerates the wrong way: {shares}", remedy
         )
-    elif {"position", "hangs"} <= seen.holds:
-        yield from _zero(torque_balance(log, effort, aside=True), effort)
-    large = 0.08 * float(
-        np.std(log.signals[effort])
-    )  # else it is what fast changes leave of rounding
+    elif {"position", "hangs"} <= facts.conditions:
+        yield from _zero(torque_balance(log, effort, is_tilted=True), effort)
+    # A smaller residual may come from the rounding of a torque that changes fast.
+    large = 0.08 * float(np.std(log.signals[effort]))
     if effort == "torque" and balance.unexplained > 0.25 and balance.residual > large:
         text = (
             f"the motion leaves {balance.unexplained:.0%} of the torque unexplained (mean over"
@@ -450,106 +494,120 @@ def _mechanical(seen: Seen) -> Iterator[Finding]:
         if lag is not None and abs(lag.lag) > log.step and lag.improvement < 0.9:
             text += f"; {lag.unexplained:.0%} if the motion came {1e3 * lag.lag:.3g} ms later"
         remedy = (
-            "something else moves it, or the columns are not of one time: trust this log less than"
-            " others"
+            "something else moves the shaft, or the columns were not sampled at the same time:"
+            " trust this log less than others"
         )
         yield Finding("warning", "torque", None, text, remedy)
 
 
-def _told_sign(log: Log, effort: str, rig: str | None) -> str:
-    """How much better a body with friction explains the effort with a minus; empty where it does not.
+def _explain_sign(log: Log, effort: str, rig: str | None) -> str:
+    """Return how much better the effort fits with a minus, or an empty text.
 
-    The other check, by standard errors, is fooled where friction that holds, or a controller, makes
-    what it sees.
+    The check by standard errors alone may be wrong where static friction holds the shaft, or where
+    a controller produces the effort from the motion.
     """
     for seconds in (0.3, 0.03):
-        now, turned = (
+        original, flipped = (
             torque_balance(log, effort, seconds, rig=rig, sign=sign) for sign in (1.0, -1.0)
         )
-        if now is None or turned is None or now.unexplained < 0.03:
-            continue  # as it is nothing is amiss
-        if turned.residual < _TURNED * now.residual:
+        # The logged sign explains the effort well enough.
+        if original is None or flipped is None or original.unexplained < 0.03:
+            continue
+        if flipped.residual < _MAX_FLIPPED_RESIDUAL * original.residual:
             shares = (
-                f"{now.unexplained:.1%} of it unexplained, with a minus {turned.unexplained:.2%}"
+                f"{original.unexplained:.1%} of it unexplained, with a minus"
+                f" {flipped.unexplained:.2%}"
             )
             return f"inertia and friction leave {shares}"
     return ""
 
 
 def _zero(balance: Balance | None, effort: str) -> Iterator[Finding]:
-    """Where a pendulum hangs; beside 0 that is not told of a voltage, of which friction and back-EMF leave little."""
+    """Find a pendulum that does not hang at position 0.
+
+    Under a voltage only a zero near the top is reported: friction and back-EMF leave too little of
+    the voltage for gravity.
+    """
     names = "gravity", "gravity_aside"
-    if balance is None or max(abs(balance.certainty.get(name, 0.0)) for name in names) < _CERTAIN:
+    if (
+        balance is None
+        or max(abs(balance.certainty.get(name, 0.0)) for name in names) < _MIN_CERTAINTY
+    ):
         return
     along, aside = (balance.values.get(name, 0.0) for name in names)
     zero, pull = math.atan2(-aside, along), math.hypot(along, aside)
+    # Over a small arc gravity is nearly constant, and cancels against an opposite constant load.
     if abs(balance.values.get("constant", 0.0)) > 0.5 * pull:
-        return  # over a small arc a pull and a constant load against it are as good as nothing
-    if pull > 2.0 * balance.residual and abs(zero) > (2.5 if effort == "voltage" else _TILTED):
-        where = ", as if 0 were at the top" if abs(zero) > 2.5 else ""
-        most = f"with up to {pull:.3g} {SIGNALS[effort]} of the {effort}"
-        text = f"gravity pulls towards position {zero:.3g} rad and not 0{where}, {most}"
+        return
+    if pull > 2.0 * balance.residual and abs(zero) > (2.5 if effort == "voltage" else _MIN_TILT):
+        hint = ", as if 0 were at the top" if abs(zero) > 2.5 else ""
+        size = f"with up to {pull:.3g} {SIGNALS[effort]} of the {effort}"
+        text = f"gravity pulls towards position {zero:.3g} rad and not 0{hint}, {size}"
         remedy = (
-            f"write position=column{-zero:+.4g}:rad, so that it hangs at 0; or its sign is wrong"
+            f"write position=column{-zero:+.4g}:rad, so that the pendulum hangs at 0, or correct"
+            " its sign"
         )
         yield Finding("warning", "zero", None, text, remedy)
 
 
 @_needs("motion")
-def _motion(seen: Seen) -> Iterator[Finding]:
-    """Whether it moves back and forth."""
-    signals, remedy = seen.log.signals, "leave position and velocity out if it is"
+def _motion(facts: LogFacts) -> Iterator[Finding]:
+    """Find a shaft that stands still, or that turns one way only."""
+    signals, remedy = facts.log.signals, "leave position and velocity out if it is"
     speed = signals["velocity"] if "velocity" in signals else np.diff(signals["position"])
-    if "stands" in seen.holds:
+    if "stands" in facts.conditions:
         yield Finding(
             "info", "excitation", None, "the shaft stands still, as if it were locked", remedy
         )
-    elif seen.effort and min(float(speed.max()), float(-speed.min())) < 0.05 * float(
+    elif facts.effort and min(float(speed.max()), float(-speed.min())) < 0.05 * float(
         np.abs(speed).max()
     ):
-        text = "the shaft turns one way only: friction cannot be told from a constant load"
+        text = "the shaft turns one way only: friction looks the same as a constant load"
         yield Finding("info", "excitation", None, text, "add a log that reverses")
 
 
 @_needs("voltage current torque")
-def _two_constants(seen: Seen) -> Iterator[Finding]:
-    """The torque constant against the back-EMF constant, which in SI are equal but for losses and star or delta."""
-    # the steps of an encoder take less from the speed of longer windows
-    balance = seen.winding and (voltage_balance(seen.log, 0.1) or seen.winding)
-    if balance is None or balance.certainty.get("back_emf_constant", 0.0) < _CERTAIN:
+def _two_constants(facts: LogFacts) -> Iterator[Finding]:
+    """Compare the torque constant with the back-EMF constant.
+
+    In SI units they are equal but for losses and the convention of star or delta windings.
+    """
+    # The speed of longer windows is less affected by the resolution of an encoder.
+    balance = facts.winding and (voltage_balance(facts.log, 0.1) or facts.winding)
+    if balance is None or balance.certainty.get("back_emf_constant", 0.0) < _MIN_CERTAINTY:
         return
     back_emf = balance.values["back_emf_constant"]
-    current, torque = seen.log.signals["current"], seen.log.signals["torque"]
+    current, torque = facts.log.signals["current"], facts.log.signals["torque"]
     constant = float(current @ torque / max(current @ current, 1e-300))
     if constant <= 0.0:
-        text = "torque and current are of opposite signs"
+        text = "torque and current have opposite signs"
         yield Finding("error", "sign", None, text, "give one of them a minus: torque=-column:N*m")
     elif abs(math.log(constant / back_emf)) > math.log(2.0):
         text = (
             f"torque/current is {constant:.3g} N*m/A and the back-EMF constant {back_emf:.3g}"
             " V*s/rad, must be about "
         )
-        text += f"equal: {name_of_factor(constant / back_emf)}"
+        text += f"equal: {explain_factor(constant / back_emf)}"
         yield Finding(
             "error", "unit", None, text, "correct the unit of torque, current, voltage or motion"
         )
 
 
 @_needs("voltage current datasheet")
-def _datasheet(seen: Seen) -> Iterator[Finding]:
-    """Resistance and back-EMF constant against what is printed."""
-    motor, balance = seen.motor, seen.winding
+def _datasheet(facts: LogFacts) -> Iterator[Finding]:
+    """Compare the resistance and the back-EMF constant with the datasheet."""
+    motor, balance = facts.motor, facts.winding
     constant = motor.back_emf_constant * motor.gear_ratio
     for name, value in (("resistance", motor.resistance), ("back_emf_constant", constant)):
-        if balance is None or balance.certainty.get(name, 0.0) <= _CERTAIN or value <= 0.0:
+        if balance is None or balance.certainty.get(name, 0.0) <= _MIN_CERTAINTY or value <= 0.0:
             continue
-        found = balance.values[name]
-        if abs(math.log(found / value)) > math.log(2.0):
+        logged = balance.values[name]
+        if abs(math.log(logged / value)) > math.log(2.0):
             unit = PARAMETERS[name].unit
             text = (
-                f"the {name.replace('_', ' ')} would be {found:.3g} {unit}, the datasheet says"
+                f"the {name.replace('_', ' ')} would be {logged:.3g} {unit}, the datasheet says"
                 f" {value:.3g} {unit}: "
             )
             remedy = "correct the units of voltage, current and motion, or name the right motor"
-            text += name_of_factor(found / value, name != "resistance")
+            text += explain_factor(logged / value, name != "resistance")
             yield Finding("error", "unit", None, text, remedy)

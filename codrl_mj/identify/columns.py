@@ -1,4 +1,4 @@
-"""Which columns of a file are which signals: `time=t:s,voltage=duty*vbus:V,current=-i:mA`. Nothing is guessed."""
+"""The mapping of a file's columns to signals: `time=t:s,voltage=duty*vbus:V,current=-i:mA`."""
 
 import ast
 import dataclasses
@@ -13,13 +13,14 @@ import numpy as np
 from codrl_mj.fields import check_names
 from codrl_mj.identify.log import SIGNALS
 
-KINDS: dict[str, str | None] = {
+COLUMN_UNITS: dict[str, str | None] = {
     "time": "s",
     **SIGNALS,
     "only": "",
-}  # what columns may be -> its SI unit; None: any
+}
+"""Signal that columns can be mapped to -> its SI unit; None: any."""
 OPEN_UNIT = "UNIT"
-"""Stands for the unit that a person has to fill in, in a proposal."""
+"""Placeholder of a proposal for a unit that the user has to fill in."""
 EXAMPLES = {
     "time": "s, ms or us",
     "voltage": "V or mV",
@@ -33,18 +34,18 @@ EXAMPLES = {
     "command": "rad, deg or turn",
     "only": "1",
 }
-"""Signal -> units that its columns often have."""
+"""Signal -> usual units of its columns."""
 _EXAMPLE = "time=t:s,voltage=duty*vbus:V,current=i:A,position=q:rad"
 
 
 def twos_complement(values: Any, bits: Any) -> Any:
-    """Whole numbers that a register shows without their sign, with it: 65535 of 16 bits is -1."""
+    """Return the signed values of unsigned numbers in two's complement: 65535 of 16 bits is -1."""
     whole = 2.0 ** float(bits)
     return (np.asarray(values) + whole / 2.0) % whole - whole / 2.0
 
 
 def sign_magnitude(values: Any, bits: Any) -> Any:
-    """Return whole numbers of which the highest bit is the sign, with it: 1324 of 11 bits is -300."""
+    """Return the values of numbers whose highest bit is the sign: 1324 of 11 bits is -300."""
     half = 2.0 ** (float(bits) - 1.0)
     return np.where(np.asarray(values) >= half, half - np.asarray(values), values)
 
@@ -58,7 +59,10 @@ FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
     "sign": (1, np.sign),
     "sqrt": (1, np.sqrt),
 }
-"""What a formula may call -> number of arguments, function. A second one is a number, but of atan2."""
+"""Function of a formula -> number of arguments, and the function.
+
+A second argument must be a number, except for atan2.
+"""
 _Value = Callable[[Mapping[str, Any]], Any]
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
     ast.Add: np.add,
@@ -73,59 +77,59 @@ class Column:
     """A signal as a formula of a file's columns."""
 
     signal: str  # `time`, one of `SIGNALS`, or `only`: rows where it is 0 are left out
-    # columns (one with spaces in quotes, column[0] of a list), numbers, `pi`, + - * / and
-    # `FUNCTIONS`
+    # Columns (a name with spaces in quotes, column[0] of a list), numbers, `pi`, + - * / and
+    # `FUNCTIONS`.
     formula: str
-    unit: (
-        str | None
-    )  # of the formula's value; None: SI, which only a formula of more than a name may leave out
-    # of a voltage: whether it is the mean from its row to the next, not what holds from its row on
+    # Unit of the formula's value; None: SI, which is allowed for formulas but not for bare names.
+    unit: str | None
+    # For a voltage: True if it is the mean until the next row, False if it is held from its row on.
     mean: bool = False
 
     def __post_init__(self) -> None:
-        """Validate, without a file."""
-        check_names([self.signal], KINDS, "signal")
+        """Validate everything that does not depend on a file."""
+        check_names([self.signal], COLUMN_UNITS, "signal")
         bare = self._formula[2]
-        kind = KINDS[self.signal]
+        kind = COLUMN_UNITS[self.signal]
         if self.unit == OPEN_UNIT:
             remedy = f"write the column's own, such as {EXAMPLES[self.signal]}"
-            raise self._wrong(f"the unit is not filled in; {remedy}. The file does not state it")
+            raise self._error(f"the unit is not filled in; {remedy}. The file does not state it")
         if self.unit is not None:
             self._quantity(1.0)
         elif kind and bare:
             remedy = f"write {self.signal}={self.formula}:{kind} if it is in {kind}"
-            raise self._wrong(f"has no unit, must have one that is of {kind}; {remedy}")
+            raise self._error(f"has no unit, must have a unit of the same kind as {kind}; {remedy}")
 
     @property
     def text(self) -> str:
-        """As it is written, for messages."""
+        """The mapping as the user writes it, for messages."""
         return f"{self.signal}={self.formula}" + (f":{self.unit}" if self.unit is not None else "")
 
-    def _wrong(self, what: str) -> ValueError:
-        return ValueError(f"columns: {self.text}: {what}")
+    def _error(self, problem: str) -> ValueError:
+        """Return an error that quotes the mapping."""
+        return ValueError(f"columns: {self.text}: {problem}")
 
     @property
     def names(self) -> set[str]:
-        """The columns and constants that it reads."""
+        """Names of the columns and constants that the formula reads."""
         return self._formula[1]
 
-    def value(self, table: Mapping[str, Any]) -> Any:
-        """The signal in SI, by a table of columns and constants."""
+    def evaluate(self, table: Mapping[str, Any]) -> Any:
+        """Return the signal in SI units, from a table of columns and constants."""
         for name in sorted(self.names - table.keys()):
             if width := sum(
                 bool(re.fullmatch(re.escape(name) + r"\[\d+\]", known)) for known in table
             ):
-                raise self._wrong(
-                    f"{name} holds lists of {width} numbers; write the one you want, such as"
-                    f" {name}[0]"
+                raise self._error(
+                    f"{name} holds lists of {width} numbers; choose an entry, such as {name}[0]"
                 )
         check_names(self.names, table, "column")
+        # Rows without a finite value are left out later, with a finding.
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._quantity(self._formula[0]({"pi": math.pi, **table}))
 
     @functools.cached_property
     def _formula(self) -> tuple[_Value, set[str], bool]:
-        """Its value by a table, before the unit; the names that it reads; whether it is but a name or number."""
+        """Compiled formula without its unit, the names that it reads, and True for a bare name."""
         try:
             body = ast.parse(self.formula.strip(), mode="eval").body
         except SyntaxError as error:
@@ -133,11 +137,12 @@ class Column:
                 f"columns: {self.signal}={self.formula}: no formula ({error.msg}); write a column's"
                 f" name, in quotes if it has spaces, as in {_EXAMPLE}"
             ) from None
-        value, names = self._made(body)
+        value, names = self._compile(body)
         return value, names - {"pi"}, isinstance(body, ast.Name | ast.Constant | ast.Subscript)
 
-    def _made(self, node: ast.AST) -> tuple[_Value, set[str]]:
-        """A part of the formula: its value by a table, and the names that it reads."""
+    def _compile(self, node: ast.AST) -> tuple[_Value, set[str]]:
+        """Return a part of the formula as a function of a table, and the names that it reads."""
+        # Only the listed kinds of nodes are allowed: a formula cannot execute other code.
         match node:
             case ast.Constant(value=str(name)) | ast.Name(id=name):
                 return lambda table: table[name], {name}
@@ -146,42 +151,49 @@ class Column:
                 slice=ast.Name() | ast.Attribute() | ast.Constant(value=int() | str()) as entry,
             ):
                 parts = (
-                    str(x.value) if isinstance(x, ast.Constant) else ast.unparse(x)
-                    for x in (column, entry)
+                    str(part.value) if isinstance(part, ast.Constant) else ast.unparse(part)
+                    for part in (column, entry)
                 )
                 listed = "{}[{}]".format(*parts)
                 return lambda table: table[listed], {listed}
             case ast.Constant(value=number):
                 return lambda _: number, set()
             case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=inner):
-                value, names = self._made(inner)
+                value, names = self._compile(inner)
                 return (lambda table: -value(table)) if isinstance(sign, ast.USub) else value, names
             case ast.BinOp(left=left, op=operator, right=right) if type(operator) in _OPERATORS:
-                (one, names), (other, more), apply = (
-                    self._made(left),
-                    self._made(right),
+                (left_value, left_names), (right_value, right_names), apply = (
+                    self._compile(left),
+                    self._compile(right),
                     _OPERATORS[type(operator)],
                 )
-                return lambda table: apply(one(table), other(table)), names | more
-            case ast.Call(func=ast.Name(id=called), args=arguments, keywords=[]):
-                check_names([called], FUNCTIONS, "function")
-                needed, function = FUNCTIONS[called]
-                if len(arguments) != needed:
-                    raise self._wrong(f"{called} takes {needed} arguments, not {len(arguments)}")
-                values, read = zip(*map(self._made, arguments), strict=True)
-                if needed == 2 and called != "atan2" and read[1] - {"pi"}:
-                    raise self._wrong(
-                        f"the second argument of {called} must be a number, such as 16"
+                return (
+                    lambda table: apply(left_value(table), right_value(table)),
+                    left_names | right_names,
+                )
+            case ast.Call(func=ast.Name(id=function_name), args=arguments, keywords=[]):
+                check_names([function_name], FUNCTIONS, "function")
+                count, function = FUNCTIONS[function_name]
+                if len(arguments) != count:
+                    raise self._error(
+                        f"{function_name} takes {count} arguments, not {len(arguments)}"
                     )
-                return lambda table: function(*(one(table) for one in values)), set().union(*read)
+                values, names_read = zip(*map(self._compile, arguments), strict=True)
+                if count == 2 and function_name != "atan2" and names_read[1] - {"pi"}:
+                    raise self._error(
+                        f"the second argument of {function_name} must be a number, such as 16"
+                    )
+                return lambda table: function(*(operand(table) for operand in values)), set().union(
+                    *names_read
+                )
         known = ", ".join(FUNCTIONS)
-        raise self._wrong(
+        raise self._error(
             f"{type(node).__name__} is not allowed; write names, numbers, + - * / and {known}"
         )
 
     def _quantity(self, value: Any) -> Any:
-        """A value in SI."""
-        kind, unit = KINDS[self.signal], self.unit
+        """Return a value in SI units."""
+        kind, unit = COLUMN_UNITS[self.signal], self.unit
         if unit is None or (not kind and unit in ("", "1")):
             return value
         from codrl_mj.catalogue.units import in_si
@@ -189,16 +201,18 @@ class Column:
         try:
             return in_si(value, unit, kind, self.signal)
         except ValueError as error:
-            raise self._wrong(f"{error}; write {kind or '1'}, or another unit of that") from error
+            raise self._error(
+                f"{error}; write {kind or '1'}, or another unit of its kind"
+            ) from error
 
 
-def parse_columns(given: str | Mapping[str, str]) -> dict[str, Column]:
-    """Signal -> what it is made of."""
-    if isinstance(given, str):
-        pairs = [_split(entry, "=") for entry in _split(given, ",") if entry.strip()]
+def parse_columns(mapping: str | Mapping[str, str]) -> dict[str, Column]:
+    """Parse a mapping of signals, as a text `signal=formula:unit,...` or as a dictionary."""
+    if isinstance(mapping, str):
+        pairs = [_split(entry, "=") for entry in _split(mapping, ",") if entry.strip()]
     else:
-        pairs = [[name, text] for name, text in given.items()]
-    found: dict[str, Column] = {}
+        pairs = [[name, text] for name, text in mapping.items()]
+    columns: dict[str, Column] = {}
     for pair in pairs:
         if len(pair) != 2:
             raise ValueError(
@@ -207,25 +221,25 @@ def parse_columns(given: str | Mapping[str, str]) -> dict[str, Column]:
         name, (formula, *unit) = pair[0].strip(), _split(pair[1], ":")
         if len(unit) > 1:
             raise ValueError(f"columns: {pair[1]!r}: has two colons; write formula:unit")
-        if name in found:
+        if name in columns:
             raise ValueError(f"columns: {name} is given twice, must be given once; leave one out")
         formula = formula.strip()
         mean = re.fullmatch(r"mean\((.*)\)", formula) if name == "voltage" else None
-        found[name] = Column(
+        columns[name] = Column(
             name, mean[1] if mean else formula, unit[0].strip() if unit else None, mean is not None
         )
-    if "time" not in found:
+    if "time" not in columns:
         raise ValueError(f"columns: there is no time; write for instance {_EXAMPLE}")
-    if not found.keys() - {"time", "only"}:
+    if not columns.keys() - {"time", "only"}:
         raise ValueError(
             f"columns: nothing but time is given; add signals ({', '.join(SIGNALS)}), as in"
             f" {_EXAMPLE}"
         )
-    return found
+    return columns
 
 
 def _split(text: str, separator: str) -> list[str]:
-    """Split, but not within quotes or brackets."""
+    """Split a text at a separator that is outside quotes and brackets."""
     pieces, depth, quote = [""], 0, ""
     for letter in text:
         if quote:

@@ -1,8 +1,9 @@
-"""Output error: parameters of all segments at once, the initial states of each eliminated, a robust loss.
+"""Robust output-error fits of all segments at once, with the initial states eliminated.
 
-The states are solved for within each evaluation, and their share of the Jacobian is projected out
-(Kaufman 1975, *A variable projection method for solving separable nonlinear least squares
-problems*), so that the outer problem has a handful of unknowns however many segments there are.
+The initial state of each segment is solved for within each evaluation, and its share of the
+Jacobian is projected out (Kaufman 1975, *A variable projection method for solving separable
+nonlinear least squares problems*). So the outer problem has only the parameters as unknowns,
+however many segments there are.
 """
 
 import abc
@@ -12,47 +13,59 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from codrl_mj.identify.log import Log, Segment, shifted
+from codrl_mj.identify.log import Log, Segment, shift_signal
 from codrl_mj.identify.parameters import DEFAULTS, PARAMETERS
 
-# step of finite differences, in the parameters' scales: dry friction makes smaller ones rough
-DIFFERENCE = 1e-4
-FAR = 1e30
-SCREENING = 12  # evaluations from each of several starts
-DELAYS = (-1, 1, 2, 3)  # rows that the input is tried to be late by, besides 0;
-LONGEST = 20  # and on to so many, while that is better
-STARTS = 4
-BETTER = 0.8  # a delay is believed where it takes the robust cost to less than this share, and
-# lowers that of the segments by more, in the mean, than so many standard deviations of that mean
-SURE = 3.0
-UNEXPLAINED = 8.0  # residuals of more standard deviations of the sensor in the mean are no noise,
-UNLIKE = 0.02
-"""and more than this share of what moves within a segment is not explained: the log is bad, or the model is."""
+# Dry friction makes the cost rough: smaller steps give useless derivatives.
+DIFFERENCE_STEP = 1e-4
+"""Step of finite differences, in the parameters' scales."""
+MAX_SQUARED_RESIDUALS = 1e30
+"""Sum of squared residuals beyond which a simulation counts as diverged."""
+SCREENING_EVALUATIONS = 12
+"""Evaluations from each of several starts, before the best are optimized further."""
+DELAYS = (-1, 1, 2, 3)
+"""Delays of the input [rows] that are tried besides 0."""
+MAX_DELAY = 20
+"""Largest delay [rows]; delays beyond `DELAYS` are tried while they are better."""
+NUM_STARTS = 4
+# A delay is accepted if it passes both limits.
+MAX_COST_RATIO = 0.8
+"""Largest robust cost with an accepted delay, over the cost without it."""
+MIN_DEVIATIONS = 3.0
+"""Smallest mean reduction of the segments' costs, in standard deviations of that mean."""
+# Beyond both limits the log is faulty, or the model does not describe it.
+MAX_MEAN_RESIDUAL = 8.0
+"""Largest mean residual that may be noise, in standard deviations of the sensor."""
+MAX_UNEXPLAINED_SHARE = 0.02
+"""Largest unexplained share of the variation within a segment."""
 Simulate = Callable[[Segment, np.ndarray], np.ndarray]
+"""Function of a segment and its initial state that returns the output, shape (m,)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Model(abc.ABC):
-    """A part of a motor: what drives it, what is known of it and what is fitted; how it does so is a subclass's."""
+    """A part of a motor with its input, its output, and its known and free parameters."""
 
-    driven_by: str  # signal of a log
-    output: str  # signal that a simulation is compared with
+    driven_by: str  # signal of a log, the input
+    output: str  # signal of a log that a simulation is compared with
     known: Mapping[str, float]  # values of parameters that are not fitted
     defaults: Mapping[str, float] = dataclasses.field(default_factory=lambda: DEFAULTS)
     """Values of parameters that are neither fitted nor known."""
-    names: tuple[str, ...] = ()  # free parameters; none before `begun`
+    names: tuple[str, ...] = ()  # free parameters; none before `initial_guess`
     scales: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(0))
-    """What a change of each is measured by, > 0, shape (p,)."""
+    """Typical size of each free parameter, > 0, shape (p,)."""
     steps: ClassVar[np.ndarray]  # steps of finite differences of the state, shape (s,)
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest values of the free parameters, each of shape (p,)."""
+        """Lower and upper bounds of the free parameters, each of shape (p,)."""
         free = [PARAMETERS[name] for name in self.names]
-        return np.array([one.least for one in free]), np.array([one.most for one in free])
+        return np.array([parameter.lower for parameter in free]), np.array(
+            [parameter.upper for parameter in free]
+        )
 
     def all_values(self, values: np.ndarray) -> dict[str, float]:
-        """Free and known parameters by name."""
+        """Return all parameters by name, of which `values` are the free ones."""
         return {
             **self.defaults,
             **self.known,
@@ -61,35 +74,34 @@ class Model(abc.ABC):
 
     @abc.abstractmethod
     def segments(self, logs: Sequence[Log]) -> list[Segment]:
-        """The logs, cut."""
+        """Cut logs into segments."""
 
     @abc.abstractmethod
-    def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
-        """With what is free in such segments, and starts for it, each of shape (p,)."""
+    def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
+        """Return the model with its free parameters, and initial guesses, each of shape (p,)."""
 
     @abc.abstractmethod
-    def at(self, values: np.ndarray) -> Simulate:
-        """(segment, state at its beginning) -> what the sensor would have seen, shape (m,), for parameters (p,)."""
+    def simulator(self, values: np.ndarray) -> Simulate:
+        """Return a function that simulates the output of a segment with parameters (p,)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
-    """Parameters that fit, and what is needed to judge them."""
+    """Fitted parameters, and all that is needed to judge them."""
 
     model: Any  # a `Model`
     segments: Sequence[Segment]
-    values: np.ndarray  # shape (p,)
-    scale: float  # residuals beyond this, in standard deviations of the sensor, count less
-    residuals: tuple[
-        np.ndarray, ...
-    ]  # of each segment, in standard deviations of the sensor, shape (m,)
-    jacobians: tuple[
-        np.ndarray, ...
-    ]  # of each segment, what its states cannot do taken out, shape (m, p)
-    states: tuple[np.ndarray, ...]  # at the beginning of each segment
-    logs: tuple[Log, ...] = ()  # of the segments, with the input in time
-    delay: float = 0  # rows by which it was late
-    tried: tuple["Fit", ...] = ()  # what each start led to
+    values: np.ndarray  # free parameters, shape (p,)
+    # Residuals beyond the scale, in standard deviations of the sensor, are outliers.
+    scale: float
+    # Residuals of each segment in standard deviations of the sensor, shape (m,).
+    residuals: tuple[np.ndarray, ...]
+    # Jacobian of each segment, without the part that its initial state compensates, shape (m, p).
+    jacobians: tuple[np.ndarray, ...]
+    states: tuple[np.ndarray, ...]  # initial state of each segment
+    logs: tuple[Log, ...] = ()  # logs of the segments, with the delay of the input removed
+    delay: float = 0  # delay of the input [rows]
+    start_fits: tuple["Fit", ...] = ()  # fits from each start
 
     @property
     def cost(self) -> float:
@@ -97,180 +109,223 @@ class Fit:
         return robust_cost(np.concatenate(self.residuals), self.scale)
 
     def costs(self, scale: float) -> np.ndarray:
-        """Robust cost of each segment."""
+        """Return the robust cost of each segment."""
         return np.array([robust_cost(residuals, scale) for residuals in self.residuals])
 
     def weights(self, segment: int) -> np.ndarray:
-        """What each of a segment's residuals counts: 1 where it is small, shape (m,)."""
+        """Return the weight of each residual of a segment, 1 for small ones, shape (m,)."""
         return 1.0 / np.sqrt(1.0 + (self.residuals[segment] / self.scale) ** 2)
 
 
 def robust_cost(residuals: np.ndarray, scale: float) -> float:
-    """Soft-L1 loss, the sum of squares where residuals are small."""
+    """Return the soft-L1 loss, which is the sum of squares of small residuals."""
     return float(2.0 * scale * scale * np.sum(np.sqrt(1.0 + (residuals / scale) ** 2) - 1.0))
 
 
 def _residuals(simulate: Simulate, segment: Segment, state: np.ndarray) -> np.ndarray:
-    found = (simulate(segment, state) - segment.measured) / segment.deviation
-    return found if found @ found < FAR else np.clip(np.nan_to_num(found, nan=1e9), -1e9, 1e9)
+    residuals = (simulate(segment, state) - segment.measured) / segment.deviation
+    # A diverged simulation gets large finite residuals, from which the optimizer can step back.
+    return (
+        residuals
+        if residuals @ residuals < MAX_SQUARED_RESIDUALS
+        else np.clip(np.nan_to_num(residuals, nan=1e9), -1e9, 1e9)
+    )
 
 
-class _Settled(NamedTuple):
-    """A segment from the state from which it fits best."""
+class _StateFit(NamedTuple):
+    """A segment with its fitted initial state."""
 
     state: np.ndarray
     residuals: np.ndarray
-    columns: np.ndarray  # how these change with the state, shape (m, s)
+    columns: np.ndarray  # derivative of the residuals with respect to the state, shape (m, s)
 
 
-def _settle(
+def _fit_state(
     simulate: Simulate,
     segment: Segment,
     state: np.ndarray,
     steps: np.ndarray,
     scale: float,
-    most: int = 4,
-) -> _Settled:
-    """The segment from the best state near one, by Gauss-Newton steps that are cut where they are too long."""
-    here = _residuals(simulate, segment, state)
-    for _ in range(most):
-        columns = np.empty((len(here), len(steps)))
-        for place, length in enumerate(steps):
-            moved = state.copy()
-            moved[place] += length
-            columns[:, place] = (_residuals(simulate, segment, moved) - here) / length
-        root, cost = (1.0 + (here / scale) ** 2) ** -0.25, robust_cost(here, scale)
-        step = np.linalg.lstsq(root[:, None] * columns, -root * here, rcond=1e-9)[0]
-        if np.sum((root * (columns @ step)) ** 2) < 1e-6 * cost:  # all that it could gain
+    max_iterations: int = 4,
+) -> _StateFit:
+    """Fit the initial state of a segment by damped Gauss-Newton steps from a guess."""
+    residuals = _residuals(simulate, segment, state)
+    for _ in range(max_iterations):
+        columns = np.empty((len(residuals), len(steps)))
+        for index, length in enumerate(steps):
+            changed = state.copy()
+            changed[index] += length
+            columns[:, index] = (_residuals(simulate, segment, changed) - residuals) / length
+        # The weights of the soft-L1 loss make it a sum of weighted squares.
+        root, cost = (1.0 + (residuals / scale) ** 2) ** -0.25, robust_cost(residuals, scale)
+        step = np.linalg.lstsq(root[:, None] * columns, -root * residuals, rcond=1e-9)[0]
+        # The predicted reduction of the cost is negligible.
+        if np.sum((root * (columns @ step)) ** 2) < 1e-6 * cost:
             break
         for share in (1.0, 0.25):
-            tried = _residuals(simulate, segment, state + share * step)
-            if robust_cost(tried, scale) < cost:
+            candidate = _residuals(simulate, segment, state + share * step)
+            if robust_cost(candidate, scale) < cost:
                 break
         else:
             break
-        state, here = state + share * step, tried
-    return _Settled(state, here, columns)
+        state, residuals = state + share * step, candidate
+    return _StateFit(state, residuals, columns)
 
 
-def settled_state(model: Model, values: np.ndarray, segment: Segment) -> np.ndarray:
-    """The state from which a segment fits best, by the parameters (p,)."""
-    simulate = model.at(values)
+def best_initial_state(model: Model, values: np.ndarray, segment: Segment) -> np.ndarray:
+    """Return the initial state with which a segment fits best, with parameters (p,)."""
+    simulate = model.simulator(values)
     scale = robust_scale(_residuals(simulate, segment, segment.state))
-    return _settle(simulate, segment, segment.state, model.steps, scale).state
+    return _fit_state(simulate, segment, segment.state, model.steps, scale).state
 
 
 class _Problem:
-    """The outer problem, as scipy takes it; begins from the states at the last Jacobian, moved as that says."""
+    """The outer least-squares problem in the parameters, for scipy.
+
+    The initial states are fitted from those at the last Jacobian, extrapolated linearly.
+    """
 
     def __init__(
         self, model: Model, segments: Sequence[Segment], states: Sequence[np.ndarray], scale: float
     ) -> None:
+        """Start from initial states of the segments."""
         self.model, self.segments, self.scale = model, segments, scale
-        self.known = list(states)
-        self.slopes = [
-            np.zeros((len(one), len(model.names))) for one in states
-        ]  # of the states by the parameters, at
+        # States and their derivatives with respect to the parameters, at the parameters `origin`.
+        self.states = list(states)
+        self.slopes = [np.zeros((len(state), len(model.names))) for state in states]
         self.origin = np.zeros(len(model.names))
-        self.at: tuple[bytes | None, list[_Settled]] = None, []
+        # scipy asks for residuals and Jacobian at the same parameters: the last solution is reused.
+        self.solution: tuple[bytes | None, list[_StateFit]] = None, []
 
-    def settle(self, values: np.ndarray, states: Sequence[np.ndarray]) -> list[_Settled]:
-        simulate, steps = self.model.at(values), self.model.steps
+    def fit_states(self, values: np.ndarray, states: Sequence[np.ndarray]) -> list[_StateFit]:
+        """Fit the initial state of each segment from a guess."""
+        simulate, steps = self.model.simulator(values), self.model.steps
         return [
-            _settle(simulate, *pair, steps, self.scale)
+            _fit_state(simulate, *pair, steps, self.scale)
             for pair in zip(self.segments, states, strict=True)
         ]
 
-    def solve(self, values: np.ndarray) -> list[_Settled]:
-        if self.at[0] != values.tobytes():
-            moved = values - self.origin
+    def solve(self, values: np.ndarray) -> list[_StateFit]:
+        """Return the segments with their fitted initial states."""
+        if self.solution[0] != values.tobytes():
+            change = values - self.origin
             states = [
-                one + slope @ moved for one, slope in zip(self.known, self.slopes, strict=True)
+                state + slope @ change
+                for state, slope in zip(self.states, self.slopes, strict=True)
             ]
-            self.at = values.tobytes(), self.settle(values, states)
-        return self.at[1]
+            self.solution = values.tobytes(), self.fit_states(values, states)
+        return self.solution[1]
 
-    def reconsider(self, values: np.ndarray) -> None:
-        """Begin each segment from where it fits best: what is known, or its own guess."""
-        both = zip(
+    def choose_best_states(self, values: np.ndarray) -> None:
+        """Take the better initial state of each segment, from the solution or from its guess."""
+        pairs = zip(
             self.solve(values),
-            self.settle(values, [one.state for one in self.segments]),
+            self.fit_states(values, [segment.state for segment in self.segments]),
             strict=True,
         )
-        best = [min(pair, key=lambda one: robust_cost(one.residuals, self.scale)) for pair in both]
-        self.at = values.tobytes(), best
+        best = [min(pair, key=lambda fit: robust_cost(fit.residuals, self.scale)) for pair in pairs]
+        self.solution = values.tobytes(), best
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
-        return np.concatenate([one.residuals for one in self.solve(values)])
+        """Return the residuals of all segments, shape (sum of m,)."""
+        return np.concatenate([fit.residuals for fit in self.solve(values)])
 
     def jacobians(self, values: np.ndarray) -> list[np.ndarray]:
-        found = self.solve(values)
-        self.known, self.slopes, self.origin = [one.state for one in found], [], values.copy()
-        model, made = self.model, []
-        inward = np.where(values + DIFFERENCE * model.scales > model.bounds[1], -1.0, 1.0)
-        moves = np.diag(inward * DIFFERENCE * model.scales)
-        moved = [model.at(values + move) for move in moves]
-        for segment, (state, residuals, own) in zip(self.segments, found, strict=True):
+        """Return the Jacobian of each segment with its state eliminated, shape (m, p)."""
+        fits = self.solve(values)
+        self.states, self.slopes, self.origin = [fit.state for fit in fits], [], values.copy()
+        model, jacobians = self.model, []
+        # Steps must not leave the bounds.
+        signs = np.where(values + DIFFERENCE_STEP * model.scales > model.bounds[1], -1.0, 1.0)
+        changes = np.diag(signs * DIFFERENCE_STEP * model.scales)
+        simulators = [model.simulator(values + change) for change in changes]
+        for segment, (state, residuals, state_columns) in zip(self.segments, fits, strict=True):
             columns = np.empty((len(residuals), len(values)))
-            for place, (simulate, move) in enumerate(zip(moved, moves, strict=True)):
-                columns[:, place] = (_residuals(simulate, segment, state) - residuals) / move.sum()
+            for index, (simulate, change) in enumerate(zip(simulators, changes, strict=True)):
+                columns[:, index] = (
+                    _residuals(simulate, segment, state) - residuals
+                ) / change.sum()
+            # The state follows the parameters such that the residuals stay minimal.
             root = ((1.0 + (residuals / self.scale) ** 2) ** -0.25)[:, None]
-            self.slopes.append(-np.linalg.lstsq(root * own, root * columns, rcond=1e-9)[0])
-            made.append(columns + own @ self.slopes[-1])
-        return made
+            self.slopes.append(
+                -np.linalg.lstsq(root * state_columns, root * columns, rcond=1e-9)[0]
+            )
+            jacobians.append(columns + state_columns @ self.slopes[-1])
+        return jacobians
 
 
 def robust_scale(residuals: np.ndarray) -> float:
-    """One and a half standard deviations of what is no outlier, and at least those of the sensor."""
+    """Return 1.5 standard deviations of the residuals without outliers, and at least 1.5."""
     return 1.5 * max(1.4826 * float(np.median(np.abs(residuals))), 1.0)
 
 
-def search(
+def fit_from_starts(
     model: Model,
     segments: Sequence[Segment],
     starts: Sequence[np.ndarray],
     on_start: Callable[[], None] = lambda: None,
 ) -> tuple[Fit, tuple[Fit, ...]]:
-    """The best fit from any of several starts, and what each of them led to, the best first."""
-    found = []
+    """Return the best fit from several starts, and the fit from each start, the best first."""
+    fits = []
     for start in starts:
-        found.append(
-            refit(model, segments, start, SCREENING, states=[segment.state for segment in segments])
+        fits.append(
+            optimize(
+                model,
+                segments,
+                start,
+                SCREENING_EVALUATIONS,
+                states=[segment.state for segment in segments],
+            )
         )
         on_start()
-    least = min(one.scale for one in found)
+    # Costs are comparable only with the same scale.
+    scale = min(start_fit.scale for start_fit in fits)
 
     def cost(fit: Fit) -> float:
-        return robust_cost(np.concatenate(fit.residuals), least)
+        return robust_cost(np.concatenate(fit.residuals), scale)
 
-    found.sort(key=cost)
-    polished = [refit(model, segments, one.values, 40, one.scale, one.states) for one in found[:2]]
-    return min(polished, key=cost), tuple(found)
+    fits.sort(key=cost)
+    best_fits = [
+        optimize(model, segments, start_fit.values, 40, start_fit.scale, start_fit.states)
+        for start_fit in fits[:2]
+    ]
+    return min(best_fits, key=cost), tuple(fits)
 
 
-def refit(
+def optimize(
     model: Model,
     segments: Sequence[Segment],
     start: np.ndarray,
-    most: int = 40,
+    max_evaluations: int = 40,
     scale: float | None = None,
     states: Sequence[np.ndarray] | None = None,
 ) -> Fit:
-    """A fit from a start, and from states or those that fit it best; without a scale that of what they leave."""
+    """Fit the free parameters of a model to segments.
+
+    Args:
+        model: with its free parameters.
+        segments: to fit.
+        start: initial guess, shape (p,).
+        max_evaluations: 0 leaves the parameters at the start.
+        scale: beyond which residuals count as outliers; None takes it from the residuals at the
+            start.
+        states: initial states of the segments; None fits them at the start.
+    """
     from scipy.optimize import least_squares
 
     if states is None:
-        states = [settled_state(model, start, one) for one in segments]
+        states = [best_initial_state(model, start, segment) for segment in segments]
     lower, upper = model.bounds
     values = np.clip(start, lower, upper)
     if scale is None:
-        simulate = model.at(values)
-        left = [
-            _residuals(simulate, one, state) for one, state in zip(segments, states, strict=True)
+        simulate = model.simulator(values)
+        residuals_at_start = [
+            _residuals(simulate, segment, state)
+            for segment, state in zip(segments, states, strict=True)
         ]
-        scale = robust_scale(np.concatenate(left))
+        scale = robust_scale(np.concatenate(residuals_at_start))
     problem = _Problem(model, segments, states, scale)
-    if model.names and most:
+    if model.names and max_evaluations:
         values = least_squares(
             problem.residuals,
             np.clip(values, lower + 1e-9 * model.scales, upper - 1e-9 * model.scales),
@@ -279,122 +334,139 @@ def refit(
             x_scale=model.scales,
             loss="soft_l1",
             f_scale=scale,
-            max_nfev=most,
+            max_nfev=max_evaluations,
             xtol=1e-6,
             ftol=1e-6,
             gtol=1e-10,
         ).x
     problem.scale = robust_scale(problem.residuals(values))
-    problem.reconsider(
-        values
-    )  # dry friction gives a segment several minima: that under other parameters may be worse
+    # Dry friction gives a segment several minima: the state that was followed from the start may be
+    # a worse one.
+    problem.choose_best_states(values)
     jacobians = problem.jacobians(values)
-    found = problem.solve(values)
-    residuals = tuple(one.residuals for one in found)
-    states = tuple(one.state for one in found)
+    state_fits = problem.solve(values)
+    residuals = tuple(fit.residuals for fit in state_fits)
+    states = tuple(fit.state for fit in state_fits)
     return Fit(model, segments, values, problem.scale, residuals, tuple(jacobians), states)
 
 
-def refitted(fit: Fit, model: Model) -> Fit:
-    """Another model of the same logs, from where a fit ended."""
+def refit_model(fit: Fit, model: Model) -> Fit:
+    """Fit another model to the logs of a fit, from its parameters."""
     segments = model.segments(fit.logs)
-    found = refit(model.begun(segments)[0], segments, fit.values)
-    return dataclasses.replace(found, logs=fit.logs, delay=fit.delay, tried=fit.tried)
+    refit = optimize(model.initial_guess(segments)[0], segments, fit.values)
+    return dataclasses.replace(refit, logs=fit.logs, delay=fit.delay, start_fits=fit.start_fits)
 
 
-def fitted(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fit:
-    """Fit a model to logs: several starts, then the delays.
+def fit_model(model: Model, logs: Sequence[Log], on_step: Callable[[], None] = lambda: None) -> Fit:
+    """Fit a model to logs from several starts, and then the delay of its input.
 
-    A voltage whose mean between two rows fits worse than itself is shown to hold from row to row:
-    then it is also the mean, which fewer rows can be given. One that fits better is that of the
-    rows' times, and taken half a row later.
+    For a winding, delays of half a row are tried too. If they fit worse than whole rows, the
+    voltage is held from row to row: then it is also the mean between rows, of which a log at half
+    the rate can be made. If a half row fits better, the voltage was sampled at the times of the
+    rows, and is delayed accordingly.
     """
     segments = model.segments(logs)
-    model, starts = model.begun(segments)
+    model, starts = model.initial_guess(segments)
     if not model.names:
-        fit = refit(model, segments, starts[0])
+        fit = optimize(model, segments, starts[0])
         on_step()
-        return dataclasses.replace(fit, logs=tuple(logs), tried=(fit,))
-    fit, tried = search(model, segments, starts[:STARTS], on_step)
+        return dataclasses.replace(fit, logs=tuple(logs), start_fits=(fit,))
+    fit, start_fits = fit_from_starts(model, segments, starts[:NUM_STARTS], on_step)
     costs: dict[float, np.ndarray] = {0: fit.costs(fit.scale)}
 
-    def late(delay: float) -> list[Log]:
-        return [shifted(log, model.driven_by, delay) for log in logs]
+    def delayed_logs(delay: float) -> list[Log]:
+        return [shift_signal(log, model.driven_by, delay) for log in logs]
 
-    def measure(*delays: float) -> float:
-        """Their costs; returns the best delay that is believed."""
-        for one in delays:
-            costs[one] = refit(model, model.segments(late(one)), fit.values, 20, fit.scale).costs(
-                fit.scale
-            )
+    def try_delays(*delays: float) -> float:
+        """Compute the costs of delays, and return the best accepted delay."""
+        for candidate in delays:
+            costs[candidate] = optimize(
+                model, model.segments(delayed_logs(candidate)), fit.values, 20, fit.scale
+            ).costs(fit.scale)
             on_step()
-        best = min(costs, key=lambda one: costs[one].sum())
-        return best if _better(costs[best], costs[0]) else 0
+        best = min(costs, key=lambda candidate: costs[candidate].sum())
+        return best if _is_better(costs[best], costs[0]) else 0
 
-    delay = measure(*DELAYS)
-    while delay != 0 and delay in (min(costs), max(costs)) and abs(delay) < LONGEST:
-        delay = measure(delay + (1 if delay > 0 else -1))
-    told = late(delay)
+    delay = try_delays(*DELAYS)
+    # The best delay is at an end of those that were tried: the next one may be better.
+    while delay != 0 and delay in (min(costs), max(costs)) and abs(delay) < MAX_DELAY:
+        delay = try_delays(delay + (1 if delay > 0 else -1))
+    shifted_logs = delayed_logs(delay)
     if model.output == "current" and not all(log.mean_voltage for log in logs):
-        whole = costs[delay]
-        measure(delay - 0.5, delay + 0.5)
-        half = min(delay - 0.5, delay + 0.5, key=lambda one: costs[one].sum())
-        delay = half if _better(costs[half], whole) else delay
-        if delay == half or _better(whole, costs[half]):
-            told = [dataclasses.replace(log, mean_voltage=True) for log in late(delay)]
+        whole_costs = costs[delay]
+        try_delays(delay - 0.5, delay + 0.5)
+        half = min(delay - 0.5, delay + 0.5, key=lambda candidate: costs[candidate].sum())
+        delay = half if _is_better(costs[half], whole_costs) else delay
+        if delay == half or _is_better(whole_costs, costs[half]):
+            shifted_logs = [
+                dataclasses.replace(log, mean_voltage=True) for log in delayed_logs(delay)
+            ]
     if delay != 0:
-        segments = model.segments(told)
-        model, starts = model.begun(segments)
-        fit, tried = search(model, segments, [fit.values, starts[0]])
-    return dataclasses.replace(fit, logs=tuple(told), delay=delay, tried=tried)
+        segments = model.segments(shifted_logs)
+        model, starts = model.initial_guess(segments)
+        fit, start_fits = fit_from_starts(model, segments, [fit.values, starts[0]])
+    return dataclasses.replace(fit, logs=tuple(shifted_logs), delay=delay, start_fits=start_fits)
 
 
-def _better(these: np.ndarray, those: np.ndarray) -> bool:
-    """Whether costs of segments are lower than others, by more than chance."""
-    gained = those - these
-    error = gained.std(ddof=1) / np.sqrt(len(gained)) if len(gained) > 1 else 0.0
-    return bool(these.sum() < BETTER * those.sum() and gained.mean() > SURE * error)
+def _is_better(costs: np.ndarray, reference: np.ndarray) -> bool:
+    """Return True if the costs of segments are lower than others, by more than chance."""
+    reductions = reference - costs
+    error = reductions.std(ddof=1) / np.sqrt(len(reductions)) if len(reductions) > 1 else 0.0
+    return bool(
+        costs.sum() < MAX_COST_RATIO * reference.sum()
+        and reductions.mean() > MIN_DEVIATIONS * error
+    )
 
 
 def fit_warnings(fit: Fit, shares: dict[str, float]) -> list[str]:
-    """Return what a fit says is wrong with its logs or its model; `shares` gets the unexplained share of each log."""
-    unlike: dict[str, str] = {}
-    for place, log in enumerate(fit.logs):
-        own = [
-            pair for pair in zip(fit.segments, fit.residuals, strict=True) if pair[0].log == place
+    """Return warnings about the logs or the model of a fit.
+
+    Args:
+        fit: of a model to logs.
+        shares: gets the unexplained share of each log that the model does not explain.
+    """
+    unexplained: dict[str, str] = {}
+    for index, log in enumerate(fit.logs):
+        pairs = [
+            pair for pair in zip(fit.segments, fit.residuals, strict=True) if pair[0].log == index
         ]
-        sizes = np.concatenate([np.abs(residuals) for _, residuals in own])
-        rest = np.concatenate([residuals * segment.deviation for segment, residuals in own])
-        swing = np.concatenate([segment.measured - segment.measured.mean() for segment, _ in own])
-        share = float(np.std(rest) / max(np.std(swing), 1e-12))
-        if sizes.mean() / 0.8 > UNEXPLAINED and share > UNLIKE:
+        sizes = np.concatenate([np.abs(residuals) for _, residuals in pairs])
+        errors = np.concatenate([residuals * segment.deviation for segment, residuals in pairs])
+        variations = np.concatenate(
+            [segment.measured - segment.measured.mean() for segment, _ in pairs]
+        )
+        share = float(np.std(errors) / max(np.std(variations), 1e-12))
+        # The mean absolute value of normal noise is 0.8 standard deviations.
+        if sizes.mean() / 0.8 > MAX_MEAN_RESIDUAL and share > MAX_UNEXPLAINED_SHARE:
             shares[log.name] = max(share, shares.get(log.name, 0.0))
-            unlike[log.name] = (
+            unexplained[log.name] = (
                 f"{sizes.mean() / 0.8:.1f} standard deviations of the sensor, {100.0 * share:.2g} %"
-                " of what moves"
+                " of the output's variation"
             )
-    found = []
-    if 1 < len(unlike) == len(fit.logs):
-        found.append(
-            "the model does not explain any of the logs within what their sensors see: of the"
-            f" first, residuals are {next(iter(unlike.values()))}. Fit more friction, or find out"
-            " what else moved"
+    warnings = []
+    if 1 < len(unexplained) == len(fit.logs):
+        warnings.append(
+            "the model does not explain any of the logs within the noise of their sensors: the"
+            f" mean residuals of the first log are {next(iter(unexplained.values()))}. Fit more"
+            " friction, or find out what else moved"
         )
     else:
-        found += [
-            f"log {name}: residuals are {text} in the mean: the model does not explain it. Leave it"
+        warnings += [
+            f"log {name}: mean residuals are {text}: the model does not explain the log. Leave it"
             " out, find out what else moved, or fit more friction"
-            for name, text in unlike.items()
+            for name, text in unexplained.items()
         ]
-    values = np.array([one.values for one in fit.tried])
-    costs = np.array([np.mean(np.abs(np.concatenate(one.residuals))) for one in fit.tried])
-    near = costs < 1.1 * costs.min()
-    apart = np.ptp(values[near], axis=0) / np.maximum(np.abs(fit.values), fit.model.scales)
-    if np.any(apart > 0.2):
+    values = np.array([start_fit.values for start_fit in fit.start_fits])
+    costs = np.array(
+        [np.mean(np.abs(np.concatenate(start_fit.residuals))) for start_fit in fit.start_fits]
+    )
+    nearly_best = costs < 1.1 * costs.min()
+    spreads = np.ptp(values[nearly_best], axis=0) / np.maximum(np.abs(fit.values), fit.model.scales)
+    if np.any(spreads > 0.2):
         names = ", ".join(
-            name for name, one in zip(fit.model.names, apart, strict=True) if one > 0.2
+            name for name, spread in zip(fit.model.names, spreads, strict=True) if spread > 0.2
         )
-        found.append(
-            f"several minima: starts ended within 10 % of the best cost, but apart in {names}"
+        warnings.append(
+            f"several minima: starts ended within 10 % of the best cost, but with different {names}"
         )
-    return found
+    return warnings

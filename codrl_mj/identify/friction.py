@@ -1,4 +1,4 @@
-"""Which friction a shaft is fitted with: the one asked for, or the one that predicts left-out logs best."""
+"""Choice of a shaft's friction model: the requested one, or the best one by cross-validation."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -6,56 +6,58 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, refit, search
+from codrl_mj.identify.estimate import Fit, fit_from_starts, optimize
 from codrl_mj.identify.log import SIGNALS, Log
 from codrl_mj.identify.models import ShaftModel
 from codrl_mj.identify.result import predict
 
-LEAST_LOGS = (
-    3  # Fewer logs give no standard deviation of what a richer friction gains on the one left out.
-)
+# With fewer logs the improvement on the logs left out has no useful standard deviation.
+MIN_LOGS = 3
+"""Smallest number of moving logs for a cross-validation."""
 _LOADED = {"coulomb": "load", "stribeck": "both"}
-# An efficiency is hinted at where it takes all cost, and half of the segments', to less than this
-# share,
-_HINTED = 0.9
-_APART = 0.05  # and differs by more than this from the one that the fit took as known.
+"""Friction model -> the same model with an efficiency of the gear."""
+# A hint has to pass both limits.
+_MAX_COST_RATIO = 0.9
+"""Largest ratio of costs with and without an efficiency, in total and in the median segment."""
+_MIN_DIFFERENCE = 0.05
+"""Smallest difference between the fitted efficiency and the known one."""
 
 
 class FrictionChoice(NamedTuple):
-    """A shaft with its kind of friction."""
+    """A shaft with the chosen friction model."""
 
     model: ShaftModel
     reason: str
-    """Why this kind; empty if it was asked for."""
+    """Reason of the choice; empty if the friction model was requested."""
 
 
 def choose_friction(
-    model: ShaftModel, logs: Sequence[Log], wanted: str, on_step: Callable[[], None]
+    model: ShaftModel, logs: Sequence[Log], friction: str, on_step: Callable[[], None]
 ) -> FrictionChoice:
-    """Return the model with the friction that is wanted or, for `auto`, with what leaving out one log at a time favors.
+    """Return a shaft with the requested friction model or, for `auto`, with the best one.
 
-    More than viscous and Coulomb friction is kept where the errors on the logs left out fall by
-    more, in the mean, than two standard deviations of that mean. With fewer than three logs none
-    is.
+    `auto` leaves out one log at a time and predicts it from a fit to the others. A richer model
+    than viscous and Coulomb friction is chosen if it reduces the mean error by more than two
+    standard deviations of that mean. With fewer than three logs the model is `coulomb`.
     """
-    if wanted != "auto":
-        return FrictionChoice(dataclasses.replace(model, friction=wanted), "")
-    if len(logs) < LEAST_LOGS:
+    if friction != "auto":
+        return FrictionChoice(dataclasses.replace(model, friction=friction), "")
+    if len(logs) < MIN_LOGS:
         return FrictionChoice(
             model,
-            "friction: coulomb, because auto compares the errors on logs left out: it needs"
-            f" {LEAST_LOGS} logs that move, and there {'is' if len(logs) == 1 else 'are'}"
-            f" {len(logs)}. Name more, or choose --friction load, stribeck or both",
+            f"friction: coulomb, because auto needs {MIN_LOGS} logs that move, and there"
+            f" {'is' if len(logs) == 1 else 'are'} {len(logs)}: it compares the errors on logs left"
+            " out. Add logs, or choose --friction load, stribeck or both",
         )
     errors = {"coulomb": _left_out_errors(model, logs, on_step)}
     best = model
-    for friction in ("load", "stribeck", "both"):
-        richer = dataclasses.replace(model, friction=friction)
-        errors[friction] = _left_out_errors(richer, logs, on_step)
-        gained = errors[best.friction] - errors[friction]
-        if gained.mean() > 2.0 * gained.std(ddof=1) / np.sqrt(len(gained)):
+    for kind in ("load", "stribeck", "both"):
+        richer = dataclasses.replace(model, friction=kind)
+        errors[kind] = _left_out_errors(richer, logs, on_step)
+        reductions = errors[best.friction] - errors[kind]
+        if reductions.mean() > 2.0 * reductions.std(ddof=1) / np.sqrt(len(reductions)):
             best = richer
-    means = ", ".join(f"{friction} {error.mean():.3g}" for friction, error in errors.items())
+    means = ", ".join(f"{name} {error.mean():.3g}" for name, error in errors.items())
     reason = (
         f"friction: {best.friction}, by the mean errors on the logs left out"
         f" [{SIGNALS[model.output]}]: {means}; a richer one is taken if it is better by two"
@@ -67,21 +69,24 @@ def choose_friction(
 def _left_out_errors(
     model: ShaftModel, logs: Sequence[Log], on_step: Callable[[], None]
 ) -> np.ndarray:
-    """Return the mean absolute error on each log of the fit to all others, from that to all, shape (n,)."""
+    """Return the mean absolute error on each log of a fit to all other logs, shape (n,)."""
     segments = model.segments(logs)
-    model, starts = model.begun(segments)
-    whole, errors = search(model, segments, starts[:2])[0].values, []
-    for place, log in enumerate(logs):
-        found = predict(
-            refit(model, model.segments([*logs[:place], *logs[place + 1 :]]), whole, 12), log
+    model, starts = model.initial_guess(segments)
+    # The fit to all logs is the start of each other fit, which then needs few evaluations.
+    values, errors = fit_from_starts(model, segments, starts[:2])[0].values, []
+    for index, log in enumerate(logs):
+        prediction = predict(
+            optimize(model, model.segments([*logs[:index], *logs[index + 1 :]]), values, 12), log
         )
-        errors.append(found.open_loop if found.closed_loop is None else found.closed_loop)
+        errors.append(
+            prediction.open_loop if prediction.closed_loop is None else prediction.closed_loop
+        )
         on_step()
     return np.array(errors)
 
 
 def load_hint(fit: Fit) -> str | None:
-    """Return advice to fit an efficiency if that explains the same logs clearly better; None: it does not."""
+    """Return the advice to fit an efficiency if that explains the same logs clearly better."""
     model = fit.model
     if model.friction not in _LOADED or "gear_efficiency" in (*model.known, *model.names):
         return None
@@ -89,13 +94,13 @@ def load_hint(fit: Fit) -> str | None:
         model, names=(*model.names, "gear_efficiency"), scales=np.append(model.scales, 0.1)
     )
     known = model.defaults["gear_efficiency"]
-    richer = refit(loaded, fit.segments, np.append(fit.values, min(known, 0.9)), 20, fit.scale)
-    costs, before = richer.costs(fit.scale), fit.costs(fit.scale)
-    left = max(costs.sum() / before.sum(), float(np.median(costs / before)))
-    if abs(richer.values[-1] - known) <= _APART or left > _HINTED:
+    richer = optimize(loaded, fit.segments, np.append(fit.values, min(known, 0.9)), 20, fit.scale)
+    costs, reference = richer.costs(fit.scale), fit.costs(fit.scale)
+    ratio = max(costs.sum() / reference.sum(), float(np.median(costs / reference)))
+    if abs(richer.values[-1] - known) <= _MIN_DIFFERENCE or ratio > _MAX_COST_RATIO:
         return None
     return (
         f"friction grows with the load: an efficiency of {richer.values[-1]:.2g} instead of"
-        f" {known:.2g} would take {1.0 - left:.0%} off what is not explained; fit it by --friction"
+        f" {known:.2g} would reduce the unexplained part by {1.0 - ratio:.0%}; fit it by --friction"
         f" {_LOADED[model.friction]}"
     )

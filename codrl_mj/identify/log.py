@@ -1,4 +1,4 @@
-"""A bench log in SI units, what its sensors and its shaft do, and the segments that it is cut into."""
+"""Bench logs in SI units, properties of their sensors and motion, and segments of them."""
 
 import dataclasses
 import itertools
@@ -17,40 +17,37 @@ SIGNALS = {
     "bus": "V",  # of the supply
     "duty": "",  # share of the bus voltage
     "temperature": "degC",
-    "command": None,  # in any unit: what a controller was asked for
+    "command": None,  # setpoint of a controller, in any unit
 }
-"""What a log may hold -> its SI unit; None: any."""
-LONGEST_STEP = 5.0  # a longer step, in median steps, is a gap, across which nothing is simulated
-_ROUND = {
-    *(tenths / 10 for tenths in range(10, 100)),
-    1.25,
-    2.25,
-}  # leading digits of a step that a file rounds to
-_MOST_LEVELS = 1_000_000  # of a converter: what has more is as good as continuous
+"""Signal of a log -> its SI unit; None: any."""
+GAP_STEPS = 5.0  # a longer step, in median steps, is a gap, across which nothing is simulated
+_ROUND_DIGITS = {*(tenths / 10 for tenths in range(10, 100)), 1.25, 2.25}
+"""Leading digits of a step that probably comes from the rounding of a file."""
+_MAX_LEVELS = 1_000_000  # levels of a converter; a signal with more counts as continuous
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """What is noteworthy about a log."""
+    """A fault or a remarkable property of a log."""
 
     severity: str
-    """`error`: what is fitted would be wrong; `warning`: it may be; `info`: good to know."""
+    """`error`: fitted values would be wrong; `warning`: they may be wrong; `info`: good to know."""
     check: str
     """Name of the check."""
     row: int | None
     """Row of the file, the first one being 1, headers not counted; None: the whole log."""
     message: str
-    """What, with how much."""
+    """Description of the fault, with its size."""
     remedy: str
-    """What to do about it; empty where nothing is to be done."""
+    """Advice; empty if nothing needs to be done."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Log:
-    """A bench log in SI units; times increase strictly, gaps and dropped rows stay as they are.
+    """A bench log in SI units; times increase strictly, gaps and dropped rows are allowed.
 
-    Signals are at the motor's output as logged; positive voltage, current, torque and speed point
-    the same way.
+    Signals are those of the motor's output; positive voltage, current, torque and speed have the
+    same direction.
 
     Raises:
         ValueError: a signal is unknown, has another shape than the times or a value that is not
@@ -58,24 +55,24 @@ class Log:
     """
 
     name: str
-    """The file's stem, for messages."""
+    """Stem of the file's name, for messages."""
     time: np.ndarray
-    """[s], shape (n,)."""
+    """Times [s], shape (n,)."""
     signals: Mapping[str, np.ndarray]
-    """Each of shape (n,), in the units of `SIGNALS`."""
+    """Signals by name, each of shape (n,), in the units of `SIGNALS`."""
     resolution: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Signal -> step of its quantisation, found or declared; 0 where there is none."""
+    """Signal -> step of its quantization, detected or declared; 0: none."""
     mean_voltage: bool = False
-    """Whether voltage[k] is the mean from time[k] to time[k+1]; else it is what holds from time[k] to the next row."""
+    """True if voltage[k] is the mean from time[k] to time[k+1]; else it is held from time[k] on."""
     constants: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Numbers that the file states for the whole log, such as `kp` or `mass`."""
     rows: np.ndarray | None = None
-    """Row of the file that each row was, shape (n,), the first being 1; None: all of them, in order."""
+    """Row of the file for each row, shape (n,), the first being 1; None: all rows, in order."""
     findings: tuple[Finding, ...] = ()
-    """What reading it found."""
+    """Findings from reading the file."""
 
     def __post_init__(self) -> None:
-        """Validate."""
+        """Validate all fields."""
         shape = self.time.shape
         if len(shape) != 1 or shape[0] < 2:
             raise ValueError(
@@ -107,11 +104,11 @@ class Log:
             )
 
     def has(self, *names: str) -> bool:
-        """Whether it holds all of these signals."""
+        """Return True if all of these signals were logged."""
         return all(name in self.signals for name in names)
 
-    def part(self, rows: slice) -> "Log":
-        """Some of its rows."""
+    def slice_rows(self, rows: slice) -> "Log":
+        """Return a log of some of the rows."""
         signals = {name: values[rows] for name, values in self.signals.items()}
         return dataclasses.replace(
             self, time=self.time[rows], signals=signals, rows=self.row_numbers[rows]
@@ -119,110 +116,123 @@ class Log:
 
     @property
     def row_numbers(self) -> np.ndarray:
-        """Row of the file that each row was, shape (n,)."""
+        """Row of the file for each row, shape (n,), the first being 1."""
         return np.arange(1, len(self.time) + 1) if self.rows is None else self.rows
 
     @property
     def step(self) -> float:
-        """Its usual step of time [s], the median."""
+        """Median time step [s]."""
         return float(np.median(np.diff(self.time)))
 
 
-def usable(log: Log) -> list[slice]:
-    """The stretches of a log without gaps, through which may be simulated by the time stamps; each of two rows or more.
+def gapless_stretches(log: Log) -> list[slice]:
+    """Return the stretches of a log without gaps, each of at least two rows.
 
-    What is dropped within one has to be seen by the stamps: its steps differ.
+    A simulation may run through a stretch by its time stamps. Its steps differ where single rows
+    were dropped.
     """
-    gaps = np.flatnonzero(np.diff(log.time) > LONGEST_STEP * log.step) + 1
+    gaps = np.flatnonzero(np.diff(log.time) > GAP_STEPS * log.step) + 1
     edges = [0, *map(int, gaps), len(log.time)]
     return [slice(start, end) for start, end in itertools.pairwise(edges) if end - start >= 2]
 
 
 def find_resolution(values: np.ndarray) -> float:
-    """The step of a signal's quantisation; 0 where its values do not lie on a grid."""
+    """Return the step of a signal's quantization; 0 if its values do not lie on a grid."""
     levels = np.unique(values)
     spread = float(levels[-1] - levels[0])
     steps = np.diff(levels)
     steps = steps[steps > 1e-9 * spread]
-    if steps.size < 2:  # what has one or two values says nothing
+    # One or two levels do not show whether they lie on a grid.
+    if steps.size < 2:
         return 0.0
-    least = float(steps.min())
-    least = float(steps[steps < 1.2 * least].mean())  # rounding of the file itself
-    for parts in (1, 2, 3):  # neighbouring levels need not occur
-        count = round(parts * spread / least)
+    # The file may round values, which makes equal steps slightly different: their mean is better.
+    min_step = float(steps.min())
+    min_step = float(steps[steps < 1.2 * min_step].mean())
+    # Neighboring levels may be missing, so that the smallest step may be two or three of the grid.
+    for parts in (1, 2, 3):
+        count = round(parts * spread / min_step)
         grid = (levels - levels[0]) * (count / spread)
-        if count < _MOST_LEVELS and float(np.abs(grid - np.round(grid)).max()) < 0.1:
+        if count < _MAX_LEVELS and float(np.abs(grid - np.round(grid)).max()) < 0.1:
             return spread / count
     return 0.0
 
 
-def turn_jumps(values: np.ndarray, period: float) -> np.ndarray:
-    """Return the rows after which an angle jumps by a turn, `period` in its unit; none if it mostly moves that fast."""
+def find_turn_jumps(values: np.ndarray, period: float) -> np.ndarray:
+    """Return the rows after which an angle jumps by a turn, which is `period` in its unit.
+
+    There are none if many of the steps are as large as a part of a turn: then the shaft is fast.
+    """
     steps = np.abs(np.diff(values))
     jumps = np.flatnonzero(np.abs(steps - period) < 0.1 * period)
     return jumps if jumps.size and np.mean(steps > 0.25 * period) <= 0.2 else jumps[:0]
 
 
 def counts_per_turn(step: float, period: float) -> int | None:
-    """Return the counts of an encoder whose step is a part of a turn; None if it is as likely a file's rounding."""
-    if step <= 0.0 or round(step / 10.0 ** math.floor(math.log10(step)), 5) in _ROUND:
+    """Return an encoder's counts per turn; None if its step may as well be a file's rounding."""
+    if step <= 0.0 or round(step / 10.0 ** math.floor(math.log10(step)), 5) in _ROUND_DIGITS:
         return None
     count = round(period / step)
+    # Encoders have a multiple of 100 counts, or a power of two.
     is_usual = count >= 100 and (count % 100 == 0 or count & (count - 1) == 0)
     return count if is_usual and abs(period / step - count) < 0.02 else None
 
 
-def is_supply(volts: np.ndarray, others: Sequence[np.ndarray]) -> bool:
-    """Return True if a voltage hardly changes although the motor is driven or turns both ways, as only a supply's."""
+def is_supply_voltage(volts: np.ndarray, responses: Sequence[np.ndarray]) -> bool:
+    """Return True if a voltage is the supply's: it hardly changes although the motor reverses."""
     reverses = any(
-        one.size and float(one.min()) < -0.2 * float(np.abs(one).max()) < 0.0 < one.max()
-        for one in others
+        values.size
+        and float(values.min()) < -0.2 * float(np.abs(values).max()) < 0.0 < values.max()
+        for values in responses
     )
     return bool(volts.size) and 0.0 < float(volts.max()) <= 1.3 * float(volts.min()) and reverses
 
 
-# -- whether a fit can use it ---------------------------------------------------------------------------------------
+# -- requirements of a fit ------------------------------------------------------------------------
 
-INPUTS = (
-    "torque",
-    "current",
-    "voltage",
-)  # what drives the shaft: the nearest to it that all logs that move have
-OUTPUTS = "position", "velocity"  # what a simulation is compared with
-MAX_STEP = 0.05  # rows that are farther apart [s] say too little within the time that is predicted
-MIN_ROWS = (
-    20  # of the longest stretch without a gap: a shaft has up to five parameters and two states
-)
-# of that stretch [s], if the shaft moves: the first 0.03 s only tell the state it begins from
+INPUTS = ("torque", "current", "voltage")
+"""Possible inputs of a shaft, the nearest to it first."""
+OUTPUTS = "position", "velocity"
+"""Signals that a simulated shaft is compared with, the preferred one first."""
+# Rows that are farther apart hold too little information within the predicted time.
+MAX_STEP = 0.05
+"""Longest usual time step of a log [s]."""
+# A shaft has up to five parameters and two states.
+MIN_ROWS = 20
+"""Smallest number of rows in the longest stretch without a gap."""
+# The first 0.03 s determine only the initial state.
 MIN_DURATION = 0.04
+"""Shortest duration [s] of that stretch, if the shaft moves."""
 
 
-class Usage(NamedTuple):
-    """The part of a fit that each of some logs is for."""
+class LogRoles(NamedTuple):
+    """The logs that determine each part of a motor, and the signals of the shaft."""
 
-    electrical: list[Log]  # tell the winding
-    moving: list[Log]  # tell the shaft
-    driven_by: (
-        str | None
-    )  # the shaft's input in the fit; None if the moving logs have none in common
-    output: str  # the motion that the fit compares; empty if the moving logs have none in common
+    electrical: list[Log]  # logs that determine the winding
+    moving: list[Log]  # logs that determine the shaft
+    # The input of the shaft in the fit; None if the moving logs have no input in common.
+    driven_by: str | None
+    # The motion that the fit compares; empty if the moving logs have no motion in common.
+    output: str
 
 
-def usage(logs: Sequence[Log]) -> Usage:
-    """Return which logs tell the winding and which the shaft, by which input and output."""
-    moving = [log for log in logs if moves(log)]
+def assign_logs(logs: Sequence[Log]) -> LogRoles:
+    """Assign logs to the winding and to the shaft, and choose the shaft's input and output."""
+    moving = [log for log in logs if has_motion(log)]
     driven_by, output = (
         next((name for name in names if moving and all(log.has(name) for log in moving)), None)
         for names in (INPUTS, OUTPUTS)
     )
-    return Usage(
+    return LogRoles(
         [log for log in logs if log.has("voltage", "current")], moving, driven_by, output or ""
     )
 
 
-def obstacle(logs: Sequence[Log]) -> Finding | None:
-    """Return the reason why logs cannot be fitted together, as `check` and `identify` report it; None if they can."""
-    electrical, moving, driven_by, _ = usage(logs)
+def find_obstacle(logs: Sequence[Log]) -> Finding | None:
+    """Return the reason for which logs cannot be fitted together; None if they can.
+
+    `check` reports it as a finding, `identify` as an error.
+    """
+    electrical, moving, driven_by, _ = assign_logs(logs)
     if not electrical and driven_by is None:
         return _no_signals(logs, bool(moving))
     for log in moving:
@@ -232,13 +242,15 @@ def obstacle(logs: Sequence[Log]) -> Finding | None:
             return Finding("error", "rows", None, text, remedy)
     for log in [*electrical, *moving]:
         rows = max(
-            usable(log), key=lambda stretch: stretch.stop - stretch.start, default=slice(0, 1)
+            gapless_stretches(log),
+            key=lambda stretch: stretch.stop - stretch.start,
+            default=slice(0, 1),
         )
         count, seconds = (
             rows.stop - rows.start,
             float(log.time[rows.stop - 1] - log.time[rows.start]),
         )
-        is_moving = any(log is one for one in moving)
+        is_moving = any(log is moving_log for moving_log in moving)
         if count < MIN_ROWS or (is_moving and seconds < MIN_DURATION):
             text = (
                 f"log {log.name}: {count} rows in {seconds:.3g} s without a gap, must be at least"
@@ -250,9 +262,10 @@ def obstacle(logs: Sequence[Log]) -> Finding | None:
 
 
 def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
-    """Return which signals are missing for a fit, and how to get them."""
+    """Return a finding that names the signals that a fit lacks, and how to get them."""
     signals = set().union(*(log.signals for log in logs))
     if not signals & {*INPUTS}:
+        # The command of a servo is not an input of the shaft; its duty is one.
         lacking, remedy = "no voltage, current or torque", "log one of them"
         if "duty" in signals:
             remedy = (
@@ -267,103 +280,127 @@ def _no_signals(logs: Sequence[Log], is_moving: bool) -> Finding:
     elif is_moving:
         lacking, remedy = (
             "no torque, current or voltage in all logs that move",
-            "fit alike logs together",
+            "fit logs with the same signals together",
         )
     else:
         lacking, remedy = (
             "no position or velocity that moves",
             "log the motion, or both voltage and current",
         )
-    who, them = ("this log has", "it") if len(logs) == 1 else ("these logs have", "them")
+    subject, pronoun = ("this log has", "it") if len(logs) == 1 else ("these logs have", "them")
     return Finding(
-        "error", "signals", None, f"{who} {lacking}: nothing can be identified from {them}", remedy
+        "error",
+        "signals",
+        None,
+        f"{subject} {lacking}: nothing can be identified from {pronoun}",
+        remedy,
     )
 
 
-# -- cut into segments, each simulated from an initial state of its own ----------------------------------------------
+# -- segments, each simulated from its own initial state ------------------------------------------
 
-SEGMENT = 0.5
-"""Time [s] that a shaft is simulated for at once: longer ones meet friction that no model has, and several minima."""
-# shortest stretch [s] of a log that is resampled as a whole: residuals within it belong together
-BLOCK = 1.0
+# A longer simulation accumulates the effect of friction that no model describes, and its cost has
+# several minima.
+SEGMENT_DURATION = 0.5
+"""Duration [s] of the segments of a shaft."""
+# Residuals within a block are correlated: resampling single rows would make intervals too narrow.
+BLOCK_DURATION = 1.0
+"""Shortest stretch [s] of a log that is resampled as a whole."""
+# The shaft is slower than the winding. Combined rows have their mean input and first position.
 SHAFT_STEP = 5e-4
-"""Rows that are nearer [s] are taken together for a shaft, which is slower: their mean input, their first position."""
-# a row is a spike where it sticks out by more than so many times what nine of ten rows do at most
-SPIKE = 50.0
-WINDOW = 4e-3
-"""Time [s] that positions are smoothed over: short beside what a shaft does, long beside an encoder's steps."""
-STILL = 10.0  # a shaft that moves by no more than so many steps of its encoder is locked
+"""Shortest time step [s] of a shaft's segments; rows that are closer are combined."""
+SPIKE_FACTOR = 50.0
+"""Deviation of a spike from its neighbors, over the 90th percentile of all rows."""
+# The window is short compared with the motion of a shaft, and long compared with the steps of an
+# encoder.
+SMOOTHING_WINDOW = 4e-3
+"""Duration [s] that positions are smoothed over."""
+MIN_MOTION_STEPS = 10.0
+"""Steps of its encoder that a shaft has to move by; otherwise it counts as locked."""
 
 
 class Segment(NamedTuple):
-    """Rows that are simulated at once."""
+    """Rows of a log that are simulated from one initial state."""
 
-    log: int  # place of its log among those fitted
-    block: int  # number of the stretch that it is resampled with, unique over all logs
-    rows: slice  # of its log
+    log: int  # index of the log among the fitted logs
+    block: int  # number of the block that it is resampled with, unique over all logs
+    rows: slice  # of the log
     times: np.ndarray  # [s], shape (m,)
-    inputs: np.ndarray  # what drives it, at the times, shape (m,)
-    slopes: np.ndarray  # how that changes till the next row [1/s], shape (m,)
-    speeds: np.ndarray  # mean speed [rad/s] till the next row, shape (m,): of a winding
-    measured: np.ndarray  # what a simulation is compared with, shape (m,)
+    inputs: np.ndarray  # input at the times, shape (m,)
+    slopes: np.ndarray  # rate of change of the input until the next row [1/s], shape (m,)
+    speeds: np.ndarray  # mean speed [rad/s] until the next row, shape (m,); used by a winding
+    measured: np.ndarray  # output that a simulation is compared with, shape (m,)
     deviation: float  # standard deviation of the sensor, in the unit of `measured`
-    state: np.ndarray  # a guess of the state at the first row
+    state: np.ndarray  # initial guess of the state at the first row
 
     def first(self, count: int) -> "Segment":
-        """Its first rows."""
-        several = ("times", "inputs", "slopes", "speeds", "measured")
-        return self._replace(**{name: getattr(self, name)[:count] for name in several})
+        """Return a segment of the first rows."""
+        arrays = ("times", "inputs", "slopes", "speeds", "measured")
+        return self._replace(**{name: getattr(self, name)[:count] for name in arrays})
 
 
-def shifted(log: Log, name: str, rows: float) -> Log:
-    """A log whose signal is as it was some rows before (or, negative, after), the ends repeated; halves lie between."""
-    places, values = np.arange(len(log.time)), log.signals[name]
-    return log if rows == 0 else replaced(log, name, np.interp(places - rows, places, values))
+def shift_signal(log: Log, name: str, rows: float) -> Log:
+    """Return a log with a signal delayed by a number of rows, which may be negative or fractional.
+
+    Fractions are interpolated linearly; the value at an end of the log is repeated.
+    """
+    indices, values = np.arange(len(log.time)), log.signals[name]
+    return (
+        log if rows == 0 else replace_signal(log, name, np.interp(indices - rows, indices, values))
+    )
 
 
-def replaced(log: Log, name: str, values: np.ndarray) -> Log:
-    """A log with another signal, shape (n,)."""
+def replace_signal(log: Log, name: str, values: np.ndarray) -> Log:
+    """Return a log with other values of a signal, shape (n,)."""
     return dataclasses.replace(log, signals={**log.signals, name: values})
 
 
-def without_spikes(values: np.ndarray) -> np.ndarray:
-    """A sampled signal, rows that stick out of both their neighbours by far more than is usual in place of the nearer.
+def remove_spikes(values: np.ndarray) -> np.ndarray:
+    """Return a signal whose spikes of single rows are replaced by the nearer neighbor.
 
-    Residuals of an output bear outliers, by the robust loss; what drives a simulation has to be
-    free of them.
+    The robust loss tolerates outliers of an output, but the input of a simulation must not have
+    any.
     """
-    middle = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
-    off = np.abs(values[1:-1] - middle)
-    usual = max(float(np.percentile(off, 90.0)), 1e-3 * float(np.std(values)))
-    found = values.copy()
-    found[1:-1][off > SPIKE * usual] = middle[off > SPIKE * usual]
-    return found
+    # The median of three rows is the row itself, unless it is above or below both neighbors.
+    median = np.median(np.stack([values[:-2], values[1:-1], values[2:]]), axis=0)
+    deviations = np.abs(values[1:-1] - median)
+    usual = max(float(np.percentile(deviations, 90.0)), 1e-3 * float(np.std(values)))
+    cleaned = values.copy()
+    cleaned[1:-1][deviations > SPIKE_FACTOR * usual] = median[deviations > SPIKE_FACTOR * usual]
+    return cleaned
 
 
 def sensor_deviation(log: Log, name: str) -> float:
-    """Standard deviation of a signal's sensor: of its quantisation, or of what no smooth motion does within 4 rows.
+    """Return the standard deviation of a signal's sensor, from its noise or its quantization.
 
-    Where the latter is within a step of the quantisation it is that of the quantisation.
+    The noise is the part that no smooth motion has within four rows. If it is less than a step of
+    the quantization, only the quantization counts.
     """
     values = log.signals[name]
     step = log.resolution.get(name, 0.0)
+    # A uniform error within one step has the standard deviation step/sqrt(12).
     if len(values) < 8:
         return max(step / math.sqrt(12.0), 1e-9)
-    ripple = np.diff(values, n=3) / math.sqrt(20.0)  # 1, 3, 3, 1
-    noise = 1.4826 * float(np.median(np.abs(ripple)))
+    # Third differences have the coefficients 1, -3, 3, -1, whose squares add up to 20.
+    noise_samples = np.diff(values, n=3) / math.sqrt(20.0)
+    noise = 1.4826 * float(np.median(np.abs(noise_samples)))
     return max(
         noise if noise > step else step / math.sqrt(12.0), 1e-6 * float(np.ptp(values)), 1e-12
     )
 
 
-def moves(log: Log) -> bool:
-    """Whether the shaft moves, by more than an encoder flickers or a velocity is noisy; no where neither is logged."""
+def has_motion(log: Log) -> bool:
+    """Return True if the shaft moves by more than the noise of its position or velocity.
+
+    Without a position or a velocity it counts as locked.
+    """
     if log.has("position"):
         return float(np.ptp(log.signals["position"])) > max(
-            STILL * log.resolution.get("position", 0.0), 1e-4
+            MIN_MOTION_STEPS * log.resolution.get("position", 0.0), 1e-4
         )
     if not log.has("velocity"):
         return False
+    # The mean over 50 ms removes noise, but not the velocity of a moving shaft.
     velocity, rows = (
         log.signals["velocity"],
         max(min(round(0.05 / log.step), len(log.time) // 4), 1),
@@ -373,66 +410,75 @@ def moves(log: Log) -> bool:
     )
 
 
-def speeds(
-    times: np.ndarray, positions: np.ndarray, at: np.ndarray, window: float = WINDOW
+def smoothed_speeds(
+    times: np.ndarray, positions: np.ndarray, centers: np.ndarray, window: float = SMOOTHING_WINDOW
 ) -> np.ndarray:
-    """Slopes [rad/s] of straight lines through the positions within half a window of a time, at least three of them.
+    """Return the slopes [rad/s] of lines fitted to the positions in a window around each center.
 
-    In the middle of a window that is also the slope of the parabola. Near the ends the window is
-    what there is.
+    A window has at least three positions, and is cut off at the ends of the log. In its middle the
+    slope of the line is also that of a fitted parabola.
     """
     count = len(times)
-    first = np.searchsorted(times, at - 0.5 * window - 1e-9)
-    last = np.searchsorted(times, at + 0.5 * window + 1e-9)
-    near = np.clip(np.searchsorted(times, at), 1, count - 1)
-    first = np.clip(np.minimum(first, near - 1), 0, max(count - 2, 0))
-    last = np.clip(np.maximum(last, near + 1), first + 2, count)
-    shifted, moved = times - times[0], positions - positions[0]
-    sums = [
-        np.concatenate([[0.0], np.cumsum(one)])
-        for one in (shifted, moved, shifted * moved, shifted**2)
+    first = np.searchsorted(times, centers - 0.5 * window - 1e-9)
+    last = np.searchsorted(times, centers + 0.5 * window + 1e-9)
+    nearest = np.clip(np.searchsorted(times, centers), 1, count - 1)
+    first = np.clip(np.minimum(first, nearest - 1), 0, max(count - 2, 0))
+    last = np.clip(np.maximum(last, nearest + 1), first + 2, count)
+    # Differences of cumulative sums give the sums of all windows at once. Offsets from the first
+    # row keep the sums small, and their differences accurate.
+    offsets, turns = times - times[0], positions - positions[0]
+    cumulative = [
+        np.concatenate([[0.0], np.cumsum(values)])
+        for values in (offsets, turns, offsets * turns, offsets**2)
     ]
-    t, q, tq, tt = (one[last] - one[first] for one in sums)
+    t, q, tq, tt = (values[last] - values[first] for values in cumulative)
     number = last - first
     return (number * tq - t * q) / (number * tt - t * t)
 
 
-def cut(log: Log, longest: float) -> list[slice]:
-    """Rows of segments of a length [s], where there are no gaps; the last of a stretch is up to half longer."""
-    found = []
-    for stretch in usable(log):
+def cut_segments(log: Log, duration: float) -> list[slice]:
+    """Return the rows of segments of about a duration [s], none of which has a gap.
+
+    Each stretch is divided evenly, so that a segment may be up to half longer than the duration.
+    """
+    segments = []
+    for stretch in gapless_stretches(log):
         begin, end = log.time[stretch.start], log.time[stretch.stop - 1]
-        count = max(round((end - begin) / longest), 1)
+        count = max(round((end - begin) / duration), 1)
         edges = (
             np.searchsorted(log.time[stretch], np.linspace(begin, end, count + 1)[:-1])
             + stretch.start
         )
         edges = [*map(int, np.unique(edges)), stretch.stop]
-        found += [slice(a, b) for a, b in itertools.pairwise(edges) if b - a >= 4]
-    return found
+        segments += [slice(a, b) for a, b in itertools.pairwise(edges) if b - a >= 4]
+    return segments
 
 
 def initial_state(log: Log, rows: slice) -> np.ndarray:
-    """Position and speed at the first row, from the rows around it: a parabola within 15 ms, or five rows."""
+    """Return the position and the speed at the first row, from a parabola around it.
+
+    The parabola is fitted to the rows within 15 ms, or to five rows.
+    """
     time = log.time[rows.start]
-    stretch = next(one for one in usable(log) if one.start <= rows.start < one.stop)
+    stretch = next(part for part in gapless_stretches(log) if part.start <= rows.start < part.stop)
     first = max(min(int(np.searchsorted(log.time, time - 0.015)), rows.start - 2), stretch.start)
     last = min(max(int(np.searchsorted(log.time, time + 0.015)), rows.start + 3), stretch.stop)
-    near = slice(first, last)
+    nearby = slice(first, last)
     degree = min(2, last - first - 1)
-    fitted = np.polynomial.polynomial.polyfit(
-        log.time[near] - time, log.signals["position"][near], degree
+    coefficients = np.polynomial.polynomial.polyfit(
+        log.time[nearby] - time, log.signals["position"][nearby], degree
     )
-    return np.array([fitted[0], fitted[1]])
+    return np.array([coefficients[0], coefficients[1]])
 
 
-def halved(log: Log) -> Log:
-    """Every second row of a log; a mean voltage becomes that of both."""
-    count = len(log.time) - (len(log.time) + 1) % 2  # to begin and end with a row that is kept
-    kept = log.part(slice(0, count, 2))
+def halve_rate(log: Log) -> Log:
+    """Return every second row of a log; a mean voltage becomes the mean over both rows."""
+    # An odd number of rows begins and ends with a row that stays.
+    count = len(log.time) - (len(log.time) + 1) % 2
+    half = log.slice_rows(slice(0, count, 2))
     if not (log.mean_voltage and log.has("voltage")):
-        return kept
+        return half
     steps, volts = np.diff(log.time[:count]), log.signals["voltage"][:count]
-    energy = volts[:-1] * steps
-    mean = (energy[::2] + energy[1::2]) / (steps[::2] + steps[1::2])
-    return replaced(kept, "voltage", np.append(mean, volts[-1]))
+    integrals = volts[:-1] * steps
+    mean = (integrals[::2] + integrals[1::2]) / (steps[::2] + steps[1::2])
+    return replace_signal(half, "voltage", np.append(mean, volts[-1]))

@@ -1,4 +1,4 @@
-"""A winding and a shaft: segments of their logs, models that the estimator fits, starts that regression gives."""
+"""Models of a winding and a shaft for the estimator, with initial guesses from regressions."""
 
 import dataclasses
 import functools
@@ -8,68 +8,74 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Model, Simulate, settled_state
+from codrl_mj.identify.estimate import Model, Simulate, best_initial_state
 from codrl_mj.identify.log import (
-    BLOCK,
-    SEGMENT,
+    BLOCK_DURATION,
+    SEGMENT_DURATION,
     SHAFT_STEP,
     Log,
     Segment,
-    cut,
+    cut_segments,
+    gapless_stretches,
+    has_motion,
     initial_state,
-    moves,
+    remove_spikes,
     sensor_deviation,
-    shifted,
-    speeds,
-    usable,
-    without_spikes,
+    shift_signal,
+    smoothed_speeds,
 )
 from codrl_mj.identify.parameters import ELECTRICAL, FRICTION, OF_FRICTION, OF_RIG, PARAMETERS
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class WindingModel(Model):
-    """L di/dt = u - R i - kE n w, exactly over each interval of a held voltage; the speed is its mean there."""
+    """The winding: L di/dt = u - R i - kE n w, exact at a constant voltage and the mean speed."""
 
     driven_by: str = "voltage"
     output: str = "current"
     shaft: Any = None
-    """The `Fit` of a shaft under the current, where it is known: what an encoder does not see between its rows."""
+    """`Fit` of the shaft under the current, which gives the speed between the rows; None: none."""
 
     steps: ClassVar = np.array([1e-3])
 
-    def at(self, values: np.ndarray) -> Simulate:
-        """Of currents [A]."""
-        from codrl_mj.identify.simulation import winding
+    def simulator(self, values: np.ndarray) -> Simulate:
+        """Return a function that simulates the currents [A] of a segment with parameters (p,)."""
+        from codrl_mj.identify.simulation import simulate_winding
 
-        number = self.all_values(values)
-        resistance, inductance = number["resistance"], number["inductance"]
-        constant = number.get("back_emf_constant", 0.0) * number["gear_ratio"]
-        return lambda one, state: winding(
-            one.times, one.inputs, one.speeds, state[0], resistance, inductance, constant
+        parameters = self.all_values(values)
+        resistance, inductance = parameters["resistance"], parameters["inductance"]
+        constant = parameters.get("back_emf_constant", 0.0) * parameters["gear_ratio"]
+        return lambda segment, state: simulate_winding(
+            segment.times,
+            segment.inputs,
+            segment.speeds,
+            state[0],
+            resistance,
+            inductance,
+            constant,
         )
 
     def segments(
-        self, logs: Sequence[Log], turned: Sequence[np.ndarray] | None = None
+        self, logs: Sequence[Log], speeds: Sequence[np.ndarray] | None = None
     ) -> list[Segment]:
-        """The logs, cut into a block each, in which voltage and speed drive the current; speeds may be given."""
-        made: list[Segment] = []
-        for place, log in enumerate(logs):
+        """Cut logs into segments of a block each; `speeds` [rad/s] replace those of the logs."""
+        segments: list[Segment] = []
+        for index, log in enumerate(logs):
             volts, deviation = log.signals["voltage"], sensor_deviation(log, "current")
-            speed = self._turning(log) if turned is None else turned[place]
-            for rows in cut(log, BLOCK):
+            speed = self._mean_speeds(log) if speeds is None else speeds[index]
+            for rows in cut_segments(log, BLOCK_DURATION):
                 times, current = log.time[rows], log.signals["current"][rows]
                 drive = times, volts[rows], np.zeros(len(times)), speed[rows]
-                made.append(
-                    Segment(place, len(made), rows, *drive, current, deviation, current[:1])
+                segments.append(
+                    Segment(index, len(segments), rows, *drive, current, deviation, current[:1])
                 )
-        return made
+        return segments
 
-    def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
-        """With starts by regressions of the voltage's integral over windows of several lengths.
+    def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
+        """Return the model with its free parameters, and guesses from regressions.
 
-        The integral over a window is R times that of the current, L times its change and kE times
-        the turn.
+        The integral of the voltage over a window is R times the integral of the current, plus L
+        times its change, plus kE times the angle turned. Each guess has another length of window.
         """
         moving = any(np.any(segment.speeds) for segment in segments)
         free = tuple(
@@ -77,27 +83,29 @@ class WindingModel(Model):
             for name in ELECTRICAL
             if name not in self.known and (moving or name != "back_emf_constant")
         )
-        given = {**self.defaults, "back_emf_constant": 0.0, **self.known}
+        fixed = {**self.defaults, "back_emf_constant": 0.0, **self.known}
         starts = []
-        for count in (2, 8, 32):  # rows of a window
+        # Short windows show the inductance, long ones average the noise.
+        for count in (2, 8, 32):
             rows = []
-            for one in segments:
-                steps, current, turns = (
-                    np.diff(one.times),
-                    one.measured,
-                    one.speeds[:-1] * given["gear_ratio"],
+            for segment in segments:
+                steps, current, speeds = (
+                    np.diff(segment.times),
+                    segment.measured,
+                    segment.speeds[:-1] * fixed["gear_ratio"],
                 )
                 edges = np.arange(0, len(current), min(count, len(current) - 1))
-                rates = 0.5 * (current[1:] + current[:-1]), turns, one.inputs[:-1]
+                rates = 0.5 * (current[1:] + current[:-1]), speeds, segment.inputs[:-1]
                 charge, turn, flux = (
                     np.diff(np.append(0.0, np.cumsum(rate * steps))[edges]) for rate in rates
                 )
                 rows.append(np.stack([charge, np.diff(current[edges]), turn, flux], axis=1))
             table = np.concatenate(rows)
-            starts.append(_regressed(table[:, :3], table[:, 3], ELECTRICAL, free, given))
+            starts.append(_regress_free(table[:, :3], table[:, 3], ELECTRICAL, free, fixed))
         magnitudes = np.abs(np.median(starts, axis=0))
-        volts = np.concatenate([one.inputs for one in segments])
-        amperes = np.concatenate([one.measured for one in segments])
+        volts = np.concatenate([segment.inputs for segment in segments])
+        amperes = np.concatenate([segment.measured for segment in segments])
+        # A regression may give values near 0 or below: rough magnitudes replace them.
         fallback = {
             "resistance": np.std(volts) / max(np.std(amperes), 1e-9) + 1e-6,
             "inductance": 1e-4,
@@ -105,125 +113,134 @@ class WindingModel(Model):
         scales = np.maximum(
             magnitudes, 0.03 * np.array([fallback.get(name, 1e-3) for name in free])
         )
-        starts = [np.where(one > 0.02 * scales, one, scales) for one in starts]
+        starts = [np.where(start > 0.02 * scales, start, scales) for start in starts]
         return dataclasses.replace(self, names=free, scales=scales), starts
 
-    def _turning(self, log: Log) -> np.ndarray:
-        """Mean speeds till the next row, (n,), 0 if locked: of smoothed positions, or what the shaft does and leaves.
+    def _mean_speeds(self, log: Log) -> np.ndarray:
+        """Return the mean speeds until the next row, shape (n,), 0 if locked.
 
-        A smoothed speed lags behind a light rotor, and the back-EMF that it misses would be taken
-        for inductance.
+        They are those of smoothed positions. With a fitted shaft they are those of its simulation,
+        plus those of the smoothed residuals.
         """
-        found, part = np.zeros(len(log.time)), self.shaft
-        for rows in usable(log) if moves(log) else ():
+        speeds, shaft = np.zeros(len(log.time)), self.shaft
+        for rows in gapless_stretches(log) if has_motion(log) else ():
             times = log.time[rows]
             if log.has("position"):
                 middles = times + 0.5 * np.diff(times, append=2.0 * times[-1] - times[-2])
-                found[rows] = speeds(times, log.signals["position"][rows], middles)
+                speeds[rows] = smoothed_speeds(times, log.signals["position"][rows], middles)
             else:
                 velocity = log.signals["velocity"][rows]
-                found[rows] = 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
-        if part is None or not moves(log) or not log.has("position", part.model.driven_by):
-            return found
-        model, values = dataclasses.replace(part.model, output="position"), part.values
-        simulate = model.at(values)
-        for segment in model.segments([shifted(log, model.driven_by, part.delay)], 0.0):
-            positions = simulate(segment, settled_state(model, values, segment))
-            left = log.signals["position"][segment.rows] - positions
+                speeds[rows] = 0.5 * (velocity + np.append(velocity[1:], velocity[-1]))
+        if shaft is None or not has_motion(log) or not log.has("position", shaft.model.driven_by):
+            return speeds
+        # A smoothed speed lags behind that of a light rotor, and the missing back-EMF would be
+        # attributed to the inductance. A simulated speed has no lag.
+        model, values = dataclasses.replace(shaft.model, output="position"), shaft.values
+        simulate = model.simulator(values)
+        for segment in model.segments([shift_signal(log, model.driven_by, shaft.delay)], 0.0):
+            positions = simulate(segment, best_initial_state(model, values, segment))
+            residuals = log.signals["position"][segment.rows] - positions
             middles = 0.5 * (segment.times[1:] + segment.times[:-1])
-            rest = speeds(segment.times, left, middles)
-            found[segment.rows][:-1] = np.diff(positions) / np.diff(segment.times) + rest
-        return found
+            correction = smoothed_speeds(segment.times, residuals, middles)
+            speeds[segment.rows][:-1] = np.diff(positions) / np.diff(segment.times) + correction
+        return speeds
 
 
-def _regressed(
+def _regress_free(
     columns: np.ndarray,
     target: np.ndarray,
     names: Sequence[str],
     free: Sequence[str],
-    given: Mapping[str, float],
+    fixed: Mapping[str, float],
 ) -> np.ndarray:
-    """Least squares for the free ones of the columns' factors, the others being given."""
-    rest = target - sum(
-        columns[:, place] * given[name] for place, name in enumerate(names) if name not in free
+    """Return the factors of the free columns by least squares, with the other factors fixed."""
+    remainder = target - sum(
+        columns[:, index] * fixed[name] for index, name in enumerate(names) if name not in free
     )
+    # Columns of equal norm make the cutoff of small singular values independent of units.
     matrix = columns[:, [names.index(name) for name in free]]
     norms = np.maximum(np.linalg.norm(matrix, axis=0), 1e-30)
-    found = np.linalg.lstsq(matrix / norms, rest, rcond=1e-6)[0]
-    return np.asarray(found / norms)
+    solution = np.linalg.lstsq(matrix / norms, remainder, rcond=1e-6)[0]
+    return np.asarray(solution / norms)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class ShaftModel(Model):
-    """Inertia, gravity, load and friction under a torque, a current or a voltage.
+    """The shaft: inertia, gravity, load and friction under a torque, a current or a voltage.
 
-    Under a voltage the winding is taken to be settled, and kE to be kT unless known.
+    Under a voltage the current is quasi-static, and kE equals kT unless it is known.
     """
 
     rig: str
     friction: str
-    estimated: tuple[str, ...] = ()  # what is fitted besides
-    segment: float = SEGMENT  # time [s] that is simulated at once
+    estimated: tuple[str, ...] = ()  # additional free parameters
+    segment: float = SEGMENT_DURATION  # duration [s] of a segment
 
     steps: ClassVar = np.array([1e-4, 1e-3])
 
-    def moved(self, values: np.ndarray) -> Any:
-        """What a simulation takes, a `Moved`."""
-        from codrl_mj.identify.simulation import moved
+    def shaft_parameters(self, values: np.ndarray) -> Any:
+        """Return the `ShaftParameters` of a simulation with free parameters (p,)."""
+        from codrl_mj.identify.simulation import shaft_parameters
 
-        number = self.all_values(values)
-        ratio = number["gear_ratio"]
-        gain, braking = number["torque_gain"], 0.0
+        parameters = self.all_values(values)
+        ratio = parameters["gear_ratio"]
+        gain, braking = parameters["torque_gain"], 0.0
         if self.driven_by != "torque":
-            gain = number["torque_constant"] * ratio
+            gain = parameters["torque_constant"] * ratio
         if self.driven_by == "voltage":
-            gain /= number["resistance"]
-            braking = gain * ratio * number.get("back_emf_constant", number["torque_constant"])
-        return moved(number, gain, braking)
+            gain /= parameters["resistance"]
+            braking = (
+                gain * ratio * parameters.get("back_emf_constant", parameters["torque_constant"])
+            )
+        return shaft_parameters(parameters, gain, braking)
 
-    def at(self, values: np.ndarray) -> Simulate:
-        """Of positions [rad] or speeds [rad/s]."""
-        from codrl_mj.identify.simulation import moving
+    def simulator(self, values: np.ndarray) -> Simulate:
+        """Return a function that simulates positions [rad] or speeds [rad/s] of a segment."""
+        from codrl_mj.identify.simulation import simulate_shaft
 
-        moved, output = self.moved(values), int(self.output == "velocity")
-        return lambda one, state: moving(
-            one.times, one.inputs, one.slopes, state[0], state[1], moved
-        )[output]
+        shaft, output_index = self.shaft_parameters(values), int(self.output == "velocity")
+        return lambda segment, state: simulate_shaft(
+            segment.times, segment.inputs, segment.slopes, state[0], state[1], shaft
+        )[output_index]
 
-    def segments(self, logs: Sequence[Log], shortest: float = SHAFT_STEP) -> list[Segment]:
-        """The logs, cut; rows that are nearer than `shortest` [s] are taken together."""
+    def segments(self, logs: Sequence[Log], min_step: float = SHAFT_STEP) -> list[Segment]:
+        """Cut logs into segments; rows that are closer than `min_step` [s] are combined."""
         from scipy.integrate import cumulative_trapezoid
 
-        made: list[Segment] = []
+        segments: list[Segment] = []
         driven_by, output, block = self.driven_by, self.output, -1
-        for place, log in enumerate(logs):
-            given = log.signals[driven_by]
+        for index, log in enumerate(logs):
+            inputs = log.signals[driven_by]
+            # A voltage may have peaks of one row, as a PRBS with a fast clock; a sensor's peaks are
+            # outliers.
             if driven_by != "voltage":
-                given = without_spikes(given)
+                inputs = remove_spikes(inputs)
             measured, deviation = log.signals[output], sensor_deviation(log, output)
-            # without a position a log begins at 0: it turns on from there
+            # Without a position the angle at the first row counts as 0, and later segments continue
+            # from there.
             angle = cumulative_trapezoid(measured, log.time, initial=0.0)
-            together = max(int(shortest / log.step * (1.0 + 1e-6)), 1)
-            began = -math.inf
-            for rows in cut(log, self.segment):
-                times, drive = log.time[rows], given[rows]
-                if times[0] - began >= BLOCK - 1e-3:
-                    block, began = block + 1, times[0]
+            rows_per_step = max(int(min_step / log.step * (1.0 + 1e-6)), 1)
+            block_start = -math.inf
+            for rows in cut_segments(log, self.segment):
+                times, drive = log.time[rows], inputs[rows]
+                if times[0] - block_start >= BLOCK_DURATION - 1e-3:
+                    block, block_start = block + 1, times[0]
+                # A voltage is held until the next row; a measured effort is interpolated.
                 slopes = np.zeros(len(times))
                 if driven_by != "voltage":
                     slopes[:-1] = np.diff(drive) / np.diff(times)
-                if together > 1:
+                if rows_per_step > 1:
                     means = drive[:-1] + 0.5 * slopes[:-1] * np.diff(times)
-                    edges = np.arange(0, len(times), together)
+                    edges = np.arange(0, len(times), rows_per_step)
                     totals = np.diff(np.append(0.0, np.cumsum(means * np.diff(times)))[edges])
                     drive = np.append(totals / np.diff(times[edges]), drive[-1])
-                    rows = slice(rows.start, rows.start + int(edges[-1]) + 1, together)
+                    rows = slice(rows.start, rows.start + int(edges[-1]) + 1, rows_per_step)
                     times, slopes = times[edges], np.zeros(len(edges))
                 state = np.array([angle[rows.start], measured[rows.start]])
                 state = initial_state(log, rows) if output == "position" else state
-                made.append(
+                segments.append(
                     Segment(
-                        place,
+                        index,
                         block,
                         rows,
                         times,
@@ -235,33 +252,37 @@ class ShaftModel(Model):
                         state,
                     )
                 )
-        return made
+        return segments
 
-    def begun(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
-        """With starts by a regression of the input's integral, and changes of it."""
+    def initial_guess(self, segments: Sequence[Segment]) -> tuple[Self, list[np.ndarray]]:
+        """Return the model with its free parameters, and guesses from regressions and near them."""
         driven_by, known = self.driven_by, self.known
-        wanted = [*OF_RIG[self.rig], *OF_FRICTION[self.friction], *self.estimated]
+        names = [*OF_RIG[self.rig], *OF_FRICTION[self.friction], *self.estimated]
         if driven_by != "torque":
-            wanted.insert(0, "torque_constant")
+            names.insert(0, "torque_constant")
         if driven_by == "voltage":
-            wanted.insert(0, "resistance")
-        free = tuple(name for name in dict.fromkeys(wanted) if name not in known)
-        firsts = []
+            names.insert(0, "resistance")
+        free = tuple(name for name in dict.fromkeys(names) if name not in known)
+        guesses = []
         for window in (0.02, 0.004):
             factors, drive, speed = _shaft_regression(segments, self.rig, self.output, window)
-            firsts.append(
+            guesses.append(
                 _shaft_start(factors, drive, speed, driven_by, {**self.defaults, **known}, known)
             )
-        start, floors = firsts[0]
+        start, floors = guesses[0]
         scales = np.array(
             [
                 floors[name] if name in FRICTION else max(abs(start[name]), floors.get(name, 1e-9))
                 for name in free
             ]
         )
-        positive = np.array([PARAMETERS[name].least >= 0.0 for name in free], bool)
-        starts = [np.array([one[name] for name in free]) for one, _ in firsts]
-        starts = [np.where(positive & ~(one > 0.02 * scales), 0.3 * scales, one) for one in starts]
+        positive = np.array([PARAMETERS[name].lower >= 0.0 for name in free], bool)
+        starts = [np.array([guess[name] for name in free]) for guess, _ in guesses]
+        starts = [
+            np.where(positive & ~(values > 0.02 * scales), 0.3 * scales, values)
+            for values in starts
+        ]
+        # Dry friction gives the cost several minima: random factors of 0.5 to 2 reach others.
         changes = np.random.default_rng(0).uniform(-0.7, 0.7, (2, len(free)))
         starts += [starts[0] * np.exp(change) for change in changes]
         return dataclasses.replace(self, names=free, scales=scales), starts
@@ -272,35 +293,45 @@ def _shaft_start(
     drive: float,
     speed: float,
     driven_by: str,
-    given: Mapping[str, float],
+    fixed: Mapping[str, float],
     known: Mapping[str, float],
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Every parameter of a shaft by the factors that its input was regressed by, and sizes that matter of some."""
-    ratio = given["gear_ratio"]
-    # torque at the output for one of the input, where that is not known
-    gain, braking, resistance = given["torque_gain"], 0.0, given.get("resistance", 1.0)
+    """Return guesses of all parameters of a shaft, and smallest scales of some.
+
+    Args:
+        factors: of the regression of the input.
+        drive: root mean square of the input.
+        speed: root mean square of the speed [rad/s].
+        driven_by: `torque`, `current` or `voltage`.
+        fixed: known parameters and defaults.
+        known: known parameters.
+    """
+    ratio = fixed["gear_ratio"]
+    # The gain is the torque at the output over the input.
+    gain, braking, resistance = fixed["torque_gain"], 0.0, fixed.get("resistance", 1.0)
     if driven_by != "torque":
-        gain = given.get("torque_constant", _gain_of(factors, known) / ratio) * ratio
-    start = dict(given)
+        gain = fixed.get("torque_constant", _input_gain(factors, known) / ratio) * ratio
+    start = dict(fixed)
     if driven_by == "voltage":
         if "torque_constant" in known or "resistance" in known:
-            per_volt = _gain_of(
+            per_volt = _input_gain(
                 factors, known, gain / resistance if "torque_constant" in known else gain
             )
             resistance = resistance if "resistance" in known else gain / max(per_volt, 1e-9)
-        else:  # as if all of what brakes were the back-EMF
+        # Without a known constant the viscous term counts entirely as back-EMF.
+        else:
             per_volt = gain
             resistance = (max(factors["viscous"], 0.0) + 1e-6) / max(per_volt, 1e-9)
-        start["torque_constant"] = given.get("torque_constant", per_volt * resistance / ratio)
+        start["torque_constant"] = fixed.get("torque_constant", per_volt * resistance / ratio)
         start["resistance"] = resistance
-        start["back_emf_constant"] = given.get("back_emf_constant", start["torque_constant"])
+        start["back_emf_constant"] = fixed.get("back_emf_constant", start["torque_constant"])
         braking = per_volt * ratio * start["back_emf_constant"]
         gain = per_volt
     else:
         start["torque_constant"] = gain / ratio
-    # Without an input, as in a free swing, what is known to pull says how large torques are.
-    held = max(known.get("mgl", 0.0), abs(known.get("constant_torque", 0.0)))
-    torque = max(drive * gain if drive * gain > 1e-3 * held else held, 1e-9)
+    # Without an input, as in a free swing, gravity or a known load gives the size of torques.
+    load = max(known.get("mgl", 0.0), abs(known.get("constant_torque", 0.0)))
+    torque = max(drive * gain if drive * gain > 1e-3 * load else load, 1e-9)
     start |= {
         "inertia": factors["inertia"] * gain,
         "mgl": factors["mgl"] * gain,
@@ -323,36 +354,48 @@ def _shaft_start(
     return start, floors
 
 
-def _gain_of(
-    factors: Mapping[str, float], known: Mapping[str, float], otherwise: float = 1.0
+def _input_gain(
+    factors: Mapping[str, float], known: Mapping[str, float], default: float = 1.0
 ) -> float:
-    """Torque at the output for one of the input, by whatever torque or inertia is known."""
+    """Return the torque at the output over the input, from a known torque or inertia."""
     for name in ("mgl", "constant_torque", "inertia"):
         if known.get(name, 0.0) != 0.0 and factors[name] > 0.0:
             return known[name] / factors[name]
-    return otherwise
+    return default
 
 
 def _shaft_regression(
     segments: Sequence[Segment], rig: str, output: str, window: float
 ) -> tuple[dict[str, float], float, float]:
-    """Factors of the input's integral in those of what it works against, its size, and that of the speed.
+    """Regress the integral of the input on the integrals of the shaft's torques.
 
-    Speeds are positions smoothed over `window` [s].
+    Args:
+        segments: of the shaft's logs.
+        rig: `pendulum`, `free` or `load`.
+        output: `position` or `velocity`.
+        window: duration [s] that positions are smoothed over.
+
+    Returns:
+        The factors, and the root mean squares of the input and of the speed [rad/s].
     """
     from scipy.integrate import cumulative_trapezoid
 
-    turned = functools.partial(cumulative_trapezoid, initial=0.0)
-    rows, inputs, turning = [], [], []
+    integrate = functools.partial(cumulative_trapezoid, initial=0.0)
+    rows, inputs, all_speeds = [], [], []
     for segment in segments:
         times, step = segment.times, float(np.median(np.diff(segment.times)))
         if output == "position":
             position, speed = (
                 segment.measured,
-                speeds(times, segment.measured, times, max(window, 5.0 * step)),
+                smoothed_speeds(times, segment.measured, times, max(window, 5.0 * step)),
             )
         else:
-            position, speed = segment.state[0] + turned(segment.measured, times), segment.measured
+            position, speed = (
+                segment.state[0] + integrate(segment.measured, times),
+                segment.measured,
+            )
+        # The columns are gravity, a constant load, Coulomb friction, viscous friction and the
+        # input.
         columns = (
             np.sin(position),
             np.ones(len(times)),
@@ -360,18 +403,22 @@ def _shaft_regression(
             speed,
             segment.inputs,
         )
-        sums = [turned(one, times) for one in columns]
+        integrals = [integrate(column, times) for column in columns]
+        # Windows of 2.5 smoothing windows make the errors of the smoothed speeds unimportant.
         edges = np.searchsorted(times, np.arange(times[0], times[-1] + 1e-9, 2.5 * window))
         edges = np.unique(np.minimum(edges, len(times) - 1))
         rows.append(
-            np.stack([np.diff(speed[edges]), *(np.diff(one[edges]) for one in sums)], axis=1)
+            np.stack(
+                [np.diff(speed[edges]), *(np.diff(integral[edges]) for integral in integrals)],
+                axis=1,
+            )
         )
         inputs.append(segment.inputs)
-        turning.append(speed)
+        all_speeds.append(speed)
     table = np.concatenate(rows)
     names = ["inertia", "mgl", "constant_torque", "coulomb", "viscous"]
     free = [name for name in names if name not in ("mgl", "constant_torque") or name in OF_RIG[rig]]
-    found = _regressed(table[:, :5], table[:, 5], names, free, dict.fromkeys(names, 0.0))
-    factors = dict.fromkeys(names, 0.0) | dict(zip(free, map(float, found), strict=True))
+    solution = _regress_free(table[:, :5], table[:, 5], names, free, dict.fromkeys(names, 0.0))
+    factors = dict.fromkeys(names, 0.0) | dict(zip(free, map(float, solution), strict=True))
     size = float(np.sqrt(np.mean(np.concatenate(inputs) ** 2)))
-    return factors, size, float(np.sqrt(np.mean(np.concatenate(turning) ** 2)))
+    return factors, size, float(np.sqrt(np.mean(np.concatenate(all_speeds) ** 2)))

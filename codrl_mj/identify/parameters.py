@@ -1,16 +1,19 @@
-"""What can be identified: names, units, bounds. Those of a motor are called as `GearMotor`'s fields, at its rotor."""
+"""Parameters that can be identified, with units and bounds.
+
+Parameters of a motor have the names of `GearMotor`'s fields, and are values at the rotor.
+"""
 
 from typing import NamedTuple
 
 
 class Parameter(NamedTuple):
-    """A number that a log may tell."""
+    """A parameter that a log may determine."""
 
     unit: str
-    least: float
-    most: float
-    what: str
-    default: float | None = None  # where it is neither fitted nor known; None: it has to be either
+    lower: float
+    upper: float
+    description: str
+    default: float | None = None  # value if it is neither fitted nor known; None: none
 
 
 PARAMETERS = {
@@ -18,33 +21,29 @@ PARAMETERS = {
     "inductance": Parameter("H", 1e-8, 1e2, "terminal inductance"),
     "back_emf_constant": Parameter("V*s/rad", 1e-6, 1e3, "back-EMF constant at the rotor"),
     "torque_constant": Parameter("N*m/A", 1e-6, 1e3, "torque constant at the rotor"),
-    "torque_gain": Parameter(
-        "", 1e-2, 1e2, "true torque for one of the torque that was logged", 1.0
-    ),
+    "torque_gain": Parameter("", 1e-2, 1e2, "true torque over the logged torque", 1.0),
     "inertia": Parameter("kg*m^2", 1e-9, 1e4, "inertia of all that moves, at the output"),
     "mgl": Parameter("N*m", 0.0, 1e4, "largest torque of gravity, at the output", 0.0),
     "constant_torque": Parameter(
-        "N*m", -1e4, 1e4, "held load against positive speeds, at the output", 0.0
+        "N*m", -1e4, 1e4, "constant load torque against positive speeds, at the output", 0.0
     ),
     "coulomb_friction": Parameter("N*m", 0.0, 1e3, "Coulomb friction at the rotor"),
     "viscous_friction": Parameter("N*m*s/rad", 0.0, 1e3, "viscous friction at the rotor"),
     "friction_torque": Parameter(
-        "N*m", 0.0, 1e3, "what all friction takes at the speed of the logs, at the rotor"
+        "N*m", 0.0, 1e3, "total friction at the speed of the logs, at the rotor"
     ),
     "gear_efficiency": Parameter("", 0.3, 1.0, "share of the torque that the gear passes on", 1.0),
     "stribeck_friction": Parameter(
-        "N*m", 0.0, 1e3, "what standstill adds to Coulomb friction, at the rotor", 0.0
+        "N*m", 0.0, 1e3, "additional static friction above Coulomb friction, at the rotor", 0.0
     ),
     "stribeck_speed": Parameter(
-        "rad/s", 1e-3, 1e4, "rotor speed at which 1/e of that is left", 1.0
+        "rad/s", 1e-3, 1e4, "rotor speed at which 1/e of the Stribeck friction is left", 1.0
     ),
     "rotor_inertia": Parameter("kg*m^2", 0.0, 1e3, "inertia of the rotor"),
-    "load_inertia": Parameter(
-        "kg*m^2", 0.0, 1e4, "inertia of what the output moves besides the motor"
-    ),
-    "gear_ratio": Parameter("", 1e-3, 1e5, "turns of the rotor for one of the output", 1.0),
+    "load_inertia": Parameter("kg*m^2", 0.0, 1e4, "inertia at the output without the motor's"),
+    "gear_ratio": Parameter("", 1e-3, 1e5, "turns of the rotor per turn of the output", 1.0),
 }
-"""Everything that can be identified; all but `friction_torque`, which is a sum, can be given as known."""
+"""All parameters; all but `friction_torque`, which is a sum, can be given as known."""
 ELECTRICAL = ("resistance", "inductance", "back_emf_constant")
 FRICTION = (
     "coulomb_friction",
@@ -53,7 +52,10 @@ FRICTION = (
     "gear_efficiency",
     "friction_torque",
 )
-"""What may well be nothing at all (an efficiency: 1): judged by how much of the torque it takes."""
+"""Parameters whose true value may be 0 (of an efficiency: 1).
+
+Their intervals are judged by their share of the torque, because a relative error has no meaning.
+"""
 OF_MOTOR = (
     *(
         "resistance",
@@ -73,7 +75,7 @@ OF_MOTOR = (
 )
 """Fields of `GearMotor` that are identified or known."""
 OF_LOSS = ("gear_efficiency", "stribeck_friction", "stribeck_speed", "stribeck_exponent")
-"""Fields of `GearMotor` that the simulation of a shaft has from a base where they are neither fitted nor known."""
+"""Fields of `GearMotor` that a shaft takes from a base if they are neither fitted nor known."""
 OF_WINDING = {
     "current": ("torque_constant", "back_emf_constant"),
     "voltage": ("resistance", "resistance"),
@@ -96,8 +98,12 @@ OF_RIG: dict[str, tuple[str, ...]] = {
     "free": ("inertia",),
     "load": ("inertia", "constant_torque"),
 }
-DEFAULTS = {name: one.default for name, one in PARAMETERS.items() if one.default is not None}
-"""What is taken for parameters that are neither fitted nor known."""
+DEFAULTS = {
+    name: parameter.default
+    for name, parameter in PARAMETERS.items()
+    if parameter.default is not None
+}
+"""Values of parameters that are neither fitted nor known."""
 ESTIMABLE = {
     **dict.fromkeys(
         [*OF_RIG["pendulum"], *OF_RIG["load"], *OF_FRICTION["both"], "torque_constant"]
@@ -106,4 +112,4 @@ ESTIMABLE = {
     "back_emf_constant": "voltage",
     "resistance": "voltage",
 }
-"""What a shaft can tell -> the only input under which it does; None: any."""
+"""Parameter that the logs of a shaft determine -> the only suitable input; None: any input."""

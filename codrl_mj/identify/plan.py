@@ -1,10 +1,10 @@
-"""Which excitation, sample rate and amplitude a motor needs: what each would tell, before anything is measured.
+"""Choice of the excitation, sample rate and amplitude for a motor, before a measurement.
 
-The errors expected are those of a fit to a log without noise, at the truth: by the noise that will
-be and by the fit's own Jacobian (Fisher information), and those of a winding by a voltage that is
-taken as held where it changes. Winding and shaft stand each for itself: the current under voltage
-and speed, the position under the measured current. Source: Ljung, *System Identification* (2nd ed.
-1999), sec. 7.4 and 13.2.
+The expected errors come from a fit to a simulated log without noise, at the true parameters: from
+the expected noise and the Jacobian of the fit (Fisher information), and for a winding also from a
+voltage that is taken as held although it changes between rows. Winding and shaft are fitted
+separately: the current under voltage and speed, the position under the measured current. Source:
+Ljung, *System Identification* (2nd ed. 1999), sec. 7.4 and 13.2.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ import numpy as np
 
 from codrl_mj.actuators import Drive
 from codrl_mj.fields import Checked, choice, real
-from codrl_mj.identify.estimate import Model, refit
+from codrl_mj.identify.estimate import Model, optimize
 from codrl_mj.identify.log import Log, Segment
 from codrl_mj.identify.models import ShaftModel, WindingModel
 from codrl_mj.identify.parameters import DEFAULTS, ELECTRICAL, OF_LOSS, PARAMETERS
@@ -28,9 +28,9 @@ from codrl_mj.identify.synthetic import (
     Load,
     Sampler,
     check_size,
-    run,
     sample_times,
     simulate,
+    simulate_drive,
 )
 from codrl_mj.runs.files import writing
 
@@ -42,59 +42,59 @@ GOALS = {
     "coulomb_friction": 0.05,
     "viscous_friction": 0.05,
 }
-"""Relative error of each parameter that a plan is to reach."""
-MARGIN = (
-    3.0  # by which a plan's errors are below the goals, because a bench has more faults than noise
-)
-RATES = (1e3, 2e3, 5e3, 10e3, 20e3)  # rows a second [Hz] that are tried
-_SEGMENT = 0.25  # [s]
-_PHASE = 0.37  # of a row, by which the rows miss the excitation's clock
+"""Relative error of each parameter that a plan aims at."""
+# A bench has more faults than noise, so that real errors are larger than expected ones.
+MARGIN = 3.0
+"""Factor between the goals and the expected errors of a good plan."""
+RATES = (1e3, 2e3, 5e3, 10e3, 20e3)
+"""Sample rates [Hz] that are compared."""
+_SEGMENT = 0.25  # duration of a segment [s]
+_PHASE = 0.37  # time between a row and the excitation's clock, over the time of a row
 
 
 @dataclasses.dataclass(frozen=True)
 class Sensing(Checked):
-    """What is measured, how well."""
+    """Accuracy of the sensors and timing of the voltage."""
 
     current_noise: float = real(0.01, above=0.0, unit="")
     """Standard deviation of the current's noise as a share of the largest current, > 0."""
     encoder: float = real(4096.0, above=0.0, unit="")
-    """Steps of the position a turn of the output, > 0."""
+    """Encoder steps per turn of the output, > 0."""
     voltage: Literal["together", "instantaneous", "mean"] = choice(
         "together", "together", "instantaneous", "mean"
     )
-    """How the rows have the voltage: `together`, it changes when a row is written and not in
-    between; else it changes by a clock of its own, and a row has what it is at the time, or its
-    mean to the next row.
+    """Voltage of a row. With `together` the voltage changes only when a row is written; else it
+    has a separate clock, and a row has its `instantaneous` value, or its `mean` until the next row.
     """
 
 
 class Option(NamedTuple):
-    """An excitation at a sample rate, and what it would tell."""
+    """An excitation at a sample rate, with the expected errors."""
 
     excitation: Excitation
-    rate: float  # rows a second [Hz]
+    rate: float  # of the rows [Hz]
     peak_current: float  # [A]
     rms_current: float  # root mean square [A]
-    errors: dict[
-        str, float
-    ]  # parameter -> relative error expected; what cannot be seen is left out
+    # Parameter -> expected relative error; parameters that cannot be identified are left out.
+    errors: dict[str, float]
 
     @property
     def worst(self) -> float:
-        """The largest error over its goal; infinite where one of the electrical parameters cannot be seen."""
+        """Largest error over its goal; infinite if an electrical parameter cannot be identified."""
         if any(name not in self.errors for name in ELECTRICAL):
             return math.inf
         return max(error / GOALS[name] for name, error in self.errors.items())
 
 
 class Plan(NamedTuple):
-    """All options, and the one to play."""
+    """All options, and the best one."""
 
     options: list[Option]
-    # that of the lowest rate that is below all goals by `MARGIN`; else that which comes closest
+    # The option of the lowest rate whose errors are below all goals by `MARGIN`, or else the option
+    # that comes closest.
     best: Option
-    missed: list[str]  # parameters that it does not reach the goals of
-    unknown: list[str]  # parameters that the datasheet leaves at 0, of which nothing can be said
+    missed: list[str]  # parameters whose goals the best option misses
+    unknown: list[str]  # parameters that are 0 on the datasheet, so that no error can be expected
 
 
 def plan(
@@ -105,10 +105,15 @@ def plan(
     max_current: float = math.inf,
     continuous_current: float = math.inf,
 ) -> Plan:
-    """Compare excitations and sample rates for a motor whose parameters are about known.
+    """Compare excitations and sample rates for a motor whose parameters are roughly known.
 
-    A log lasts `duration` [s]; the current stays below `max_current` [A] of the bench and below the
-    drive's own, its root mean square below `continuous_current` [A] of the motor.
+    Args:
+        drive: with the motor, the supply and the current limit.
+        load: at the output.
+        sensing: accuracy of the sensors; None takes the defaults.
+        duration: of a log [s].
+        max_current: largest current of the bench [A]; the drive's limit applies, too.
+        continuous_current: largest root mean square of the current [A], of the motor.
     """
     if not duration >= 4.0 * _SEGMENT:
         raise ValueError(
@@ -138,11 +143,11 @@ def plan(
         for kind in EXCITATIONS
         for rate in rates
     ]
-    reached = [option for option in options if option.worst <= 1.0 / MARGIN]
+    good = [option for option in options if option.worst <= 1.0 / MARGIN]
     best = (
-        min(reached, key=lambda one: (one.rate, one.worst))
-        if reached
-        else min(options, key=lambda one: one.worst)
+        min(good, key=lambda choice: (choice.rate, choice.worst))
+        if good
+        else min(options, key=lambda choice: choice.worst)
     )
     names = [name for name in GOALS if truth[name] > 0.0]
     missed = [name for name in names if best.errors.get(name, math.inf) > GOALS[name]]
@@ -150,7 +155,8 @@ def plan(
 
 
 def write_excitation(path: Path, option: Option) -> None:
-    """Write what to play as CSV, a row for each change at the option's rate: `time` [s], `voltage` [V]."""
+    """Write an option's voltage as CSV at its rate, with columns `time` [s] and `voltage` [V]."""
+    # The small offset keeps a sample that is due at a change of the voltage from falling before it.
     time = np.arange(round(option.excitation.duration * option.rate) + 1) / option.rate
     table = np.column_stack([time, option.excitation.voltage(time + 1e-9 / option.rate)])
     with writing(path) as temporary:
@@ -167,7 +173,7 @@ def _option(
     limits: tuple[float, float],
     truth: Mapping[str, float],
 ) -> Option:
-    """An excitation at a rate, as large as the supply, the largest and the continuous current allow."""
+    """Return an excitation at a rate, as large as the supply and the current limits allow."""
     constant, together = drive.motor.electrical_time_constant, sensing.voltage == "together"
     excitation = Excitation(
         kind,
@@ -175,10 +181,10 @@ def _option(
         duration,
         frequency=2.0 if kind == "square" else 0.5,
         highest=min(200.0, 0.5 / constant),
-        # an even number of rows, so that a fit of every second one still has the voltage
+        # An even number of rows per change lets a fit of every second row have the right voltage.
         clock=2 * max(round(2.0 * constant * rate), 1) / rate if together else 4.0 * constant,
     )
-    held = dataclasses.replace(load, locked=load.locked or excitation.locked)
+    locked_load = dataclasses.replace(load, locked=load.locked or excitation.locked)
     time, amplitude = sample_times(drive, duration), excitation.amplitude
     shape = (
         excitation.voltage(
@@ -186,8 +192,9 @@ def _option(
         )
         / amplitude
     )
-    for _ in range(8):  # the response is nearly in proportion to the voltage
-        current = run(drive, amplitude * shape, held).signals["current"]
+    # The response is nearly proportional to the voltage, so that few iterations suffice.
+    for _ in range(8):
+        current = simulate_drive(drive, amplitude * shape, locked_load).signals["current"]
         peak, rms = float(np.abs(current).max()), float(np.sqrt(np.mean(current**2)))
         excess = max(peak / limits[0], rms / limits[1])
         if excess <= 1.0:
@@ -196,24 +203,25 @@ def _option(
     log = simulate(
         drive,
         amplitude * shape,
-        held,
+        locked_load,
         sampler=Sampler(rate, mean_voltage=sensing.voltage == "mean"),
     )
     excitation = dataclasses.replace(excitation, amplitude=amplitude)
-    return Option(excitation, rate, peak, rms, _expected(truth, held, sensing, log))
+    return Option(excitation, rate, peak, rms, _expected_errors(truth, locked_load, sensing, log))
 
 
-def _expected(
+def _expected_errors(
     truth: Mapping[str, float], load: Load, sensing: Sensing, log: Log
 ) -> dict[str, float]:
-    """Relative errors of a winding by the current, at the speed that is, and of a shaft by the position.
+    """Return the expected relative errors of a winding and a shaft.
 
-    The torque is known by the back-EMF constant; what the datasheet leaves at 0 is left out.
+    The winding is fitted to the current at the true speed, the shaft to the position. The torque is
+    known as well as the back-EMF constant. Parameters that are 0 on the datasheet are left out.
     """
     deviation = sensing.current_noise * float(np.abs(log.signals["current"]).max())
-    turned = np.append(np.diff(log.signals["position"]) / np.diff(log.time), 0.0)
+    speed = np.append(np.diff(log.signals["position"]) / np.diff(log.time), 0.0)
     winding = WindingModel(known={"gear_ratio": truth["gear_ratio"]})
-    errors = _errors(truth, winding, winding.segments([log], [turned]), deviation)
+    errors = _fit_errors(truth, winding, winding.segments([log], [speed]), deviation)
     if load.locked:
         return errors
     known = {
@@ -224,28 +232,41 @@ def _expected(
     known |= {"mgl": load.gravity, "constant_torque": load.against}
     known = {name: value for name, value in known.items() if name not in GOALS or value == 0.0}
     losses = {name: truth[name] for name in OF_LOSS}
-    shaft = ShaftModel(rig="free", friction="coulomb", driven_by="current", output="position", known=known,
-                       defaults=DEFAULTS | losses, segment=_SEGMENT)  # fmt: skip
-    by_position = _errors(
+    shaft = ShaftModel(
+        rig="free",
+        friction="coulomb",
+        driven_by="current",
+        output="position",
+        known=known,
+        defaults=DEFAULTS | losses,
+        segment=_SEGMENT,
+    )
+    shaft_errors = _fit_errors(
         truth, shaft, shaft.segments([log]), 2.0 * math.pi / sensing.encoder / math.sqrt(12.0)
     )
     constant = errors.get("back_emf_constant", 0.0)
-    return errors | {name: math.hypot(error, constant) for name, error in by_position.items()}
+    return errors | {name: math.hypot(error, constant) for name, error in shaft_errors.items()}
 
 
-def _errors(
+def _fit_errors(
     truth: Mapping[str, float], model: Model, segments: Sequence[Segment], deviation: float
 ) -> dict[str, float]:
-    """Relative errors of a fit by noise, and of a winding by what it cannot explain; those above 1 are left out."""
-    model, _ = model.begun(segments)
+    """Return the relative errors of a fit due to noise, and of a winding also due to its residuals.
+
+    Errors above 1 are left out.
+    """
+    model, _ = model.initial_guess(segments)
     values = np.array([truth[name] for name in model.names])
-    fit = refit(model, [one._replace(deviation=deviation) for one in segments], values, 0)
+    # No evaluation: the residuals and the Jacobian at the true values are all that is needed.
+    fit = optimize(
+        model, [segment._replace(deviation=deviation) for segment in segments], values, 0
+    )
     inverse = np.linalg.pinv(np.concatenate(fit.jacobians) * values)
-    found = np.linalg.norm(inverse, axis=1)
+    errors = np.linalg.norm(inverse, axis=1)
     if isinstance(model, WindingModel):
-        found = np.hypot(found, inverse @ np.concatenate(fit.residuals))
+        errors = np.hypot(errors, inverse @ np.concatenate(fit.residuals))
     return {
         name: float(error)
-        for name, error in zip(model.names, found, strict=True)
+        for name, error in zip(model.names, errors, strict=True)
         if 0.0 < error < 1.0
     }

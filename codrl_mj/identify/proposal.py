@@ -1,4 +1,4 @@
-"""A proposal of `--columns` by the names, units and values of a file's columns, for a person to complete."""
+"""Proposals for `--columns` from the names, units and values of a file's columns."""
 
 import json
 import keyword
@@ -10,9 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.columns import EXAMPLES, KINDS, OPEN_UNIT, Column, parse_columns
-from codrl_mj.identify.log import counts_per_turn, find_resolution, is_supply, obstacle, turn_jumps
-from codrl_mj.identify.reading import STAMP, Cells, read_table, to_log
+from codrl_mj.identify.columns import COLUMN_UNITS, EXAMPLES, OPEN_UNIT, Column, parse_columns
+from codrl_mj.identify.log import (
+    counts_per_turn,
+    find_obstacle,
+    find_resolution,
+    find_turn_jumps,
+    is_supply_voltage,
+)
+from codrl_mj.identify.reading import STAMP, Table, read_table, table_to_log
 
 _NAMES = {
     "only": "enable enabled armed",
@@ -29,27 +35,18 @@ _NAMES = {
     "current": "i current iq strom",
     "voltage": "u v voltage volts spannung vq uq",
 }
-"""Signal -> words of its names; of a name with several the first signal counts, and letters only where nothing else."""
-_READINGS = {
-    "present",
-    "feedback",
-    "measured",
-    "actual",
-    "state",
-}  # of a signal that only a unit tells, or a position
-_NO_SIGNALS = {
-    "error",
-    "err",
-    "limit",
-    "max",
-    "mode",
-    "status",
-    "fault",
-    "gain",
-    "integrator",
-    "d",
-}  # d: of the d axis
-_INPUTS = {"input", "in", "dc"}  # of a servo or an inverter, not of the motor
+"""Signal -> words in its columns' names.
+
+If a name has words of several signals, the first signal counts. Single letters count only if there
+is no other word.
+"""
+_READINGS = {"present", "feedback", "measured", "actual", "state"}
+"""Words in the name of a measured signal; its unit tells which signal, or else it is a position."""
+# The letter d marks signals of the d axis.
+_NO_SIGNALS = {"error", "err", "limit", "max", "mode", "status", "fault", "gain", "integrator", "d"}
+"""Words in the name of a column that no fit uses."""
+_INPUTS = {"input", "in", "dc"}
+"""Words in the name of a signal at the input of a servo or an inverter, not at the motor."""
 _SPELLINGS = {
     "deg": "° º degrees",
     "deg/s": "dps",
@@ -61,33 +58,31 @@ _SPELLINGS |= {"s": "sec seconds", "ms": "millis", "us": "micros", "percent": "%
 _UNITS = {
     spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split()
 }
-"""How files spell a unit -> as the mapping takes it."""
-_TURNS = {"deg": 360.0, "rad": 2.0 * math.pi, "turn": 1.0}  # unit of an angle -> a turn
-_SCALED = re.compile(r"[x×*]?\s*(\d+(?:\.\d+)?(?:e[-+]?\d+)?)\s*[x×*·]?\s*(\D+)", re.IGNORECASE)
-"""A factor and a unit, as in `[0.1 deg]`."""
-_STEPS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # unit of time -> [s]
-_USUAL = {
+"""Spelling of a unit in files -> unit of the mapping."""
+_TURNS = {"deg": 360.0, "rad": 2.0 * math.pi, "turn": 1.0}  # unit of an angle -> size of a turn
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # unit of time -> size in [s]
+_USUAL_RANGES = {
     "voltage": (1.0, 60.0),
     "bus": (3.0, 60.0),
     "duty": (0.02, 1.0),
     "temperature": (0.0, 150.0),
 }
-"""Signal -> range of its largest value in the first unit of `EXAMPLES`, in which another unit is unlikely."""
+"""Signal -> range of its largest value in which the first unit of `EXAMPLES` is very likely."""
 
 
 class Proposal(NamedTuple):
-    """Kinds of columns of a log."""
+    """A proposed mapping of a log's columns."""
 
     columns: str
-    """As `read_log` and `--columns` take it, once each `UNIT` in it is replaced."""
+    """Mapping for `read_log` and `--columns`, in which each `UNIT` has to be replaced."""
     doubts: tuple[str, ...]
-    """What could not be told, or was inferred from values."""
+    """Columns that are unknown, or whose signal or unit was inferred from values."""
     problem: str | None = None
-    """Why nothing can be identified from these columns, with a remedy; None if something can."""
+    """Reason why nothing can be identified from these columns, with a remedy; None: no problem."""
 
 
 class _Entry(NamedTuple):
-    """A signal of a proposal."""
+    """A signal of a proposed mapping."""
 
     column: str
     formula: str
@@ -95,152 +90,150 @@ class _Entry(NamedTuple):
 
 
 def propose_columns(path: Path | str) -> Proposal:
-    """Propose which signals the columns of a file are: by names, units in them (`u [V]`, `pos_deg`) or below, values.
+    """Propose a mapping of a file's columns to signals.
 
-    A unit that neither the file nor its values tell is left open, as `UNIT`.
+    The signals follow from the names of the columns, the units in names (`u [V]`, `pos_deg`) or
+    below them, and the values. A unit that remains unknown is left open, as `UNIT`.
 
     Args:
-        path: of a log, as `read_log` takes it.
+        path: of a log in a format of `read_log`.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, or has no time or nothing else.
+        ValueError: the file cannot be read, or has no column of time or no other signal.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no log at {path}")
     table, entries, doubts = read_table(path), dict[str, _Entry](), list[str]()
     for name in table.columns:
-        listed = re.fullmatch(r"(.*)\[(\d+)\]", name)
-        if (listed and listed[2] != "0") or re.sub("nanosec$", "sec", name) in {*table.columns} - {
-            name
-        }:
+        # Only the first entry of a list is proposed. Nanoseconds are added to their column of
+        # seconds.
+        list_entry = re.fullmatch(r"(.*)\[(\d+)\]", name)
+        if (list_entry and list_entry[2] != "0") or re.sub("nanosec$", "sec", name) in {
+            *table.columns
+        } - {name}:
             continue
         signal, unit, doubt = _signal(name, table, entries)
-        if signal and not _numbers(name, table).size:
+        if signal and not _finite_values(name, table).size:
             signal, doubt = None, "holds no numbers, left out"
         if signal:
             entries[signal], doubt = _entry(signal, name, unit, table)
-        if signal and listed:
-            others = table.entries.get(
-                listed[1], [one for one in table.columns if one.startswith(f"{listed[1]}[")]
+        if signal and list_entry:
+            entry_names = table.entries.get(
+                list_entry[1],
+                [column for column in table.columns if column.startswith(f"{list_entry[1]}[")],
             )
-            doubt = f"the first of {', '.join(others)} is taken" + (f"; {doubt}" if doubt else "")
+            doubt = f"the first of {', '.join(entry_names)} is taken" + (
+                f"; {doubt}" if doubt else ""
+            )
         doubts += [f"{name}: {doubt}"] if doubt else []
     doubts += _add_voltage(entries, table)
     if "time" not in entries or len(entries) < 2:
         known = ", ".join(table.columns)
         raise ValueError(
-            f"log {path}: no time, or nothing else, can be told by its columns: {known}"
+            f"log {path}: no time, or no other signal, was recognized in its columns {known}; write"
+            " the mapping by hand, as in time=t:s,current=i:A"
         )
-    columns = ",".join(f"{signal}={one.formula}:{one.unit}" for signal, one in entries.items())
+    columns = ",".join(
+        f"{signal}={entry.formula}:{entry.unit}" for signal, entry in entries.items()
+    )
     return Proposal(columns, tuple(doubts), _problem(path.stem, table, entries))
 
 
-def _signal(name: str, table: Cells, taken: Collection[str]) -> tuple[str | None, str | None, str]:
-    """Return a column's signal and the unit that the file states, None if unknown, and why a column is left out."""
+def _signal(name: str, table: Table, used: Collection[str]) -> tuple[str | None, str | None, str]:
+    """Return a column's signal, its stated unit, and the reason why it is left out.
+
+    Signal and unit are None if they are unknown.
+    """
     stated, bare = _stated(name, table)
+    # Words of iMotor and i_motor are the same, but a unit such as mA must not be split.
     words = [
-        one
-        for one in re.split(r"[\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", bare).lower())
-        if one
+        word
+        for word in re.split(r"[\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", bare).lower())
+        if word
     ]
-    ends = [
-        one for one in re.split(r"[\W_]+", name.lower() if name.isupper() else name) if one
-    ]  # mA is one
+    parts = [part for part in re.split(r"[\W_]+", name.lower() if name.isupper() else name) if part]
     two_units = len(ends) > 2 and not any(re.search(r"\d", one) for one in ends[-2:])
-    pairs = [f"{ends[-2]}{sign}{ends[-1]}" for sign in "/*"] if two_units else []  # deg_s, N_m
+    # The last two parts may be a unit, as in deg_s or N_m.
+    pairs = [f"{parts[-2]}{sign}{parts[-1]}" for sign in "/*"] if len(parts) > 2 else []
+    # Single letters inside a name are rarely units.
     inner = [
-        one for one in (*reversed(ends[1:-1]), *reversed(words)) if len(one) > 1
-    ]  # letters there are of a name
-    loose = [*stated, *pairs, *ends[1:][-1:], *inner]
+        fragment for fragment in (*reversed(parts[1:-1]), *reversed(words)) if len(fragment) > 1
+    ]
+    texts = [*stated, *pairs, *parts[1:][-1:], *inner]
     units = {
-        one: next((unit for text in loose if (unit := _valid(one, text))), None) for one in _NAMES
+        signal: next((unit for text in texts if (unit := _valid_unit(signal, text))), None)
+        for signal in _NAMES
     }
     # Without its factor a unit would be a wrong one: it stays open, unless `_entry` knows what the
     # factor is.
     units |= {one: None for one in _NAMES if _factor(one, stated, ends)[0]}
     if {*words} & _NO_SIGNALS or ("state" in words and "observation" not in words):
-        return None, None, "by its name no signal that a fit needs, left out"
+        return None, None, "by its name not a signal that a fit uses, left out"
     if "erpm" in words:
         return (
             None,
             None,
             "electrical turns, left out; write velocity=erpm/7:rpm if the motor has 7 pole pairs",
         )
-    long = {one for one in words if len(one) > 1}
-    named = [one for one, known in _NAMES.items() if {*known.split()} & long]
-    named = named or [one for one, known in _NAMES.items() if {*known.split()} & {*words[:1]}]
-    if not named and {*words} & _READINGS:
-        named = [one for one in ("velocity", "position", "current", "torque") if units[one]] or [
-            "position"
-        ]
-    if "current" in named and ({*words} & _INPUTS or "bus" in named):
-        return None, None, "by its name the supply's current and not the motor's, left out"
-    if "voltage" in named and {*words} & {*_INPUTS, "present"}:
-        named = ["bus"]
-    fitting = [one for one in named if any(_valid(one, text) for text in stated)]
-    signal = next(iter([*fitting, *named]), None)
-    if signal is None or signal in taken:
-        return None, None, f"left out, {signal} is another" if signal else "not known, left out"
-    return signal, units[signal], ""
-
-
-def _stated(name: str, table: Cells) -> tuple[list[str], str]:
-    """Return what the file states as a column's unit (beside it, in brackets, after "in", as a sign), its bare name."""
-    bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]", name)
-    bare = (name.replace(bracket[0], " ") if bracket else name).strip()
-    after = re.search(r"\sin\s+(\S+)$|([°º%](?:/\w+)?)$", bare)
-    texts = [
-        table.units.get(name, ""),
-        bracket[1] if bracket else "",
-        (after[1] or after[2]) if after else "",
+    long_words = {word for word in words if len(word) > 1}
+    candidates = [signal for signal, known in _NAMES.items() if {*known.split()} & long_words]
+    candidates = candidates or [
+        signal for signal, known in _NAMES.items() if {*known.split()} & {*words[:1]}
     ]
-    return [one.strip("[]() ") for one in texts if one], bare[: after.start()] if after else bare
+    if not candidates and {*words} & _READINGS:
+        candidates = [
+            signal for signal in ("velocity", "position", "current", "torque") if units[signal]
+        ] or ["position"]
+    if "current" in candidates and ({*words} & _INPUTS or "bus" in candidates):
+        return None, None, "by its name the supply's current and not the motor's, left out"
+    # Servos call the voltage of their supply the present (input) voltage.
+    if "voltage" in candidates and {*words} & {*_INPUTS, "present"}:
+        candidates = ["bus"]
+    with_unit = [
+        signal for signal in candidates if any(_valid_unit(signal, text) for text in stated)
+    ]
+    best = next(iter([*with_unit, *candidates]), None)
+    if best is None or best in used:
+        return (
+            None,
+            None,
+            f"left out, another column is the {best}" if best else "not known, left out",
+        )
+    return best, units[best], ""
 
 
-def _factor(
-    signal: str, stated: Collection[str], ends: Collection[str] = ()
-) -> tuple[str, str | None]:
-    """Return the factor and unit of `0.1 deg`; a unit of None where it is unclear, as of `deg x10`; else no factor."""
-    for text in (one for one in stated if re.search(r"\d", one) and not _valid(signal, one)):
-        match = _SCALED.fullmatch(text)
-        if match and (unit := _valid(signal, match[2].strip())):
-            return match[1], unit
-        if any(_valid(signal, one) for one in re.split(r"[\W\d_]+", text)):
-            return text, None
-    attached = (re.fullmatch(r"x\d+|\d+x|\d+(\D+)", one) for one in ends)
-    return next(
-        ((one[0], None) for one in attached if one and (not one[1] or _valid(signal, one[1]))),
-        ("", None),
-    )
-
-
-def _valid(signal: str, unit: str) -> str | None:
-    """Return a unit as the mapping takes it, if it is one of the signal."""
-    if not re.search(r"[^\W\d]|[%°º]", unit) or unit == OPEN_UNIT:
+def _valid_unit(name: str, table: Cells) -> tuple[list[str], str]:
+    """Return what the file states in a spelling of the mapping; None in brackets, after not a unit as a sign), its bare name."""
+    bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]", name)
+    bare == OPEN_UNIT:
         return None
-    if KINDS[signal] == "" and _UNITS.get(unit, unit) != "percent":  # a duty cycle is not in cycles
+    # A column duty_cycle is not in cycles: only percent is a unit of a share.
+    if COLUMN_UNITS[0], " ") if bracket else name).strip()
+    after = re.search(r"\sin\s+(\S+)$|([°º%](?:
         return None
-    for one in (
+    # Names in capitals or lower case lose the case of their units: v for V, ma for mA.
+    for spelling in (
         _UNITS.get(unit, unit),
         unit.upper() if len(unit) == 1 else unit,
         unit[:1] + unit[1:].upper(),
     ):
         try:
-            Column(signal, "x", one)
+            Column(signal, "x", spelling)
         except ValueError:
             continue
-        return one
+        return spelling
     return None
 
 
-def _entry(signal: str, name: str, unit: str | None, table: Cells) -> tuple[_Entry, str]:
-    """Return a signal's entry, with the unit that the file states or its values tell, and what is to be seen to."""
+def _entry(signal: str, name: str, unit: str | None, table: Table) -> tuple[_Entry, str]:
+    """Return the mapping of a signal, and a doubt about it if its unit is not stated."""
     bare = re.sub(r"\[0\]$", "", name)
-    plain = bare.isascii() and bare.isidentifier() and not keyword.iskeyword(bare)
-    formula = name if plain else json.dumps(name, ensure_ascii=False)
-    values, doubt = _numbers(name, table), ""
+    # Other names are quoted in a formula.
+    is_identifier = bare.isascii() and bare.isidentifier() and not keyword.iskeyword(bare)
+    formula = name if is_identifier else json.dumps(name, ensure_ascii=False)
+    values, doubt = _finite_values(name, table), ""
     factor, scaled = _factor(signal, _stated(name, table)[0])
     if scaled:
         values, unit = values * float(factor), scaled
@@ -249,90 +242,100 @@ def _entry(signal: str, name: str, unit: str | None, table: Cells) -> tuple[_Ent
             f"a factor of {factor} is stated beside its unit, and taken: see to it",
         )
     elif unit is None:
-        unit, doubt = _unit(signal, name, formula, values, table)
-    if (rest := re.sub("sec$", "nanosec", name)) != name and rest in table.columns:
-        formula += f"+{json.dumps(rest)}/1e9"
-    if signal == "position" and (turn := _TURNS.get(unit)) and turn_jumps(values, turn).size:
+        unit, doubt = _infer_unit(signal, name, formula, values, table)
+    # ROS 2 writes seconds and nanoseconds in two columns.
+    if (nanoseconds := re.sub("sec$", "nanosec", name)) != name and nanoseconds in table.columns:
+        formula += f"+{json.dumps(nanoseconds)}/1e9"
+    if signal == "position" and (turn := _TURNS.get(unit)) and find_turn_jumps(values, turn).size:
         formula = f"unwrap({formula},{'2*pi' if unit == 'rad' else f'{turn:g}'})"
     return _Entry(name, formula, unit), doubt
 
 
-def _numbers(name: str, table: Cells) -> np.ndarray:
-    """Return a column's finite numbers; none if it holds texts."""
+def _finite_values(name: str, table: Table) -> np.ndarray:
+    """Return the finite numbers of a column, an empty array if it holds texts."""
     try:
-        values = table.numbers(name)
+        values = table.numeric_column(name)
     except ValueError:
         return np.empty(0)
     return values[np.isfinite(values)]
 
 
-def _unit(
-    signal: str, name: str, formula: str, values: np.ndarray, table: Cells
+def _infer_unit(
+    signal: str, name: str, formula: str, values: np.ndarray, table: Table
 ) -> tuple[str, str]:
-    """Return the unit that a column's values tell, or an open one, and what is to be seen to."""
+    """Infer the unit of a column from its values; return it, or an open one, and a doubt."""
     if signal == "time" and any(
-        isinstance(one, str) and STAMP.match(one) for one in table.columns[name][:2]
+        isinstance(cell, str) and STAMP.match(cell) for cell in table.columns[name][:2]
     ):
         return "s", "clock stamps, read as seconds since the first"
     if signal == "only":
         return "1", "rows where it is 0 are left out"
-    largest, whole = (
+    largest, is_integer = (
         float(np.abs(values).max(initial=0.0)),
         bool(np.all(values == np.round(values))),
     )
-    seen = f"values up to {largest:.4g}"
+    size = f"values up to {largest:.4g}"
     units = _time_units(values) if signal == "time" else []
     if len(units) == 1:
-        return units[0], f"no unit is stated, {units[0]} is taken by the steps ({seen}): see to it"
+        return (
+            units[0],
+            f"no unit is stated, {units[0]} is inferred from the steps ({size}): check it",
+        )
     for unit, turn in _TURNS.items() if signal == "position" and values.size else ():
-        if turn_jumps(values, turn).size and np.ptp(values) <= 1.1 * turn:
+        if find_turn_jumps(values, turn).size and np.ptp(values) <= 1.1 * turn:
             return (
                 unit,
-                f"no unit is stated, {unit} is taken, for it jumps by {turn:.4g}: see to it",
+                f"no unit is stated, {unit} is inferred from jumps by {turn:.4g}: check it",
             )
         if count := counts_per_turn(find_resolution(values), turn):
             return (
                 unit,
-                f"no unit is stated, {unit} is taken by its steps, {count} a turn: see to it",
+                f"no unit is stated, {unit} is inferred from {count} steps per turn: check it",
             )
-    low, high = _USUAL.get(signal, (math.inf, 0.0))
-    # Whole volts near 50 may be tenths, as servos of 5 V have them in a register.
-    if low < largest <= high and len(name) > 1 and not (whole and largest > 45.0):
+    low, high = _USUAL_RANGES.get(signal, (math.inf, 0.0))
+    # Whole numbers near 50 may be tenths of a volt, as in the registers of servos for 5 V.
+    if low < largest <= high and len(name) > 1 and not (is_integer and largest > 45.0):
         unit = re.split(r"\W", EXAMPLES[signal])[0]
-        return unit, f"no unit is stated, {unit} is a guess ({seen}): see to it"
+        return unit, f"no unit is stated, {unit} is a guess ({size}): check it"
     likely = " or ".join(units) if signal == "time" and units else EXAMPLES[signal]
-    hint = f"no unit is stated: replace UNIT by {likely} ({seen})"
+    hint = f"no unit is stated: replace UNIT by {likely} ({size})"
     if signal in ("position", "velocity"):
         hint += "; ODrive and moteus log turns"
-    if whole and signal not in ("time", "command") and len(np.unique(values)) > 3:
+    if is_integer and signal not in ("time", "command") and len(np.unique(values)) > 3:
         scale = (
-            "/4096:turn of 4096 counts"
+            "/4096:turn with 4096 counts per turn"
             if signal == "position"
-            else f"*STEP:{KINDS[signal] or '1'} of such steps"
+            else f"*STEP:{COLUMN_UNITS[signal] or '1'} with the size of a step"
         )
-        hint += f"; whole numbers may be those of a register: {signal}={formula}{scale}"
+        hint += f"; whole numbers may come from a register: {signal}={formula}{scale}"
     if signal == "voltage" and len(name) == 1:
-        hint += "; or write torque= or velocity= if it is one"
+        hint += "; or write torque= or velocity= if the column is one of them"
     return OPEN_UNIT, hint
 
 
 def _time_units(values: np.ndarray) -> list[str]:
-    """Return the units in which a time's usual step is from 40 us to half a second, the longest first."""
+    """Return the units in which the usual time step is 40 us to 0.5 s, the longest unit first."""
     step = float(np.median(np.diff(values))) if values.size > 1 else 0.0
-    return [unit for unit, size in _STEPS.items() if 4e-5 <= step * size <= 0.5]
+    return [unit for unit, size in _SECONDS.items() if 4e-5 <= step * size <= 0.5]
 
 
-def _add_voltage(entries: dict[str, _Entry], table: Cells) -> list[str]:
-    """Tell the motor's voltage from the supply's, of which a duty makes it, and return what is to be seen to."""
+def _add_voltage(entries: dict[str, _Entry], table: Table) -> list[str]:
+    """Map a voltage to the supply if it hardly changes, compute the motor's, and return doubts.
+
+    With a duty the motor's voltage is its share of the supply's voltage.
+    """
     doubts = []
     if "voltage" in entries and "bus" not in entries:
-        name, values = entries["voltage"].column, _numbers(entries["voltage"].column, table)
-        others = [
-            _numbers(entries[one].column, table)
-            for one in ("current", "torque", "velocity")
-            if one in entries
+        name, values = entries["voltage"].column, _finite_values(entries["voltage"].column, table)
+        responses = [
+            _finite_values(entries[signal].column, table)
+            for signal in ("current", "torque", "velocity")
+            if signal in entries
         ]
-        if is_supply(values, [*others, np.array([-1.0, 1.0])] if "duty" in entries else others):
+        # A duty counts as a motor that reverses.
+        if is_supply_voltage(
+            values, [*responses, np.array([-1.0, 1.0])] if "duty" in entries else responses
+        ):
             entries["bus"] = entries.pop("voltage")
             doubts.append(f"{name}: hardly changes, taken as the supply's voltage")
     if (
@@ -341,27 +344,30 @@ def _add_voltage(entries: dict[str, _Entry], table: Cells) -> list[str]:
         and entries["duty"].unit != OPEN_UNIT
     ):
         duty, bus = entries["duty"], entries["bus"]
-        part = "/100" if duty.unit == "percent" else ""
-        entries["voltage"] = _Entry(bus.column, f"{duty.formula}{part}*{bus.formula}", bus.unit)
+        percent = "/100" if duty.unit == "percent" else ""
+        entries["voltage"] = _Entry(bus.column, f"{duty.formula}{percent}*{bus.formula}", bus.unit)
         doubts.append("voltage: taken as the duty's share of the bus")
     return doubts
 
 
-def _problem(name: str, table: Cells, entries: dict[str, _Entry]) -> str | None:
-    """Return why a fit cannot use these columns, whichever units are filled in; None if it can."""
+def _problem(name: str, table: Table, entries: dict[str, _Entry]) -> str | None:
+    """Return the reason why a fit cannot use these columns with any units; None if it can."""
     units = {
-        one: KINDS[one] or "1" if entry.unit == OPEN_UNIT else entry.unit
-        for one, entry in entries.items()
+        signal: COLUMN_UNITS[signal] or "1" if entry.unit == OPEN_UNIT else entry.unit
+        for signal, entry in entries.items()
     }
     try:
-        log = to_log(
+        log = table_to_log(
             name,
             table,
-            parse_columns({one: f"{entries[one].formula}:{unit}" for one, unit in units.items()}),
+            parse_columns(
+                {signal: f"{entries[signal].formula}:{unit}" for signal, unit in units.items()}
+            ),
         )
     except ValueError as error:
         return str(error)
-    found = obstacle([log])
-    if found is None or (found.check == "rows" and entries["time"].unit == OPEN_UNIT):
+    obstacle = find_obstacle([log])
+    # With an open unit of time the rows may be frequent enough.
+    if obstacle is None or (obstacle.check == "rows" and entries["time"].unit == OPEN_UNIT):
         return None
-    return f"{found.message}; {found.remedy}"
+    return f"{obstacle.message}; {obstacle.remedy}"

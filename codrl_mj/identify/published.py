@@ -1,4 +1,4 @@
-"""Measurements of real motors that others have published, fetched as they are published, each file by its digest."""
+"""Published measurements of real motors; each file is downloaded and verified by its digest."""
 
 import tomllib
 from pathlib import Path
@@ -7,30 +7,33 @@ from typing import Any
 from codrl_mj.fields import did_you_mean
 from codrl_mj.user_code import asset_path
 
-LAYOUT = "bench_logs"  # where in a folder of data the sets are
+LAYOUT = "bench_logs"  # subfolder of a data folder that holds the data sets
 
 
-def published() -> dict[str, dict[str, Any]]:
-    """What is published, by name: `title`, `source`, `commit`, `licence`, `columns` for `read_log`, and `files`."""
+def published_datasets() -> dict[str, dict[str, Any]]:
+    """Return the data sets by name.
+
+    Each has `title`, `source`, `commit`, `licence`, `columns` for `read_log`, and `files`.
+    """
     return tomllib.loads(asset_path("published.toml").read_text(encoding="utf-8"))
 
 
 def fetch(name: str, folder: Path = Path("data")) -> list[Path]:
-    """Fetch a set of measurements from where its authors have it; files that are there already are left alone.
+    """Download a data set from its authors' repository; files that exist already are not changed.
 
     Args:
-        name: one of `published`.
-        folder: the files come into `bench_logs/NAME` in it.
+        name: one of `published_datasets`.
+        folder: the files are saved in its subfolder `bench_logs/NAME`.
 
     Returns:
-        The files, their licence first.
+        The paths of the files, the license first.
 
     Raises:
-        ValueError: there is no such set; the nearest is suggested.
+        ValueError: there is no such data set; the error suggests the nearest name.
         RuntimeError: pooch is not installed.
-        OSError: a file cannot be had, or is not the one that was published.
+        OSError: a file cannot be downloaded, or differs from the published file.
     """
-    sets = published()
+    sets = published_datasets()
     if name not in sets:
         raise ValueError(
             f"NAME = {name!r}: {did_you_mean(name, sets)}published are {', '.join(sets)}"
@@ -41,20 +44,21 @@ def fetch(name: str, folder: Path = Path("data")) -> list[Path]:
         raise RuntimeError(
             "measurements are fetched by pooch: pip install 'codrl-mj[data]'"
         ) from None
-    known, place = sets[name], folder / LAYOUT / name
-    base = known["source"].replace("https://github.com/", "https://raw.githubusercontent.com/")
-    found = []
+    dataset, target = sets[name], folder / LAYOUT / name
+    base = dataset["source"].replace("https://github.com/", "https://raw.githubusercontent.com/")
+    paths = []
     pooch.get_logger().setLevel("WARNING")
-    for file, about in known["files"].items():
-        url = f"{base}/{known['commit']}/{about['path']}"
+    for file, entry in dataset["files"].items():
+        url = f"{base}/{dataset['commit']}/{entry['path']}"
         try:
-            found.append(
-                Path(pooch.retrieve(url, f"sha256:{about['sha256']}", fname=file, path=place))
+            paths.append(
+                Path(pooch.retrieve(url, f"sha256:{entry['sha256']}", fname=file, path=target))
             )
-        except ValueError as error:  # of another digest
+        # pooch raises a ValueError if the digest differs.
+        except ValueError as error:
             raise OSError(
-                f"{url}: is not the file that was published: {' '.join(str(error).split())}"
+                f"{url}: differs from the published file: {' '.join(str(error).split())}"
             ) from error
         except OSError as error:
-            raise OSError(f"{url}: cannot be had: {' '.join(str(error).split())}") from error
-    return found
+            raise OSError(f"{url}: cannot be downloaded: {' '.join(str(error).split())}") from error
+    return paths

@@ -1,4 +1,4 @@
-"""Logs from files: CSV (also .gz), JSON and, where pyarrow is installed, Parquet."""
+"""Readers of log files: CSV, JSON, both also as .gz, and Parquet if pyarrow is installed."""
 
 import collections
 import csv
@@ -25,71 +25,71 @@ _WORDS = {
     "true": 1.0,
     "false": 0.0,
 }
-STAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d")  # seconds since 1970, or since midnight
+STAMP = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d\d:\d\d:\d\d")
+"""Date and time, read as seconds since 1970, or time of day, read as seconds since midnight."""
 _SIGN_BITS = {
     **dict.fromkeys(("duty", "voltage", "torque"), ((11, 1000.0), (16, 8192.0))),
     **dict.fromkeys(("current", "velocity"), ((16, 8192.0),)),
 }
-"""Signal -> bits and largest numbers of registers that servos (Feetech's) give a bit for the sign in."""
-_MOST_UNUSABLE = 0.2  # share of rows that may be left out as unreadable or out of order
+"""Signal -> bits and largest values of servo registers (Feetech) whose highest bit is the sign."""
+_MAX_UNUSABLE = 0.2  # share of rows that may be unreadable or out of order
 
 
-class Cells(NamedTuple):
-    """What a file holds."""
+class Table(NamedTuple):
+    """The contents of a file."""
 
-    columns: Mapping[str, Any]  # texts or numbers, each of the same length
+    columns: Mapping[str, Any]  # texts or numbers, all of the same length
     constants: Mapping[str, float]
-    ragged: list[int]  # rows that are incomplete, from 1
-    lines: Sequence[int] = ()  # of the file, of each row
-    units: Mapping[str, str] = {}  # by column, where a line states them
-    commas: bool = False  # whether a number may have a decimal comma
-    entries: Mapping[
-        str, list[str]
-    ] = {}  # names of the entries of columns that held lists, such as joints
+    ragged: list[int]  # numbers of incomplete rows, from 1
+    lines: Sequence[int] = ()  # line of the file for each row
+    units: Mapping[str, str] = {}  # column -> unit, if a line states the units
+    decimal_commas: bool = False  # whether numbers may have a decimal comma
+    # Column that held lists -> names of their entries, such as joints.
+    entries: Mapping[str, list[str]] = {}
 
     @property
     def labels(self) -> dict[str, str]:
-        """Columns by the names of their entries: action[elbow] -> action[1]."""
+        """Names of entries -> columns, as action[elbow] -> action[1]."""
         pairs = (
             (name, *pair) for name, entries in self.entries.items() for pair in enumerate(entries)
         )
-        return {f"{name}[{entry}]": f"{name}[{place}]" for name, place, entry in pairs}
+        return {f"{name}[{entry}]": f"{name}[{index}]" for name, index, entry in pairs}
 
-    def numbers(self, name: str) -> np.ndarray:
-        """A column as numbers, NaN where it is empty."""
-        found = np.empty(len(self.columns[name]))
-        for place, one in enumerate(self.columns[name]):
-            if isinstance(one, int | float):
-                found[place] = one
+    def numeric_column(self, name: str) -> np.ndarray:
+        """Return a column as numbers, NaN for empty cells."""
+        numbers = np.empty(len(self.columns[name]))
+        for index, cell in enumerate(self.columns[name]):
+            if isinstance(cell, int | float):
+                numbers[index] = cell
                 continue
-            text = "" if one is None else str(one).strip()
+            text = "" if cell is None else str(cell).strip()
             try:
                 if text.lower() in _WORDS:
-                    found[place] = _WORDS[text.lower()]
+                    numbers[index] = _WORDS[text.lower()]
                 elif STAMP.match(text):
                     day = "" if "-" in text[:5] else "1970-01-01T"
                     stamp = datetime.datetime.fromisoformat(day + text.replace(",", "."))
-                    found[place] = stamp.replace(tzinfo=stamp.tzinfo or datetime.UTC).timestamp()
+                    numbers[index] = stamp.replace(tzinfo=stamp.tzinfo or datetime.UTC).timestamp()
                 else:
-                    found[place] = float(text.replace(",", ".") if self.commas else text)
+                    numbers[index] = float(text.replace(",", ".") if self.decimal_commas else text)
             except ValueError:
                 remedy = (
                     "write a decimal point"
                     if "," in text
                     else "leave such rows out, or map another column"
                 )
-                where = f"line {self.lines[place]}" if self.lines else f"row {place + 1}"
+                location = f"line {self.lines[index]}" if self.lines else f"row {index + 1}"
                 raise ValueError(
-                    f"column {name} in {where} is {text!r}, must be a number; {remedy}"
+                    f"column {name} in {location} is {text!r}, must be a number; {remedy}"
                 ) from None
-        return found
+        return numbers
 
 
 def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
-    """A log from a file; what could not be read of it is among the log's findings.
+    """Read a log from a file; the log's findings report the rows that could not be read.
 
-    Rows with missing values, and those whose time does not increase, are left out. Time starts at
-    0.
+    Rows with missing values, and rows whose time does not increase, are left out. The time of the
+    log starts at 0.
 
     Args:
         path: .csv, .txt, .dat, .tsv, .json, any of them .gz, or .parquet. CSV has a line of names,
@@ -97,59 +97,57 @@ def read_log(path: Path | str, columns: str | Mapping[str, str]) -> Log:
             one cell are no rows, one without a number under the names is of units. Decimal commas,
             times of day (ISO 8601) and Latin-1 are read. JSON is a list of rows, or an object with
             one such list, such as `entries`, and numbers beside it, which formulas can use, or an
-            object of columns. Of a column that holds lists, `column[0]` is the first entry, and
-            `column[elbow]` the one of that name: by `features` in the file, or in meta/info.json of
-            the data set that the file lies in.
+            object of columns. In a column of lists, `column[0]` is the first entry, and
+            `column[elbow]` is the entry of that name, by `features` in the file or in
+            meta/info.json of the data set that contains the file.
         columns: `signal=formula:unit` separated by commas, or a mapping of signals to
-            `formula:unit`. The voltage is what holds from its row to the next, or `mean(formula)`:
-            the mean in between. `only=formula` leaves out the rows where it is 0.
+            `formula:unit`. A voltage is held until the next row, or `mean(formula)` is its mean
+            until the next row. `only=formula` leaves out the rows where it is 0.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is none of these, lacks a column, has text where a number is needed, or too
-            few rows are left.
+        ValueError: the format is unknown, a column is missing, a cell has text instead of a number,
+            or too few rows are left.
     """
     path, mapping = Path(path), parse_columns(columns)
     if not path.is_file():
         raise FileNotFoundError(f"no log at {path}")
     try:
-        return to_log(path.name.removesuffix(".gz").rpartition(".")[0], read_table(path), mapping)
+        return table_to_log(
+            path.name.removesuffix(".gz").rpartition(".")[0], read_table(path), mapping
+        )
     except (ValueError, UnicodeDecodeError, gzip.BadGzipFile, EOFError) as error:
         raise ValueError(f"log {path}: {error}") from None
 
 
-def to_log(name: str, table: Cells, mapping: Mapping[str, Column]) -> Log:
-    """Return the log that a file's columns are by a mapping, as `read_log` does."""
+def table_to_log(name: str, table: Table, mapping: Mapping[str, Column]) -> Log:
+    """Return the log of a file's contents and a mapping; see `read_log`."""
     count = len(next(iter(table.columns.values()), ()))
-    numbers = np.setdiff1d(
-        np.arange(1, count + len(table.ragged) + 1), table.ragged
-    )  # of the rows, in the file
+    # Row numbers count incomplete rows, too, so that they match the file.
+    row_numbers = np.setdiff1d(np.arange(1, count + len(table.ragged) + 1), table.ragged)
     labels = table.labels
-    used = set().union(*(one.names for one in mapping.values()))
+    used = set().union(*(column.names for column in mapping.values()))
     needed = {labels.get(name, name) for name in used} & table.columns.keys()
-    read = {
+    # Only the columns in use have to be numeric; the others remain as names for error messages.
+    values = {
         **dict.fromkeys(table.columns),
         **table.constants,
-        **{one: table.numbers(one) for one in needed},
+        **{name: table.numeric_column(name) for name in needed},
     }
-    read |= {label: read[column] for label, column in labels.items() if column in read}
+    values |= {label: values[name] for label, name in labels.items() if name in values}
     signals = {
-        one: np.broadcast_to(np.asarray(made.value(read), float), (count,))
-        for one, made in mapping.items()
+        signal: np.broadcast_to(np.asarray(column.evaluate(values), float), (count,))
+        for signal, column in mapping.items()
     }
-    time, wanted = signals.pop("time"), signals.pop("only", np.ones(count)) != 0.0
-    finite = np.isfinite(time) & np.all(
-        [np.isfinite(values) for values in signals.values()], axis=0
-    )
-    rows = np.flatnonzero(wanted & finite)
+    time, selected = signals.pop("time"), signals.pop("only", np.ones(count)) != 0.0
+    finite = np.isfinite(time) & np.all([np.isfinite(each) for each in signals.values()], axis=0)
+    rows = np.flatnonzero(selected & finite)
     forward = time[rows] > np.append(-np.inf, np.maximum.accumulate(time[rows])[:-1])
     findings = [
-        *_unsigned(read, mapping, numbers),
+        *_find_unsigned(values, mapping, row_numbers),
+        *_left_out(row_numbers[selected & ~finite], "missing", "lack a number, and are left out"),
         *_left_out(
-            numbers[wanted & ~finite], "missing", "have no number in some column, and are left out"
-        ),
-        *_left_out(
-            numbers[rows[~forward]],
+            row_numbers[rows[~forward]],
             "stamps",
             "have a time that is not after the rows before, and are left out",
         ),
@@ -158,67 +156,72 @@ def to_log(name: str, table: Cells, mapping: Mapping[str, Column]) -> Log:
                 "info",
                 "units",
                 None,
-                f"{one.text}: no unit is given, taken as {SIGNALS[one.signal]}",
+                f"{column.text}: no unit is given, taken as {SIGNALS[column.signal]}",
                 "",
             )
-            for one in mapping.values()
-            if one.unit is None and SIGNALS.get(one.signal)
+            for column in mapping.values()
+            if column.unit is None and SIGNALS.get(column.signal)
         ),
         *_left_out(
-            np.array(table.ragged),
-            "missing",
-            "have not as many cells as there are columns, and are left out",
+            np.array(table.ragged), "missing", "have too few or too many cells, and are left out"
         ),
     ]
-    unusable = int((wanted & ~finite).sum() + (~forward).sum())
+    unusable = int((selected & ~finite).sum() + (~forward).sum())
     rows = rows[forward]
-    if rows.size < 2 or unusable > _MOST_UNUSABLE * max(int(wanted.sum()), 1):
+    if rows.size < 2 or unusable > _MAX_UNUSABLE * max(int(selected.sum()), 1):
         raise ValueError(
-            f"{rows.size} of {int(wanted.sum())} rows can be used, must be 2 or more, and"
-            f" {1.0 - _MOST_UNUSABLE:.0%}: "
+            f"{rows.size} of {int(selected.sum())} rows can be used, must be 2 or more, and"
+            f" {1.0 - _MAX_UNUSABLE:.0%}: "
             + (
-                "; ".join(one.message for one in findings if one.severity != "info")
+                "; ".join(finding.message for finding in findings if finding.severity != "info")
                 or "there are no more"
             )
             + "; check the columns"
         )
-    kept = {signal: np.ascontiguousarray(values[rows]) for signal, values in signals.items()}
-    resolution = {signal: find_resolution(values) for signal, values in kept.items()}
+    usable = {name: np.ascontiguousarray(signal[rows]) for name, signal in signals.items()}
+    resolution = {name: find_resolution(signal) for name, signal in usable.items()}
     mean = "voltage" in mapping and mapping["voltage"].mean
     return Log(
         name,
         time[rows] - time[rows[0]],
-        kept,
+        usable,
         resolution,
         mean,
         table.constants,
-        numbers[rows],
+        row_numbers[rows],
         tuple(findings),
     )
 
 
-def _unsigned(
-    values: Mapping[str, Any], mapping: Mapping[str, Column], numbers: np.ndarray
+def _find_unsigned(
+    values: Mapping[str, Any], mapping: Mapping[str, Column], row_numbers: np.ndarray
 ) -> Iterator[Finding]:
-    """Find columns that look like registers whose sign is read as part of the number."""
-    unsigned = (
-        one
-        for one in mapping.values()
-        if not re.search("twos_complement|sign_magnitude", one.formula)
+    """Find columns that look like registers whose sign was read as part of the number."""
+    unconverted = (
+        column
+        for column in mapping.values()
+        if not re.search("twos_complement|sign_magnitude", column.formula)
     )
-    for name, signal in sorted({(name, one.signal) for one in unsigned for name in one.names}):
-        column = np.asarray(values[name] if values[name] is not None else 0.0, float)
+    for name, signal in sorted(
+        {(name, column.signal) for column in unconverted for name in column.names}
+    ):
+        numbers = np.asarray(values[name] if values[name] is not None else 0.0, float)
+        # Negative numbers in two's complement are in the upper half of the range. A signal that
+        # stays within a quarter of its range around 0 has no values in the middle half.
         for bits in (8, 16, 32):
-            whole = 2.0**bits
-            high, low = column >= 0.75 * whole, column < 0.25 * whole
-            within = (
-                (column >= 0.0) & (column < whole) & (column == np.round(column)) & (high | low)
+            range_size = 2.0**bits
+            high, low = numbers >= 0.75 * range_size, numbers < 0.25 * range_size
+            plausible = (
+                (numbers >= 0.0)
+                & (numbers < range_size)
+                & (numbers == np.round(numbers))
+                & (high | low)
             )
-            if high.any() and low.any() and np.all(within | np.isnan(column)):
-                row = int(numbers[np.flatnonzero(high)[0]])
+            if high.any() and low.any() and np.all(plausible | np.isnan(numbers)):
+                row = int(row_numbers[np.flatnonzero(high)[0]])
                 text = (
-                    f"{name} is below {whole / 4:.0f} or above {3 * whole / 4:.0f}: has it {bits}"
-                    " bits and a sign?"
+                    f"{name} is below {range_size / 4:.0f} or above {3 * range_size / 4:.0f}: does"
+                    f" it have {bits} bits and a sign?"
                 )
                 yield Finding(
                     "error", "register", row, text, f"write twos_complement({name}, {bits})"
@@ -226,18 +229,22 @@ def _unsigned(
         for bits, largest in _SIGN_BITS.get(signal, ()):
             half = 2.0 ** (bits - 1)
             high, low = (
-                (column >= half) & (column <= half + largest),
-                (column >= 0.0) & (column <= largest),
+                (numbers >= half) & (numbers <= half + largest),
+                (numbers >= 0.0) & (numbers <= largest),
             )
-            within = (column == np.round(column)) & (high | low)
-            # a signal that changes its sign passes near 0 on both sides
-            near = [
-                column[one].min() - less <= 0.25 * largest
-                for one, less in ((high, half), (low, 0.0))
-                if one.any()
+            plausible = (numbers == np.round(numbers)) & (high | low)
+            # A signal that changes its sign passes near 0 on both sides.
+            is_near_zero = [
+                numbers[side].min() - zero <= 0.25 * largest
+                for side, zero in ((high, half), (low, 0.0))
+                if side.any()
             ]
-            if len(near) == 2 and all(near) and np.all(within | np.isnan(column)):
-                row = int(numbers[np.flatnonzero(high)[0]])
+            if (
+                len(is_near_zero) == 2
+                and all(is_near_zero)
+                and np.all(plausible | np.isnan(numbers))
+            ):
+                row = int(row_numbers[np.flatnonzero(high)[0]])
                 text = (
                     f"{name} is at most {largest:.0f}, or {half:.0f} and more: is its bit"
                     f" {bits - 1} the sign?"
@@ -247,10 +254,10 @@ def _unsigned(
                 )
 
 
-def _left_out(rows: np.ndarray, check: str, what: str) -> Iterator[Finding]:
-    """What is said of rows, by their numbers in the file, from 1."""
+def _left_out(rows: np.ndarray, check: str, reason: str) -> Iterator[Finding]:
+    """Report rows that are left out, by their numbers in the file, from 1."""
     if rows.size:
-        text = f"{rows.size} row{'s' if rows.size > 1 else ''}, the first one {rows[0]}, {what}"
+        text = f"{rows.size} row{'s' if rows.size > 1 else ''}, the first one {rows[0]}, {reason}"
         remedy = (
             "find out why the logger wrote them; sort the file, or cut it, if its clock was set"
             " back"
@@ -259,8 +266,11 @@ def _left_out(rows: np.ndarray, check: str, what: str) -> Iterator[Finding]:
         yield Finding(severity, check, int(rows[0]), text, remedy)
 
 
-def read_table(path: Path) -> Cells:
-    """Return a file's columns, a list's as one column an entry; see `read_log`, which says which files are read."""
+def read_table(path: Path) -> Table:
+    """Return the contents of a file, with a column for each entry of a list.
+
+    See `read_log` for the formats.
+    """
     table = _read_table(path)
     columns: dict[str, Any] = {}
     for name, values in table.columns.items():
@@ -269,12 +279,13 @@ def read_table(path: Path) -> Cells:
             if any(_as_list(value) for value in values[:20])
             else []
         )
-        for entry in range(max((len(one) for one in lists if one), default=0)):
+        for entry in range(max((len(cells) for cells in lists if cells), default=0)):
             columns[f"{name}[{entry}]"] = [
-                one[entry] if one and entry < len(one) else None for one in lists
+                cells[entry] if cells and entry < len(cells) else None for cells in lists
             ]
         if not lists:
             columns[name] = values
+    # A LeRobot data set describes its list columns in meta/info.json above the file.
     if len(columns) > len(table.columns) and not table.entries:
         for folder in [*path.absolute().parents][:3]:
             if (info := folder / "meta" / "info.json").is_file():
@@ -291,26 +302,26 @@ def _as_list(value: Any) -> list[Any] | None:
         return value.strip("[]").replace(",", " ").split()
     return (
         value
-        if isinstance(value, list) and not any(isinstance(one, list | dict) for one in value)
+        if isinstance(value, list) and not any(isinstance(entry, list | dict) for entry in value)
         else None
     )
 
 
 def _entry_names(content: Any) -> dict[str, list[str]]:
-    """Return the names of the entries of list columns, from the `features` of a parsed file; empty without them."""
+    """Return the entries' names of list columns, from `features` in a parsed file."""
     features = content.get("features") if isinstance(content, dict) else None
-    found = {}
+    entries = {}
     for name, feature in features.items() if isinstance(features, dict) else ():
         names = feature.get("names") if isinstance(feature, dict) else None
         # Some files list the names under the kind of entry, as {"motors": [...]}.
         names = next(iter(names.values()), None) if isinstance(names, dict) else names
         if isinstance(names, list):
-            found[name] = [*map(str, names)]
-    return found
+            entries[name] = [*map(str, names)]
+    return entries
 
 
-def _read_table(path: Path) -> Cells:
-    """Return a file's columns as they stand there."""
+def _read_table(path: Path) -> Table:
+    """Return the contents of a file, with lists in their columns."""
     kind = Path(path.name.removesuffix(".gz")).suffix.lower()
     if kind == ".parquet":
         try:
@@ -319,7 +330,7 @@ def _read_table(path: Path) -> Cells:
             raise ValueError(
                 "reading Parquet needs pyarrow: pip install pyarrow, or save the log as .csv"
             ) from None
-        return Cells(parquet.read_table(path).to_pydict(), {}, [])
+        return Table(parquet.read_table(path).to_pydict(), {}, [])
     if kind not in (".csv", ".txt", ".dat", ".tsv", ".json"):
         raise ValueError(
             f"unknown kind of file {kind!r}, must be .csv, .txt, .dat, .tsv, .json (or .gz) or"
@@ -330,20 +341,24 @@ def _read_table(path: Path) -> Cells:
         text = content.decode(
             "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
         )
+    # Instruments write the signs of degrees and ohms in Latin-1.
     except UnicodeDecodeError:
-        text = content.decode("latin-1")  # what instruments write for degrees and ohms
+        text = content.decode("latin-1")
     return _json(json.loads(text)) if kind == ".json" else _csv(text)
 
 
-def _csv(text: str) -> Cells:
-    """A table after whatever comments: names are in the last line before the numbers, or above units."""
+def _csv(text: str) -> Table:
+    """Parse a CSV table, also one below comments or other text.
+
+    The columns' names are in the last line before the numbers, or above a line of units.
+    """
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     bare = [(number, line) for number, line in lines if not line.startswith("#")]
     last = [line for _, line in bare[-20:]]
-    usual = [one for one in ";\t," if 2 * sum(one in line for line in last) > len(last)]
-    separator = next(
-        (one for _, line in bare for one in usual if one in line), " "
-    )  # the names' own, not a note's
+    # A separator is in most of the last lines; of several, the first line that has one decides,
+    # which is the line of names and not a note.
+    usual = [mark for mark in ";\t," if 2 * sum(mark in line for line in last) > len(last)]
+    separator = next((mark for _, line in bare for mark in usual if mark in line), " ")
     cells = []
     for number, line in bare:
         try:
@@ -361,11 +376,12 @@ def _csv(text: str) -> Cells:
         collections.Counter(len(row) for _, row in cells[-20:]).most_common(1)[0][0] if cells else 0
     )
     filled = (
-        place for place, (_, row) in enumerate(cells) if len(row) == common and _is_filled(row)
+        index for index, (_, row) in enumerate(cells) if len(row) == common and _is_filled(row)
     )
     first = next(filled, len(cells))
     above = [row for _, row in cells[:first] if len(row) > 1 or separator == " "]
-    if first == 0 or not above:  # names behind a #, as numpy writes them
+    # numpy writes the names behind a #.
+    if first == 0 or not above:
         comments = [line.lstrip("# ") for _, line in lines if line.startswith("#")]
         above = [
             [cell.strip() for cell in row] for row in csv.reader(comments, delimiter=separator)
@@ -376,56 +392,61 @@ def _csv(text: str) -> Cells:
     if (
         len(above) > 1
         and len(above[-1]) == len(above[-2]) == width
-        and all(len(one) < 12 for one in above[-1])
+        and all(len(cell) < 12 for cell in above[-1])
     ):
         units = above.pop()
     names = above[-1] if above else []
-    if len(named := [one for one in names if one]) > len({*named}) or not named:
+    if len(named := [name for name in names if name]) > len({*named}) or not named:
         raise ValueError(
             "a line must name the columns, each once, above the numbers; it is"
             f" {separator.join(names)!r}"
         )
     rows = cells[first:]
-    ragged = [place for place, (_, row) in enumerate(rows, 1) if len(row) != len(names)]
-    whole = [row for _, row in rows if len(row) == len(names)]
+    ragged = [index for index, (_, row) in enumerate(rows, 1) if len(row) != len(names)]
+    complete = [row for _, row in rows if len(row) == len(names)]
     columns = (
-        dict(zip(names, zip(*whole, strict=True), strict=True))
-        if whole
+        dict(zip(names, zip(*complete, strict=True), strict=True))
+        if complete
         else dict.fromkeys(names, ())
     )
-    kept = [number for number, row in rows if len(row) == len(names)]
-    return Cells(columns, {}, ragged, kept, dict(zip(names, units, strict=False)), separator != ",")
+    line_numbers = [number for number, row in rows if len(row) == len(names)]
+    return Table(
+        columns, {}, ragged, line_numbers, dict(zip(names, units, strict=False)), separator != ","
+    )
 
 
 def _is_filled(row: Sequence[str]) -> bool:
-    """Whether a row is one of the table's: numbers for the most part, or nothing but what stands for a missing one."""
-    missing, numbers = sum(cell.lower() in ("", "null", "none", "na") for cell in row), 0
+    """Return True for a row of the table: most cells are numbers, or all mark missing values."""
+    num_missing, num_numbers = sum(cell.lower() in ("", "null", "none", "na") for cell in row), 0
     for cell in row:
         try:
-            for one in _as_list(cell) or [cell.replace(",", ".")]:
-                float(one)
-            numbers += 1
+            for number in _as_list(cell) or [cell.replace(",", ".")]:
+                float(number)
+            num_numbers += 1
         except ValueError:
-            numbers += bool(STAMP.match(cell))
-    return missing == len(row) or 2 * numbers > len(row) - missing
+            num_numbers += bool(STAMP.match(cell))
+    return num_missing == len(row) or 2 * num_numbers > len(row) - num_missing
 
 
-def _json(content: Any) -> Cells:
-    given = content if isinstance(content, dict) else {"": content}
-    constants = {name: float(one) for name, one in given.items() if isinstance(one, int | float)}
-    lists = {name: one for name, one in given.items() if isinstance(one, list) and one}
-    tables = [one for one in lists.values() if isinstance(one[0], dict)]
+def _json(content: Any) -> Table:
+    """Convert parsed JSON, which is a list of rows or an object."""
+    fields = content if isinstance(content, dict) else {"": content}
+    constants = {
+        name: float(value) for name, value in fields.items() if isinstance(value, int | float)
+    }
+    lists = {name: value for name, value in fields.items() if isinstance(value, list) and value}
+    tables = [values for values in lists.values() if isinstance(values[0], dict)]
     if len(tables) == 1 and all(isinstance(row, dict) for row in tables[0]):
         names = dict.fromkeys(name for row in tables[0] for name in row)
         columns = {name: [row.get(name) for row in tables[0]] for name in names}
-        return Cells(columns, constants, [], entries=_entry_names(content))
+        return Table(columns, constants, [], entries=_entry_names(content))
     if (
         isinstance(content, dict)
         and not tables
         and lists
-        and len({len(one) for one in lists.values()}) == 1
+        and len({len(values) for values in lists.values()}) == 1
     ):
-        return Cells(lists, constants, [], entries=_entry_names(content))
+        return Table(lists, constants, [], entries=_entry_names(content))
     raise ValueError(
         "JSON must be a list of rows, an object with one such list and numbers beside it, or an"
         " object of columns of the same length"

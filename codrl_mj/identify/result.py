@@ -1,4 +1,4 @@
-"""What identification found: parameters with intervals, how well they foretell logs, and the actuator that follows."""
+"""Results of an identification: parameters with intervals, prediction errors, and the actuator."""
 
 import dataclasses
 import math
@@ -8,20 +8,23 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from codrl_mj.identify.estimate import Fit, settled_state
-from codrl_mj.identify.log import Log, Segment, initial_state, usable
+from codrl_mj.identify.estimate import Fit, best_initial_state
+from codrl_mj.identify.log import Log, Segment, gapless_stretches, initial_state
 from codrl_mj.identify.parameters import DEFAULTS, OF_MOTOR, PARAMETERS
 from codrl_mj.runs.files import write_json, writing
 
 Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]
 ACTUATOR = "actuator.yaml"  # name of the file in a folder of results
-MISUNDERSTOOD = 0.2  # share of the motion beyond which it is not single numbers that are amiss
+# Beyond this share the columns or the model are wrong, and no parameter means anything.
+MAX_UNEXPLAINED = 0.2
+"""Largest unexplained share of the motion with which parameters are usable."""
 USABLE = ("identified", "rough", "given")
-HORIZON = 0.5  # time [s] that is foretold at once,
-KNOWN = 0.03  # from where and how fast the shaft was in its first so many [s], five rows at least
+HORIZON = 0.5  # duration [s] of a prediction
+START_DURATION = 0.03
+"""Time [s] at the start of a prediction, or five rows, that its initial state is fitted to."""
 
 
-def motor_of(base: Mapping[str, Any] | None) -> Any:
+def base_motor(base: Mapping[str, Any] | None) -> Any:
     """Return the `GearMotor` of a drive's mapping; None if it has none."""
     from codrl_mj.actuators import Drive, actuator_from_mapping
 
@@ -29,9 +32,9 @@ def motor_of(base: Mapping[str, Any] | None) -> Any:
     return drive.motor if isinstance(drive, Drive) else None
 
 
-def missing(names: Collection[str], base: Mapping[str, Any] | None) -> str | None:
-    """Which numbers of a motor are neither among these nor in a base, and what to do; None: none."""
-    motor = motor_of(base)
+def missing_parameters(names: Collection[str], base: Mapping[str, Any] | None) -> str | None:
+    """Return which parameters of a motor are neither in `names` nor in a base, with a remedy."""
+    motor = base_motor(base)
     if (
         motor is not None
         and motor.rotor_inertia == 0.0
@@ -39,158 +42,170 @@ def missing(names: Collection[str], base: Mapping[str, Any] | None) -> str | Non
         and "rotor_inertia" not in names
     ):
         return (
-            "rotor_inertia is unknown (0) in the datasheet, and the logs tell the inertia of all"
-            " that moves. Give what is not the motor's, at the output: --known load_inertia=VALUE;"
-            " or --known rotor_inertia=0 if the model that you train in has all of it"
+            "rotor_inertia is unknown (0) in the datasheet, and the logs show only the inertia of"
+            " all that moves. Give the inertia at the output without the motor's: --known"
+            " load_inertia=VALUE; or --known rotor_inertia=0 if the model that you train in"
+            " contains the rotor"
         )
     needed = ("resistance", "inductance", "torque_constant", "back_emf_constant", "rotor_inertia")
     lacking = [name for name in needed if name not in names]
     if not lacking or base is not None:
         return None
     flags = " ".join(f"{name}=VALUE" for name in lacking)
-    remedy = f"--known {flags}, or the motor that has the rest of its numbers with --motor NAME"
+    remedy = f"--known {flags}, or name the motor that has the other parameters with --motor NAME"
     if lacking[-1] == "rotor_inertia":
         remedy += (
-            "; of the inertia that is found give the load's share: --known load_inertia=VALUE, 0"
-            " for a motor alone"
+            "; instead of the rotor's inertia you can give the load's: --known load_inertia=VALUE,"
+            " 0 for a motor without load"
         )
     return (
-        f"{', '.join(lacking)}: these logs say nothing of {'it' if len(lacking) == 1 else 'them'}."
-        f" Give {remedy}"
+        f"{', '.join(lacking)}: these logs do not determine"
+        f" {'it' if len(lacking) == 1 else 'them'}. Give {remedy}"
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """A parameter."""
+    """A parameter with its interval and status."""
 
     name: str
     value: float
-    """In `unit`."""
+    """Value in `unit`."""
     low: float
     """Lower end of the 95 % interval."""
     high: float
     status: Status
     why: str = ""
-    """What the status comes from."""
+    """Reason of the status."""
     causes: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Half-widths of the interval by cause."""
 
     @property
     def unit(self) -> str:
-        """Of its value."""
+        """Unit of the value."""
         return PARAMETERS[self.name].unit
 
 
 class Trace(NamedTuple):
-    """A simulation beside what was measured, in pieces that each begin from a state of their own."""
+    """A simulation and a measurement, in segments with separate initial states."""
 
     log: str
     part: str  # `winding` or `shaft`
-    output: str  # what is compared: `current` [A], `position` [rad] or `velocity` [rad/s]
+    output: str  # `current` [A], `position` [rad] or `velocity` [rad/s]
     time: np.ndarray  # [s], shape (n,)
     measured: np.ndarray  # shape (n,)
     simulated: np.ndarray  # shape (n,)
-    starts: np.ndarray  # rows at which pieces begin
+    starts: np.ndarray  # rows at which segments begin
 
 
-def traced(
-    log: str, part: str, output: str, segments: Sequence[Segment], made: Sequence[np.ndarray]
+def make_trace(
+    log: str, part: str, output: str, segments: Sequence[Segment], simulated: Sequence[np.ndarray]
 ) -> Trace:
-    """A trace of segments of a log, beside what a simulation made of each, of shape (m,)."""
+    """Return a trace of segments of a log and of their simulated outputs, each of shape (m,)."""
     times, measured = (
-        np.concatenate([getattr(one, name) for one in segments]) for name in ("times", "measured")
+        np.concatenate([getattr(segment, name) for segment in segments])
+        for name in ("times", "measured")
     )
-    starts = np.cumsum([0, *(len(one.times) for one in segments)])[:-1]
-    return Trace(log, part, output, times, measured, np.concatenate(made), starts)
+    starts = np.cumsum([0, *(len(segment.times) for segment in segments)])[:-1]
+    return Trace(log, part, output, times, measured, np.concatenate(simulated), starts)
 
 
 @dataclasses.dataclass(frozen=True)
 class Prediction:
-    """Mean absolute errors on a log, in the unit of what is foretold."""
+    """Mean absolute prediction errors on a log, in the unit of the output."""
 
     log: str
     output: str
-    """`position` [rad] or `velocity` [rad/s]."""
+    """Predicted signal, `position` [rad] or `velocity` [rad/s]."""
     open_loop: float
-    """Over `HORIZON`, under the logged input, each time from the state that its first `KNOWN` tell."""
+    """Error over `HORIZON` under the logged input, from states fitted to `START_DURATION`."""
     closed_loop: float | None
-    """Over the whole log, under the law by which the servo makes a voltage of its error; None where there is none."""
+    """Error over the whole log under the servo's proportional law; None without such a law."""
     trace: Trace | None = dataclasses.field(default=None, compare=False, repr=False)
-    """What `open_loop` is the error of; in no file."""
+    """Simulation of `open_loop`; not written to files."""
 
 
 def predict(fit: Fit, log: Log) -> Prediction:
-    """Errors of a fitted shaft's simulations of a log."""
-    model, simulate, errors, made = fit.model, fit.model.at(fit.values), [], []
+    """Simulate a log with a fitted shaft, and return the errors."""
+    model, simulate, errors, simulated = fit.model, fit.model.simulator(fit.values), [], []
     segments = dataclasses.replace(model, segment=HORIZON).segments([log])
     for segment in segments:
-        known = max(int(np.searchsorted(segment.times, segment.times[0] + KNOWN)), 5)
-        made.append(simulate(segment, settled_state(model, fit.values, segment.first(known))))
-        errors.append(np.abs(made[-1] - segment.measured)[known:])
-    foretold, error = (
-        traced(log.name, "shaft", model.output, segments, made),
+        count = max(int(np.searchsorted(segment.times, segment.times[0] + START_DURATION)), 5)
+        simulated.append(
+            simulate(segment, best_initial_state(model, fit.values, segment.first(count)))
+        )
+        # The rows that the initial state was fitted to are not predicted.
+        errors.append(np.abs(simulated[-1] - segment.measured)[count:])
+    trace, error = (
+        make_trace(log.name, "shaft", model.output, segments, simulated),
         float(np.concatenate(errors).mean()),
     )
-    return Prediction(log.name, model.output, error, closed_loop_error(fit, log), foretold)
+    return Prediction(log.name, model.output, error, closed_loop_error(fit, log), trace)
 
 
 def closed_loop_error(fit: Fit, log: Log) -> float | None:
-    """Mean absolute error [rad] of a whole log under its own command, by a proportional law found in the log.
+    """Return the mean absolute error [rad] over a whole log under its command.
 
-    The law is the straight line through the origin from the command's error to the input, where the
-    input is not at its limit: a voltage's `bus`, or the largest that the log has. None where the
-    log has no command that explains it.
+    The input follows from the command by a proportional law, a line through the origin that is
+    fitted to the control error and the input where the input is not at its limit. The limit is the
+    `bus` of a voltage, or the largest input of the log.
+
+    Returns:
+        None if the log has no command, or if no such law explains the input.
     """
-    from codrl_mj.identify.simulation import served
+    from codrl_mj.identify.simulation import simulate_servo
 
     model = fit.model
     if model.output != "position" or not log.has("command", model.driven_by):
         return None
-    wanted, given = log.signals["command"], log.signals[model.driven_by]
-    error = wanted - log.signals["position"]
+    target, drive = log.signals["command"], log.signals[model.driven_by]
+    control_error = target - log.signals["position"]
     limits = (
         log.signals["bus"]
         if log.has("bus") and model.driven_by == "voltage"
-        else np.full(len(error), np.abs(given).max())
+        else np.full(len(control_error), np.abs(drive).max())
     )
-    free = np.abs(given) < 0.98 * limits
-    if not np.any(error[free]):
+    unsaturated = np.abs(drive) < 0.98 * limits
+    if not np.any(control_error[unsaturated]):
         return None
-    law = float(given[free] @ error[free] / (error[free] @ error[free]))
-    lawful = np.clip(law * error, -limits, limits)
-    if not np.mean((given - lawful) ** 2) < 0.25 * np.mean(given**2):
+    gain = float(
+        drive[unsaturated]
+        @ control_error[unsaturated]
+        / (control_error[unsaturated] @ control_error[unsaturated])
+    )
+    predicted_drive = np.clip(gain * control_error, -limits, limits)
+    if not np.mean((drive - predicted_drive) ** 2) < 0.25 * np.mean(drive**2):
         return None
-    moved, found = model.moved(fit.values), []
-    for stretch in usable(log):
+    shaft, errors = model.shaft_parameters(fit.values), []
+    for stretch in gapless_stretches(log):
         position, speed = initial_state(log, stretch)
-        simulated = served(
-            log.time[stretch], wanted[stretch], limits[stretch], law, position, speed, moved
+        simulated = simulate_servo(
+            log.time[stretch], target[stretch], limits[stretch], gain, position, speed, shaft
         )
-        found.append(np.abs(simulated - log.signals["position"][stretch]))
-    total = float(np.concatenate(found).mean())
-    return total if math.isfinite(total) else None
+        errors.append(np.abs(simulated - log.signals["position"][stretch]))
+    mean_error = float(np.concatenate(errors).mean())
+    return mean_error if math.isfinite(mean_error) else None
 
 
 def fitted_traces(part: str, fit: Fit) -> Iterator[Trace]:
-    """The fit of `winding` or `shaft` to each of its logs."""
-    for place, log in enumerate(fit.logs):
+    """Return the fit of `winding` or `shaft` to each of its logs."""
+    for index, log in enumerate(fit.logs):
         pairs = zip(fit.segments, fit.residuals, strict=True)
-        own = [
-            (one, one.measured + residuals * one.deviation)
-            for one, residuals in pairs
-            if one.log == place
+        simulated = [
+            (segment, segment.measured + residuals * segment.deviation)
+            for segment, residuals in pairs
+            if segment.log == index
         ]
-        if own:
-            yield traced(log.name, part, fit.model.output, *zip(*own, strict=True))
+        if simulated:
+            yield make_trace(log.name, part, fit.model.output, *zip(*simulated, strict=True))
 
 
 @dataclasses.dataclass(frozen=True)
 class Identified:
-    """A motor as its logs show it.
+    """A motor that was identified from logs.
 
     Raises:
-        ValueError: by `actuator`, of a parameter that was not identified.
+        ValueError: by `actuator`, if a parameter was not identified.
     """
 
     logs: tuple[str, ...]
@@ -198,131 +213,151 @@ class Identified:
     rig: str
     friction: str
     driven_by: str | None
-    """What drives the shaft in the fit; None where only the winding was fitted."""
+    """Input of the shaft in the fit; None if only the winding was fitted."""
     delays: Mapping[str, float]
-    """Rows by which the input of `winding` and `shaft` was found late; a voltage of the rows' times by half of one."""
+    """Delay [rows] of the input of `winding` and `shaft`, 0.5 for a voltage sampled at the rows."""
     estimates: tuple[Estimate, ...]
     fitted: tuple[Prediction, ...]
-    """Errors on the logs that were fitted."""
+    """Errors on the fitted logs."""
     held_out: tuple[Prediction, ...]
-    """And on those that were not."""
+    """Errors on the logs held out."""
     warnings: tuple[str, ...]
     base: Mapping[str, Any] | None = None
-    """The drive that gives what the logs do not tell, as a mapping; None: none."""
+    """Mapping of a drive, for parameters that the logs do not determine; None: none."""
     traces: tuple[Trace, ...] = ()
-    """Winding and shaft beside the logs that were fitted; in no file."""
+    """Winding and shaft with the fitted logs; not written to files."""
     correlations: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(
         default_factory=dict
     )
-    """Of the parameters of `winding` and `shaft`, each with each."""
+    """Correlations between the parameters of `winding`, and between those of `shaft`."""
     supply: float | None = None
-    """Largest voltage [V] of the supply, or at the terminals, that the logs have; None: they have none."""
+    """Largest logged voltage [V] of the supply or at the terminals; None: no logged voltage."""
     unexplained: float = 0.0
-    """Largest share of what moves in a log that the fit leaves unexplained, if that is more than sensors do."""
+    """Largest unexplained share of a log's variation, if it exceeds the noise of the sensors."""
     friction_reason: str = ""
-    """Why `friction` was chosen; empty if it was asked for."""
+    """Reason for the choice of `friction`; empty if it was requested."""
 
     def __getitem__(self, name: str) -> Estimate:
-        """A parameter by its name."""
-        for one in self.estimates:
-            if one.name == name:
-                return one
+        """Return a parameter by its name."""
+        for estimate in self.estimates:
+            if estimate.name == name:
+                return estimate
         raise KeyError(name)
 
     def problem(self) -> str | None:
-        """What stands against an actuator of these numbers, with a remedy; None: nothing."""
-        if self.unexplained > MISUNDERSTOOD:
+        """Return the reason why there is no actuator, with a remedy; None if there is one."""
+        if self.unexplained > MAX_UNEXPLAINED:
             return (
-                f"the fit leaves {self.unexplained:.0%} of what moves in a log unexplained, so that"
-                " numbers mean little. Correct the columns, their units and signs, or the rig:"
-                " codrl-mj identify check"
+                f"the fit leaves {self.unexplained:.0%} of a log's variation unexplained, so that"
+                " its parameters mean little. Correct the columns, their units and signs, or the"
+                " rig: codrl-mj identify check"
             )
-        bad = [one for one in self.estimates if one.name in OF_MOTOR and one.status not in USABLE]
-        alike: dict[str, list[str]] = {}
-        for one in bad:
-            alike.setdefault(f"{one.status}: {one.why}", []).append(one.name)
-        told = "; ".join(
-            f"{', '.join(s)} {'is' if len(s) == 1 else 'are'} {why}" for why, s in alike.items()
+        unusable = [
+            estimate
+            for estimate in self.estimates
+            if estimate.name in OF_MOTOR and estimate.status not in USABLE
+        ]
+        names_by_reason: dict[str, list[str]] = {}
+        for estimate in unusable:
+            names_by_reason.setdefault(f"{estimate.status}: {estimate.why}", []).append(
+                estimate.name
+            )
+        reasons = "; ".join(
+            f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} {reason}"
+            for reason, names in names_by_reason.items()
         )
-        if bad:
-            them = "it" if len(bad) == 1 else "them"
+        if unusable:
+            pronoun = "it" if len(unusable) == 1 else "them"
             return (
-                f"{told}. Give {them} with --known {' '.join(f'{one.name}=VALUE' for one in bad)}"
+                f"{reasons}. Give {pronoun} with --known"
+                f" {' '.join(f'{estimate.name}=VALUE' for estimate in unusable)}"
             )
-        return missing([one.name for one in self.estimates], self.base)
+        return missing_parameters([estimate.name for estimate in self.estimates], self.base)
 
     @property
     def supply_text(self) -> str | None:
-        """What feeds the actuator that is written, and where that is from; None where there is none."""
+        """Supply of the actuator and its source, as a sentence; None without an actuator."""
         if self.problem() is not None:
             return None
-        volts, of = self.actuator().voltage_limit, "assumed: set supply.voltage in actuator.yaml"
+        volts, source = (
+            self.actuator().voltage_limit,
+            "assumed: set supply.voltage in actuator.yaml",
+        )
         if self.base is not None:
-            of = "the motor's, by --motor"
+            source = "the motor's, by --motor"
         elif self.supply is not None:
-            of = (
+            source = (
                 "the largest of the logs; no current limit: set controller.max_current in"
                 f" {ACTUATOR}"
             )
-        return f"supply {volts:.4g} V: {of}"
+        return f"supply {volts:.4g} V: {source}"
 
     @property
     def base_text(self) -> str | None:
-        """The numbers of the actuator that are the base's and not of the logs; None without a base or an actuator."""
-        motor = motor_of(self.base)
+        """Parameters of the actuator from the base, as a sentence; None if there are none."""
+        motor = base_motor(self.base)
         if motor is None or self.problem() is not None:
             return None
-        own = {*DEFAULTS, *(one.name for one in self.estimates)}
-        told = [
+        identified = {*DEFAULTS, *(estimate.name for estimate in self.estimates)}
+        parameters = [
             f"{name} = {getattr(motor, name):.4g} {PARAMETERS[name].unit}"
             for name in OF_MOTOR
-            if name not in own
+            if name not in identified
         ]
         return (
-            f"not from these logs but the motor's, by --motor: {', '.join(map(str.strip, told))}"
-            if told
+            "not from these logs but the motor's, by --motor:"
+            f" {', '.join(map(str.strip, parameters))}"
+            if parameters
             else None
         )
 
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """Field of a drive -> interval, of what is used and is not a point."""
+        """Return the intervals of usable parameters by field of a drive, without known values."""
         return {
-            f"motor.{one.name}": (one.low, one.high)
-            for one in self.estimates
-            if one.name in OF_MOTOR and one.status in USABLE and one.low < one.high
+            f"motor.{estimate.name}": (estimate.low, estimate.high)
+            for estimate in self.estimates
+            if estimate.name in OF_MOTOR
+            and estimate.status in USABLE
+            and estimate.low < estimate.high
         }
 
     def actuator(self) -> Any:
-        """The drive with the numbers that were identified or given.
+        """Return the drive with the identified and the known parameters.
 
         Raises:
-            ValueError: one of them is neither; the message names it and what to do.
+            ValueError: a parameter is neither; the message names it and a remedy.
         """
         from codrl_mj.actuators import Drive, Supply, actuator_from_mapping
 
         problem = self.problem()
         if problem is not None:
             raise ValueError(problem)
-        own = None if self.supply is None else Supply(self.supply)
-        base = Drive(supply=own) if self.base is None else actuator_from_mapping(self.base)
+        supply = None if self.supply is None else Supply(self.supply)
+        base = Drive(supply=supply) if self.base is None else actuator_from_mapping(self.base)
         return base.replaced(
-            {f"motor.{one.name}": one.value for one in self.estimates if one.name in OF_MOTOR}
+            {
+                f"motor.{estimate.name}": estimate.value
+                for estimate in self.estimates
+                if estimate.name in OF_MOTOR
+            }
         )
 
     def as_mapping(self) -> dict[str, Any]:
-        """As JSON-serialisable values."""
-        found = dataclasses.asdict(self) | {"problem": self.problem()}
-        found |= {"supply_text": self.supply_text, "base_text": self.base_text}
-        del found["traces"]
-        for one in (*found["fitted"], *found["held_out"]):
-            del one["trace"]
-        return found
+        """Return all results as values that JSON can store."""
+        values = dataclasses.asdict(self) | {"problem": self.problem()}
+        values |= {"supply_text": self.supply_text, "base_text": self.base_text}
+        # Arrays are plotted in reports, and would make the file large.
+        del values["traces"]
+        for prediction in (*values["fitted"], *values["held_out"]):
+            del prediction["trace"]
+        return values
 
     def write(self, folder: Path) -> list[Path]:
-        """Write result.json and, without a problem, actuator.yaml into a folder, whole or not at all.
+        """Write result.json and, without a problem, actuator.yaml into a folder, each atomically.
 
-        The actuator's file has a drive's fields and `identified`: their intervals. With a problem,
-        an actuator.yaml of an earlier fit is removed, because it would be taken for this one's.
+        The actuator's file has a drive's fields, and their intervals under `identified`. With a
+        problem, the actuator.yaml of an earlier fit is removed, because it would be mistaken for
+        the result of this fit.
 
         Returns:
             The paths of the files written.

@@ -1,4 +1,4 @@
-"""What is wrong with one signal of a log by itself: its resolution, repeated rows, clipping, outliers."""
+"""Checks of single signals of a log: resolution, repeated rows, clipping and outliers."""
 
 from collections.abc import Iterator
 
@@ -10,9 +10,10 @@ _MEASURED = "position", "velocity", "current", "torque"
 
 
 def signal_findings(log: Log) -> Iterator[Finding]:
-    """Look at each signal; only measured signals are clipped or spoiled, others rest where they like."""
+    """Check each signal by itself."""
     for signal in log.signals:
         yield from _resolution(log, signal)
+        # Commanded signals, such as the voltage, may rest at a limit or change seldom.
         if signal in _MEASURED:
             yield from _repeated(log, signal)
         if signal in ("current", "torque", "velocity"):
@@ -21,7 +22,7 @@ def signal_findings(log: Log) -> Iterator[Finding]:
 
 
 def _resolution(log: Log, signal: str) -> Iterator[Finding]:
-    """A quantisation that is coarse beside what the signal does."""
+    """Find a quantization that is coarse compared with the signal's range."""
     step, values, unit = log.resolution.get(signal, 0.0), log.signals[signal], SIGNALS[signal] or ""
     if step == 0.0 or signal in ("command", "temperature", "duty", "voltage", "bus"):
         return
@@ -33,16 +34,14 @@ def _resolution(log: Log, signal: str) -> Iterator[Finding]:
         )
         remedies = {
             "position": "move further, or use a finer encoder",
-            "velocity": (
-                "leave it out and give the position, or smooth it over several ms and give that"
-            ),
+            "velocity": "leave it out and use the position, or smooth it over several milliseconds",
         }
         remedy = remedies.get(signal, "measure in a smaller range, or drive harder")
         yield Finding("warning", "resolution", None, text, remedy)
 
 
 def _repeated(log: Log, signal: str) -> Iterator[Finding]:
-    """Find a signal that is read less often than rows are written, so that rows repeat what was read before."""
+    """Find a signal that is sampled less often than rows are written, so that values repeat."""
     steps = np.diff(log.signals[signal])
     changes = np.flatnonzero(steps)
     if len(changes) < 20:
@@ -60,19 +59,22 @@ def _repeated(log: Log, signal: str) -> Iterator[Finding]:
 
 
 def _saturation(log: Log, signal: str) -> Iterator[Finding]:
-    """Values that pile up at the highest or the lowest one, as a clipped signal's do."""
+    """Find values that accumulate at the highest or the lowest value, as in a clipped signal."""
     values = log.signals[signal]
     spread = float(np.ptp(values))
     for name, bound in (("highest", float(values.max())), ("lowest", float(values.min()))):
-        away = np.abs(values - bound)
-        near = max(0.05 * spread, 3.5 * log.resolution.get(signal, 0.0))
-        at, beside = away <= 1e-6 * spread, (away > 1e-6 * spread) & (away <= near)
-        # flat tops in the middle of motion; a signal that rests at 0 is not clipped there
-        if at.sum() >= 10 and at.sum() > 3 * beside.sum() and abs(bound) > 0.2 * spread:
-            row = int(log.row_numbers[np.flatnonzero(at)[0]])
+        distances = np.abs(values - bound)
+        margin = max(0.05 * spread, 3.5 * log.resolution.get(signal, 0.0))
+        clipped, nearby = (
+            distances <= 1e-6 * spread,
+            (distances > 1e-6 * spread) & (distances <= margin),
+        )
+        # A clipped signal has a flat top; a signal that rests near 0 is not clipped there.
+        if clipped.sum() >= 10 and clipped.sum() > 3 * nearby.sum() and abs(bound) > 0.2 * spread:
+            row = int(log.row_numbers[np.flatnonzero(clipped)[0]])
             text = (
-                f"{int(at.sum())} rows are at the {name} {signal}, {bound:.4g} {SIGNALS[signal]},"
-                " the first one here"
+                f"{int(clipped.sum())} rows are at the {name} {signal}, {bound:.4g}"
+                f" {SIGNALS[signal]}, the first one here"
             )
             remedy = (
                 "if the sensor is clipped there, measure in a larger range, or leave these rows out"
@@ -82,13 +84,14 @@ def _saturation(log: Log, signal: str) -> Iterator[Finding]:
 
 
 def _outliers(log: Log, signal: str) -> Iterator[Finding]:
-    """Single rows that leave both neighbours by much more than others do."""
+    """Find single rows that differ from both neighbors by much more than other rows do."""
     values = log.signals[signal]
     if len(values) < 50:
         return
     before, after = np.diff(values)[:-1], np.diff(values)[1:]
     height = np.where(before * after < 0.0, np.minimum(np.abs(before), np.abs(after)), 0.0)
-    if log.has("voltage"):  # where that jumps, the current may have a peak
+    # The current may have a peak where the voltage jumps.
+    if log.has("voltage"):
         jumps = np.abs(np.diff(log.signals["voltage"])) > 0.05 * float(
             np.ptp(log.signals["voltage"])
         )
@@ -99,16 +102,16 @@ def _outliers(log: Log, signal: str) -> Iterator[Finding]:
         return
     bound = max(5.0 * float(np.quantile(peaks, 0.8)), 4.0 * log.resolution.get(signal, 0.0))
     bound = max(bound, 0.02 * float(np.ptp(values)))
-    wild = np.flatnonzero(height > bound) + 1
-    if wild.size:
-        rows = ", ".join(str(log.row_numbers[row]) for row in wild[:5])
+    outliers = np.flatnonzero(height > bound) + 1
+    if outliers.size:
+        rows = ", ".join(str(log.row_numbers[row]) for row in outliers[:5])
         text = (
-            f"{signal} leaves both its neighbours by over {bound:.3g} {SIGNALS[signal]} in"
-            f" {wild.size} rows ({rows})"
+            f"{signal} differs from both neighboring rows by over {bound:.3g} {SIGNALS[signal]} in"
+            f" {outliers.size} rows ({rows})"
         )
         remedy = (
-            "nothing up to 1 % of the rows, which a robust fit bears; else find out where they come"
-            " from"
+            "none is needed up to 1 % of the rows, which a robust fit tolerates; else find their"
+            " cause"
         )
-        severity = "info" if wild.size / len(values) <= 0.01 else "warning"
-        yield Finding(severity, "outliers", int(log.row_numbers[wild[0]]), text, remedy)
+        severity = "info" if outliers.size / len(values) <= 0.01 else "warning"
+        yield Finding(severity, "outliers", int(log.row_numbers[outliers[0]]), text, remedy)

@@ -1,8 +1,8 @@
-"""A motor's winding and shaft, stepped by the time stamps of a log, for fits and for logs that are made alike.
+"""Simulation of a winding and a shaft by the time stamps of a log, for fits and for synthetic logs.
 
-Friction is that of `GearMotor`: what `codrl_mj.actuators.shaft.friction` takes from the motor's
-torque, and then Coulomb friction, which stops the shaft and holds it, as MuJoCo's constraint does.
-So fitted numbers mean there what they mean here.
+Friction is that of `GearMotor`: `codrl_mj.actuators.shaft.friction` is subtracted from the motor's
+torque, and then Coulomb friction stops and holds the shaft, as MuJoCo's friction constraint does.
+So fitted parameters have the same meaning in a simulation with MuJoCo.
 """
 
 import math
@@ -15,41 +15,44 @@ import numpy as np
 from codrl_mj.actuators import shaft
 from codrl_mj.compile_cache import njit
 
-LONGEST_SUBSTEP = 1e-3  # longer intervals between rows are cut into pieces of at most this [s]
+MAX_SUBSTEP = 1e-3
+"""Longest substep [s]; longer intervals between rows are divided."""
 
 
-class Moved(NamedTuple):
-    """What is moved, and what brakes it, all at the motor's output."""
+class ShaftParameters(NamedTuple):
+    """Inertia, load and friction of a shaft, at the motor's output."""
 
     inertia: float  # [kg*m^2], > 0
     gravity: float  # largest torque of gravity [N*m], m*g*l, against sin(position)
-    constant_torque: float  # held load [N*m], against positive speeds
+    constant_torque: float  # constant load [N*m], against positive speeds
     coulomb: float  # [N*m]
     viscous: float  # [N*m*s/rad]
     gear_efficiency: float  # in (0, 1]
     stribeck_friction: float  # [N*m]
     stribeck_speed: float  # [rad/s]
-    stribeck_exponent: float  # what `GearMotor.stribeck_exponent` is
-    rotor_inertia: float  # not used where the inertia is known; `shaft.friction` asks for it
-    gain: float  # torque [N*m] for one of the input
-    # torque [N*m] that the motor loses for one [rad/s]: kT*kE/R where the input is a voltage, else
-    # 0
+    stribeck_exponent: float  # `GearMotor.stribeck_exponent`
+    # `shaft.friction` reads this field, but ignores it when it is called with an inertia.
+    rotor_inertia: float
+    gain: float  # torque over the input [N*m per unit]
+    # Loss of torque per speed [N*m*s/rad]: kT*kE/R if the input is a voltage, else 0.
     braking: float
 
 
-def moved(number: Mapping[str, float], gain: float, braking: float = 0.0) -> Moved:
-    """By parameters as they are called in `PARAMETERS`, those of a motor at its rotor."""
-    ratio = number["gear_ratio"]
-    return Moved(
-        number["inertia"],
-        number["mgl"],
-        number["constant_torque"],
-        number["coulomb_friction"] * ratio,
-        number["viscous_friction"] * ratio**2,
-        number["gear_efficiency"],
-        number["stribeck_friction"] * ratio,
-        number["stribeck_speed"] / ratio,
-        number.get("stribeck_exponent", 2.0),
+def shaft_parameters(
+    parameters: Mapping[str, float], gain: float, braking: float = 0.0
+) -> ShaftParameters:
+    """Convert parameters by the names of `PARAMETERS` from the rotor to the output."""
+    ratio = parameters["gear_ratio"]
+    return ShaftParameters(
+        parameters["inertia"],
+        parameters["mgl"],
+        parameters["constant_torque"],
+        parameters["coulomb_friction"] * ratio,
+        parameters["viscous_friction"] * ratio**2,
+        parameters["gear_efficiency"],
+        parameters["stribeck_friction"] * ratio,
+        parameters["stribeck_speed"] / ratio,
+        parameters.get("stribeck_exponent", 2.0),
         0.0,
         gain,
         braking,
@@ -57,7 +60,7 @@ def moved(number: Mapping[str, float], gain: float, braking: float = 0.0) -> Mov
 
 
 @njit(nogil=True, error_model="numpy")
-def winding(
+def simulate_winding(
     times: np.ndarray,
     volts: np.ndarray,
     speeds: np.ndarray,
@@ -66,96 +69,117 @@ def winding(
     inductance: float,
     constant: float,
 ) -> np.ndarray:
-    """Currents [A] at the times, (n,), exactly: voltages and speeds hold till the next row."""
+    """Return the currents [A] at the times, shape (n,), exactly for held voltages and speeds."""
     currents = np.empty(len(times))
     currents[0] = current
     for row in range(len(times) - 1):
-        lost = -math.expm1(-resistance * (times[row + 1] - times[row]) / inductance)
+        # expm1 keeps its accuracy when the step is much shorter than the time constant L/R.
+        share = -math.expm1(-resistance * (times[row + 1] - times[row]) / inductance)
         final = (volts[row] - constant * speeds[row]) / resistance
-        currents[row + 1] = currents[row] + (final - currents[row]) * lost
+        currents[row + 1] = currents[row] + (final - currents[row]) * share
     return currents
 
 
+# numba needs the function as a global of this module.
 _friction: Any = numba.njit(shaft.friction)
 _Shaft: Any = shaft.Shaft
 
 
 @njit(nogil=True, error_model="numpy")
-def turned(
-    duration: float, given: float, slope: float, position: float, speed: float, moved: Any
+def step_shaft(
+    duration: float, drive: float, slope: float, position: float, speed: float, parameters: Any
 ) -> tuple[float, float]:
-    """Position [rad] and speed [rad/s] after a duration [s] under an input that grows by `slope` [1/s].
+    """Return position [rad] and speed [rad/s] after a duration [s].
 
-    Gravity acts in the middle of a substep, and viscous friction by its mean speed: both to second
-    order; dry friction is an implicit step, and never chatters.
+    The input begins at `drive` and grows by `slope` [1/s]. Gravity acts in the middle of a substep,
+    and viscous friction acts on its mean speed: both are of second order. Dry friction is an
+    implicit step, which never chatters.
     """
-    pieces = max(math.ceil(duration / LONGEST_SUBSTEP - 1e-6), 1)
-    step = duration / pieces
-    damped = 0.5 * step * (moved.viscous + moved.braking) / moved.inertia
-    inertia = moved.inertia * (
-        1.0 + damped
-    )  # as dry friction finds it, so that it ends where torques balance
-    for piece in range(pieces):
+    substeps = max(math.ceil(duration / MAX_SUBSTEP - 1e-6), 1)
+    step = duration / substeps
+    damping = 0.5 * step * (parameters.viscous + parameters.braking) / parameters.inertia
+    # With the implicit damping included, a shaft comes to rest exactly where its torques balance.
+    inertia = parameters.inertia * (1.0 + damping)
+    for substep in range(substeps):
         position += 0.5 * step * speed
-        driving = moved.gain * (given + slope * (piece + 0.5) * step)
-        others = -moved.constant_torque
-        if moved.gravity != 0.0:  # a sine takes as long as all the rest
-            others -= moved.gravity * math.sin(position)
-        free = (speed * (1.0 - damped) + step * (driving + others) / moved.inertia) / (1.0 + damped)
-        if (
-            moved.gear_efficiency < 1.0 or moved.stribeck_friction > 0.0
-        ):  # of the torque after back-EMF
-            torque = driving - 0.5 * moved.braking * (speed + free)
-            rest = (free - speed) / step - torque / inertia
-            free -= step * _friction(moved, step, torque, _Shaft(inertia, rest, speed)) / inertia
-        most = step * moved.coulomb / inertia
-        speed = 0.0 if abs(free) <= most else free - math.copysign(most, free)
+        driving = parameters.gain * (drive + slope * (substep + 0.5) * step)
+        load = -parameters.constant_torque
+        # The sine takes as long as the rest of a substep: it is skipped without gravity.
+        if parameters.gravity != 0.0:
+            load -= parameters.gravity * math.sin(position)
+        free_speed = (speed * (1.0 - damping) + step * (driving + load) / parameters.inertia) / (
+            1.0 + damping
+        )
+        if parameters.gear_efficiency < 1.0 or parameters.stribeck_friction > 0.0:
+            # The gear transmits the motor's torque after its loss by the back-EMF.
+            torque = driving - 0.5 * parameters.braking * (speed + free_speed)
+            acceleration = (free_speed - speed) / step - torque / inertia
+            free_speed -= (
+                step
+                * _friction(parameters, step, torque, _Shaft(inertia, acceleration, speed))
+                / inertia
+            )
+        # Coulomb friction removes at most this speed in a substep, and stops a slower shaft.
+        max_change = step * parameters.coulomb / inertia
+        speed = (
+            0.0
+            if abs(free_speed) <= max_change
+            else free_speed - math.copysign(max_change, free_speed)
+        )
         position += 0.5 * step * speed
     return position, speed
 
 
 @njit(nogil=True, error_model="numpy")
-def moving(
+def simulate_shaft(
     times: np.ndarray,
     inputs: np.ndarray,
     slopes: np.ndarray,
     position: float,
     speed: float,
-    moved: Any,
+    parameters: Any,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and speeds at the times, each (n,), under inputs[k] + slopes[k]*(t - times[k]) between two rows."""
+    """Return positions and speeds at the times, each of shape (n,).
+
+    The input between two rows is inputs[k] + slopes[k]*(t - times[k]).
+    """
     positions, speeds = np.empty(len(times)), np.empty(len(times))
     positions[0], speeds[0] = position, speed
     for row in range(len(times) - 1):
-        position, speed = turned(
-            times[row + 1] - times[row], inputs[row], slopes[row], position, speed, moved
+        position, speed = step_shaft(
+            times[row + 1] - times[row], inputs[row], slopes[row], position, speed, parameters
         )
         positions[row + 1], speeds[row + 1] = position, speed
     return positions, speeds
 
 
 @njit(nogil=True, error_model="numpy")
-def served(
+def simulate_servo(
     times: np.ndarray,
     targets: np.ndarray,
     limits: np.ndarray,
-    law: float,
+    gain: float,
     position: float,
     speed: float,
-    moved: Any,
+    parameters: Any,
 ) -> np.ndarray:
-    """Positions at the times, (n,), where an input of law*(target - position), within its limit, holds for a row."""
+    """Return the positions of a servo at the times, shape (n,).
+
+    Its input gain*(target - position), clipped to the limit, is held until the next row.
+    """
     positions = np.empty(len(times))
     positions[0] = position
     for row in range(len(times) - 1):
-        given = min(max(law * (targets[row] - position), -limits[row]), limits[row])
-        position, speed = turned(times[row + 1] - times[row], given, 0.0, position, speed, moved)
+        drive = min(max(gain * (targets[row] - position), -limits[row]), limits[row])
+        position, speed = step_shaft(
+            times[row + 1] - times[row], drive, 0.0, position, speed, parameters
+        )
         positions[row + 1] = position
     return positions
 
 
 @njit(nogil=True, error_model="numpy")
-def driven(
+def simulate_samples(
     period: float,
     shares: np.ndarray,
     limit: float,
@@ -164,23 +188,34 @@ def driven(
     locked: bool,
     position: float,
 ) -> np.ndarray:
-    """Voltage, current, speed and position of the output, and bus voltage of a drive at each sample, shape (n, 5).
+    """Simulate a drive, and return its states at each sample, shape (n, 5).
 
-    The winding is exact between the samples, at the speed in their middle; the shaft moves half a
-    sample before and half a sample after it (Strang's splitting, of second order). `parts` are (R,
-    L, kE at the output), and a `Moved`.
+    The winding is exact between two samples at the speed in their middle; the shaft moves for half
+    a sample before and after it (Strang splitting, of second order).
+
+    Args:
+        period: of the samples [s].
+        shares: of the supply's voltage at each sample, in [-1, 1].
+        limit: voltage of the supply without load [V].
+        sag: resistance of the supply [ohm].
+        parts: R, L and kE at the output, and `ShaftParameters`.
+        locked: whether the shaft is held.
+        position: at the start [rad].
+
+    Returns:
+        Voltage, current, speed and position of the output, and voltage of the bus.
     """
     states = np.empty((len(shares), 5))
-    (resistance, inductance, constant), moved = parts
+    (resistance, inductance, constant), parameters = parts
     current, speed, decay = 0.0, 0.0, math.exp(-resistance * period / inductance)
     for row in range(len(shares)):
         bus = limit - sag * shares[row] * current
         voltage = shares[row] * bus
         states[row] = voltage, current, speed, position, bus
         if not locked:
-            position, speed = turned(0.5 * period, current, 0.0, position, speed, moved)
-        reached = (voltage - constant * speed) / resistance
-        current = reached + (current - reached) * decay
+            position, speed = step_shaft(0.5 * period, current, 0.0, position, speed, parameters)
+        final = (voltage - constant * speed) / resistance
+        current = final + (current - final) * decay
         if not locked:
-            position, speed = turned(0.5 * period, current, 0.0, position, speed, moved)
+            position, speed = step_shaft(0.5 * period, current, 0.0, position, speed, parameters)
     return states

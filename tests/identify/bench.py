@@ -1,4 +1,4 @@
-"""Logs of known motors, made by others: scipy's matrix exponential, and MuJoCo."""
+"""Logs of known motors from independent simulations: scipy's matrix exponential, and MuJoCo."""
 
 import mujoco
 import numpy as np
@@ -6,7 +6,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from codrl_mj.identify import Log, read_log
-from codrl_mj.identify.simulation import Moved, moving
+from codrl_mj.identify.simulation import ShaftParameters, simulate_shaft
 from tests.published import folder_of
 
 PENDULUM = "time=time:s,position=position:rad,torque=torque:N*m"
@@ -20,10 +20,12 @@ LOOP = 20000.0
 
 
 def pendulum_log(name):
+    """Return a published log of a real pendulum."""
     return read_log(folder_of("dfki_pendulum") / f"{name}.csv", PENDULUM)
 
 
 def prbs(time, random, clock=2e-3):
+    """Return random signs that change at a clock [s]."""
     bits = random.choice([-1.0, 1.0], int(time[-1] / clock) + 1)
     return bits[(time / clock + 1e-9).astype(int)]
 
@@ -31,16 +33,18 @@ def prbs(time, random, clock=2e-3):
 def motor_log(
     kind="prbs", rate=5000, duration=2.0, noise=0.01, step=0.0, seed=0, mean=True, clock=2e-3
 ):
-    """A free or locked DC motor with viscous friction under a voltage that changes at 20 kHz; exact: x' = A x + B u.
+    """Return an exact log, x' = A x + B u, of a DC motor under a voltage that changes at 20 kHz.
+
+    The motor has viscous friction and is free or locked.
 
     Args:
         kind: `prbs` with a slow sine, `sine`, or `locked`, a PRBS on a held shaft.
         rate: of the rows [Hz].
-        duration: [s].
-        noise: of the current, as a share of its largest value.
-        step: of the encoder [rad]; 0: none.
+        duration: of the log [s].
+        noise: standard deviation of the current over its largest value.
+        step: of the encoder [rad]; 0: exact.
         seed: of the PRBS and the noise.
-        mean: whether rows have the mean voltage, or that of their time.
+        mean: True if rows have the mean voltage, False if they have the instantaneous one.
         clock: of the PRBS [s].
     """
     random = np.random.default_rng(seed)
@@ -54,27 +58,28 @@ def motor_log(
     exact = expm(system / LOOP)
     poles, modes = np.linalg.eig(exact[:3, :3])
     gains = np.linalg.solve(modes, exact[:3, 3])
-    each = [
+    # The decoupled modes are first-order filters, which are fast at 20 kHz.
+    mode_states = [
         lfilter([0.0, gain], [1.0, -pole], volts) for gain, pole in zip(gains, poles, strict=True)
     ]
-    states = np.real(modes @ each).T
-    every = round(LOOP / rate)
-    current, position = states[::every, 0], states[::every, 2]
+    states = np.real(modes @ mode_states).T
+    stride = round(LOOP / rate)
+    current, position = states[::stride, 0], states[::stride, 2]
     current = current + noise * np.abs(states[:, 0]).max() * random.standard_normal(len(current))
     if step:
         position = np.round(position / step) * step
-    told = volts.reshape(-1, every).mean(axis=1) if mean else volts[::every]
+    voltage = volts.reshape(-1, stride).mean(axis=1) if mean else volts[::stride]
     return Log(
         kind,
-        time[::every],
-        {"voltage": told, "current": current, "position": position},
+        time[::stride],
+        {"voltage": voltage, "current": current, "position": position},
         {"position": step},
         mean,
     )
 
 
 def geared_pendulum(efficiency, seed=0):
-    """A pendulum of 0.19 kg*m^2 and 3.6 N*m behind a gear of an efficiency, at 2 ms, and an encoder of 3 mrad."""
+    """Return a log at 2 ms of a pendulum of 0.19 kg*m^2 and 3.6 N*m behind a gear."""
     time = np.linspace(0.0, 6.0, 12001)
     torque = np.sum(
         [
@@ -83,9 +88,10 @@ def geared_pendulum(efficiency, seed=0):
         ],
         axis=0,
     )
-    moved = Moved(0.19, 3.6, 0.0, 0.05, 0.01, efficiency, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
+    shaft = ShaftParameters(0.19, 3.6, 0.0, 0.05, 0.01, efficiency, 0.0, 1.0, 2.0, 0.0, 1.0, 0.0)
     position = (
-        np.round(moving(time, torque, np.zeros(12001), 0.0, 0.0, moved)[0][::4] / 3e-3) * 3e-3
+        np.round(simulate_shaft(time, torque, np.zeros(12001), 0.0, 0.0, shaft)[0][::4] / 3e-3)
+        * 3e-3
     )
     return Log(
         f"geared{seed}",
@@ -96,18 +102,20 @@ def geared_pendulum(efficiency, seed=0):
 
 
 def mujoco_pendulum(
-    seed=0, duration=8.0, coulomb=0.15, viscous=0.01, step=3e-3, every=10, effort="torque"
+    seed=0, duration=8.0, coulomb=0.15, viscous=0.01, step=3e-3, stride=10, effort="torque"
 ):
-    """A pendulum of 0.19 kg*m^2 and 3.6 N*m with friction, pushed about by smooth torques; MuJoCo's, at 0.2 ms.
+    """Return a log of a pendulum of 0.19 kg*m^2 and 3.6 N*m in MuJoCo, at steps of 0.2 ms.
+
+    Smooth torques move it against friction.
 
     Args:
         seed: of the torques.
-        duration: [s].
-        coulomb: [N*m].
-        viscous: [N*m*s/rad].
+        duration: of the log [s].
+        coulomb: friction [N*m].
+        viscous: friction [N*m*s/rad].
         step: of the encoder [rad].
-        every: steps for a row.
-        effort: what the torque is called, a `current` if it is that of a motor with 1 N*m/A.
+        stride: simulation steps per row.
+        effort: name of the logged torque; `current` for that of a motor with 1 N*m/A.
     """
     model = mujoco.MjModel.from_xml_string(
         f"""<mujoco><option timestep="2e-4" integrator="implicitfast"/><worldbody><body>
@@ -129,8 +137,8 @@ def mujoco_pendulum(
         position[row] = data.qpos[0]
         data.ctrl[0] = torque[row]
         mujoco.mj_step(model, data)
-    rows = slice(None, None, every)
-    seen = np.round(position[rows] / step) * step
+    rows = slice(None, None, stride)
+    measured = np.round(position[rows] / step) * step
     return Log(
-        f"swing{seed}", time[rows], {"position": seen, effort: torque[rows]}, {"position": step}
+        f"swing{seed}", time[rows], {"position": measured, effort: torque[rows]}, {"position": step}
     )

@@ -1,7 +1,7 @@
-"""Motors of ours that are known, identified from logs with and without faults: how often, how well, and what is said.
+"""Identification of random known motors from simulated logs with and without faults.
 
-`python -m tests.identify.draws --draws 100` prints a table of excitations, with `--faults` one of
-faults of a PRBS log.
+`python -m tests.identify.draws --draws 100` prints a table of excitations, with `--faults` a table
+of faults of a PRBS log: rates, errors and messages.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import numpy as np
 from codrl_mj.actuators import Drive, GearMotor, SampledLoop, Supply
 from codrl_mj.identify import identify
 from codrl_mj.identify.checks import check
-from codrl_mj.identify.synthetic import Excitation, Sampler, Sensor, run, simulate
+from codrl_mj.identify.synthetic import Excitation, Sampler, Sensor, simulate, simulate_drive
 
 VOLTS = 12.0
 NAMES = {
@@ -35,30 +35,36 @@ GOALS = {
     "viscous": 0.05,
     "friction": 0.05,
 }
-"""Relative errors within which what is identified is asked to be."""
-KINDS = ("prbs", "locked_prbs", "chirp", "square", "slow_sine")
+"""Largest relative errors of parameters that count as identified."""
+EXCITATIONS = ("prbs", "locked_prbs", "chirp", "square", "slow_sine")
 SLOW = {"rate": 1000.0}
 ROWS = {
-    **{f"{kind} 5 kHz": {"kind": kind} for kind in KINDS},
-    **{f"{kind} 1 kHz": {"kind": kind, **SLOW} for kind in KINDS},
+    **{f"{kind} 5 kHz": {"kind": kind} for kind in EXCITATIONS},
+    **{f"{kind} 1 kHz": {"kind": kind, **SLOW} for kind in EXCITATIONS},
     **{
-        f"{kind} 5 kHz, instantaneous": {"kind": kind, "voltage": "instantaneous"} for kind in KINDS
+        f"{kind} 5 kHz, instantaneous": {"kind": kind, "voltage": "instantaneous"}
+        for kind in EXCITATIONS
     },
     **{
         f"{kind} 1 kHz, together": {"kind": kind, "voltage": "together", **SLOW}
-        for kind in KINDS[:2]
+        for kind in EXCITATIONS[:2]
     },
     "prbs 5 kHz, jitter 10 %": {"jitter": 0.1},
     "prbs 5 kHz, encoder of 512 steps": {"encoder": 512},
 }
-"""Name -> arguments of `logged`. The voltage of a row: the mean to the next one; what it is at the
-time, while it changes by a clock of its own; or what holds until the next one, changing together
-with the rows.
+"""Name -> arguments of `make_log`.
+
+The voltage of a row is its mean until the next row; its instantaneous value, with a separate clock;
+or a voltage that changes together with the rows and is held until the next one.
 """
 
 
-def motor_of(draw: int) -> GearMotor:
-    """A motor of 0.5 to 5 ohm, L/R of 0.3 to 1 ms, a mechanical time constant of 10 to 60 ms, 3 to 11 % of friction."""
+def random_motor(draw: int) -> GearMotor:
+    """Return a random motor.
+
+    It has 0.5 to 5 ohm, L/R of 0.3 to 1 ms, a mechanical time constant of 10 to 60 ms, and friction
+    of 3 to 11 % of the torque.
+    """
     random = np.random.default_rng(draw)
 
     def between(low, high):
@@ -77,7 +83,7 @@ def motor_of(draw: int) -> GearMotor:
     )
 
 
-def logged(
+def make_log(
     draw,
     kind="prbs",
     rate=5000.0,
@@ -88,8 +94,8 @@ def logged(
     sag=0.0,
     **sensors,
 ):
-    """The motor of a draw, its log of 3 s through 1 % of noise on the current and an encoder."""
-    motor = motor_of(draw)
+    """Return a log of 3 s of a random motor, with 1 % of noise on the current and an encoder."""
+    motor = random_motor(draw)
     drive = Drive(motor, SampledLoop(), Supply(VOLTS, sag * motor.resistance))
     clock = 4.0 * motor.electrical_time_constant
     if voltage == "together":
@@ -97,120 +103,146 @@ def logged(
     excitation = Excitation(
         kind, 0.5 * VOLTS, 3.0, frequency=2.0 if kind == "square" else 0.5, clock=clock
     )
-    peak = float(np.abs(run(drive, excitation).signals["current"]).max())
-    seen = {"current": Sensor(0.01 * peak), "position": Sensor(resolution=2.0 * math.pi / encoder)}
+    peak = float(np.abs(simulate_drive(drive, excitation).signals["current"]).max())
+    all_sensors = {
+        "current": Sensor(0.01 * peak),
+        "position": Sensor(resolution=2.0 * math.pi / encoder),
+    }
     for name, changes in sensors.items():
-        seen[name] = dataclasses.replace(seen.get(name, Sensor()), **changes)
+        all_sensors[name] = dataclasses.replace(all_sensors.get(name, Sensor()), **changes)
     log = simulate(
         drive,
         excitation,
-        sensors=seen,
+        sensors=all_sensors,
         sampler=Sampler(rate, jitter, dropped, voltage == "mean"),
         seed=draw,
     )
-    return only(log, "voltage", "current", *(() if kind == "locked_prbs" else ("position",)))
+    return select_signals(
+        log, "voltage", "current", *(() if kind == "locked_prbs" else ("position",))
+    )
 
 
-def only(log, *names):
+def select_signals(log, *names):
+    """Return a log with only some of its signals."""
     return dataclasses.replace(log, signals={name: log.signals[name] for name in names})
 
 
-def scaled(log, **factors):
+def scale_signals(log, **factors):
+    """Return a log with signals multiplied by factors."""
     signals = {name: factors.get(name, 1.0) * values for name, values in log.signals.items()}
     resolution = {name: abs(factors.get(name, 1.0)) * step for name, step in log.resolution.items()}
     return dataclasses.replace(log, signals=signals, resolution=resolution)
 
 
-def late(log, rows):
-    """The voltage some rows before it is in force."""
+def advance_voltage(log, rows):
+    """Return a log whose voltage is logged a number of rows too early."""
     return dataclasses.replace(
         log, signals={**log.signals, "voltage": np.roll(log.signals["voltage"], -rows)}
     )
 
 
-def uniform(log):
-    """As if no row were missing, and every step the same."""
+def assume_uniform_times(log):
+    """Return a log with uniform times, as if no row were missing and all steps were equal."""
     return dataclasses.replace(log, time=np.arange(len(log.time)) * log.step)
 
 
-def called(log, mean):
+def declare_mean(log, mean):
+    """Return a log whose voltage is declared as a mean or as held."""
     return dataclasses.replace(log, mean_voltage=mean)
 
 
-def largest(draw):
-    return VOLTS / motor_of(draw).resistance
+def stall_current(draw):
+    """Return the current [A] of a locked motor at the supply's voltage."""
+    return VOLTS / random_motor(draw).resistance
 
 
-def spiky(log, name):
-    """A signal with 0.5 % of outliers."""
+def add_outliers(log, name):
+    """Return a log with 0.5 % of outliers in a signal."""
     random, values = np.random.default_rng(0), log.signals[name].copy()
     values[random.choice(len(values), len(values) // 200, replace=False)] += 5.0 * np.std(values)
     return dataclasses.replace(log, signals={**log.signals, name: values})
 
 
 FAULTS = {
-    "none": logged,
-    "voltage 1 row early": lambda draw: late(logged(draw), 1),
-    "voltage 6 rows early": lambda draw: late(logged(draw), 6),
-    "supply sags by 0.15 R": lambda draw: logged(draw, sag=0.15),
-    "current 10 % too large": lambda draw: scaled(logged(draw), current=1.1),
-    "current offset by 2 % of its largest": lambda draw: logged(
-        draw, current={"bias": 0.02 * largest(draw)}
+    "none": make_log,
+    "voltage 1 row early": lambda draw: advance_voltage(make_log(draw), 1),
+    "voltage 6 rows early": lambda draw: advance_voltage(make_log(draw), 6),
+    "supply sags by 0.15 R": lambda draw: make_log(draw, sag=0.15),
+    "current 10 % too large": lambda draw: scale_signals(make_log(draw), current=1.1),
+    "current offset by 2 % of its largest": lambda draw: make_log(
+        draw, current={"bias": 0.02 * stall_current(draw)}
     ),
-    "5 % of the rows missing": lambda draw: logged(draw, dropped=0.05),
-    "missing rows, taken for uniform": lambda draw: uniform(logged(draw, dropped=0.05)),
-    "stamps jitter by 10 %": lambda draw: logged(draw, jitter=0.1),
-    "jitter, taken for uniform": lambda draw: uniform(logged(draw, jitter=0.1)),
-    "0.5 % outliers of the current": lambda draw: logged(draw, current={"outliers": 0.005}),
-    "0.5 % outliers of the position": lambda draw: logged(draw, position={"outliers": 0.005}),
-    "0.5 % outliers of the voltage": lambda draw: spiky(logged(draw), "voltage"),
-    "encoder of 512 steps": lambda draw: logged(draw, encoder=512),
-    "sign of the current": lambda draw: scaled(logged(draw), current=-1.0),
-    "sign of the voltage": lambda draw: scaled(logged(draw), voltage=-1.0),
-    "sign of the position": lambda draw: scaled(logged(draw), position=-1.0),
-    "mA for A": lambda draw: scaled(logged(draw), current=1e3),
-    "degrees for radians": lambda draw: scaled(logged(draw), position=180.0 / math.pi),
-    "time in ms": lambda draw: dataclasses.replace(logged(draw), time=1e3 * logged(draw).time),
-    "a voltage of the rows' times, called mean": lambda draw: called(
-        logged(draw, voltage="instantaneous"), True
+    "5 % of the rows missing": lambda draw: make_log(draw, dropped=0.05),
+    "missing rows, taken for uniform": lambda draw: assume_uniform_times(
+        make_log(draw, dropped=0.05)
     ),
-    "a mean, called the voltage of the row": lambda draw: called(logged(draw), False),
+    "stamps jitter by 10 %": lambda draw: make_log(draw, jitter=0.1),
+    "jitter, taken for uniform": lambda draw: assume_uniform_times(make_log(draw, jitter=0.1)),
+    "0.5 % outliers of the current": lambda draw: make_log(draw, current={"outliers": 0.005}),
+    "0.5 % outliers of the position": lambda draw: make_log(draw, position={"outliers": 0.005}),
+    "0.5 % outliers of the voltage": lambda draw: add_outliers(make_log(draw), "voltage"),
+    "encoder of 512 steps": lambda draw: make_log(draw, encoder=512),
+    "sign of the current": lambda draw: scale_signals(make_log(draw), current=-1.0),
+    "sign of the voltage": lambda draw: scale_signals(make_log(draw), voltage=-1.0),
+    "sign of the position": lambda draw: scale_signals(make_log(draw), position=-1.0),
+    "mA for A": lambda draw: scale_signals(make_log(draw), current=1e3),
+    "degrees for radians": lambda draw: scale_signals(make_log(draw), position=180.0 / math.pi),
+    "time in ms": lambda draw: dataclasses.replace(make_log(draw), time=1e3 * make_log(draw).time),
+    "a voltage of the rows' times, called mean": lambda draw: declare_mean(
+        make_log(draw, voltage="instantaneous"), True
+    ),
+    "a mean, called the voltage of the row": lambda draw: declare_mean(make_log(draw), False),
 }
 
 
-def tried(make, draw):
-    """Of one draw: short name -> status, relative error, whether the truth is within the interval; and what is said."""
-    motor, log = motor_of(draw), make(draw)
-    said = [f"{one.check} ({one.severity})" for one in check(log) if one.severity != "info"]
+def identify_draw(make_draw_log, draw):
+    """Check and identify the log of a draw.
+
+    Returns:
+        Status, relative error and True if the truth is within the interval, by short name; and the
+        messages.
+    """
+    motor, log = random_motor(draw), make_draw_log(draw)
+    messages = [
+        f"{finding.check} ({finding.severity})"
+        for finding in check(log)
+        if finding.severity != "info"
+    ]
     try:
-        found = identify([log], "free" if log.has("position") else None, seed=draw)
+        result = identify([log], "free" if log.has("position") else None, seed=draw)
     except ValueError as error:
-        return {}, [*said, str(error)[:40]]
-    said += ["residuals" for text in found.warnings if "residuals" in text][:1]
-    said += [f"{part} {rows:+g} rows" for part, rows in found.delays.items() if rows]
-    named, numbers = {one.name: one for one in found.estimates}, {}
+        return {}, [*messages, str(error)[:40]]
+    messages += ["residuals" for text in result.warnings if "residuals" in text][:1]
+    messages += [f"{part} {rows:+g} rows" for part, rows in result.delays.items() if rows]
+    estimates, outcomes = {estimate.name: estimate for estimate in result.estimates}, {}
     for short, name in NAMES.items():
-        if name in named:
-            one, truth = named[name], _truth(motor, named, name)
-            numbers[short] = one.status, one.value / truth - 1.0, one.low <= truth <= one.high
-    return numbers, sorted(set(said))
+        if name in estimates:
+            number, truth = estimates[name], _true_value(motor, estimates, name)
+            outcomes[short] = (
+                number.status,
+                number.value / truth - 1.0,
+                number.low <= truth <= number.high,
+            )
+    return outcomes, sorted(set(messages))
 
 
-def _truth(motor, named, name):
-    if name == "friction_torque":  # at the speed at which the sum of both was taken
-        coulomb, viscous = named["coulomb_friction"].value, named["viscous_friction"].value
+def _true_value(motor, estimates, name):
+    """Return the true value of a parameter."""
+    # The total friction depends on the speed at which the fit adds up its kinds.
+    if name == "friction_torque":
+        coulomb, viscous = estimates["coulomb_friction"].value, estimates["viscous_friction"].value
         return (
             motor.coulomb_friction
-            + motor.viscous_friction * (named[name].value - coulomb) / viscous
+            + motor.viscous_friction * (estimates[name].value - coulomb) / viscous
         )
     return motor.rotor_inertia if name == "inertia" else getattr(motor, name)
 
 
-def cell(several):
-    """Of a parameter in all draws: how many identified, of these within the interval and beyond the goal; the rough."""
+def format_cell(outcomes):
+    """Return the counts and the largest error of a parameter in all draws, as text."""
     texts = []
     for status in ("identified", "rough"):
-        errors = [(error, inside) for one, error, inside in several if one == status]
+        errors = [(error, inside) for outcome, error, inside in outcomes if outcome == status]
         if errors or status == "identified":
             worst = f", {100.0 * max(abs(error) for error, _ in errors):.2g} %" if errors else ""
             texts.append(f"{len(errors)}, {sum(inside for _, inside in errors)}{worst}")
@@ -223,12 +255,12 @@ def main():
     )
     parser.add_argument("--draws", type=int, default=100)
     parser.add_argument("--faults", action="store_true")
-    parser.add_argument("--only", nargs="*", help="rows, by their whole names")
+    parser.add_argument("--only", nargs="*", help="full names of the rows to compute")
     options = parser.parse_args()
     rows = (
         FAULTS
         if options.faults
-        else {name: lambda draw, row=row: logged(draw, **row) for name, row in ROWS.items()}
+        else {name: lambda draw, row=row: make_log(draw, **row) for name, row in ROWS.items()}
     )
     print(
         f"of {options.draws} draws: identified, of these within the interval, largest error; rough:"
@@ -239,17 +271,18 @@ def main():
         f" {'--- | ' * (len(NAMES) + 1)}--- |"
     )
     for name in options.only or rows:
-        found = [tried(rows[name], draw) for draw in range(options.draws)]
-        cells, off = [], {}
+        results = [identify_draw(rows[name], draw) for draw in range(options.draws)]
+        cells, exceeded = [], {}
         for short in NAMES:
-            several = [numbers[short] for numbers, _ in found if short in numbers]
-            cells.append(cell(several))
+            outcomes = [numbers[short] for numbers, _ in results if short in numbers]
+            cells.append(format_cell(outcomes))
             if count := sum(
-                one == "identified" and abs(error) > GOALS[short] for one, error, _ in several
+                status == "identified" and abs(error) > GOALS[short]
+                for status, error, _ in outcomes
             ):
-                off[short] = count
-        said = dict(collections.Counter(text for _, texts in found for text in texts))
-        print(f"| {name} | {' | '.join(cells)} | {off or ''} | {said} |", flush=True)
+                exceeded[short] = count
+        messages = dict(collections.Counter(text for _, texts in results for text in texts))
+        print(f"| {name} | {' | '.join(cells)} | {exceeded or ''} | {messages} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A geared motor of the catalogue, moved by MuJoCo, identified beside its datasheet, and played back by MuJoCo."""
+"""A geared catalog motor: simulated by MuJoCo, identified with its datasheet, and replayed."""
 
 import mujoco
 import numpy as np
@@ -15,8 +15,8 @@ MGL, LOAD = MASS * 9.81 * ARM, MASS * ARM**2
 STEP, ROWS = 5e-4, 4
 
 
-def swung(drive, volts, name="swing"):
-    """Position of a pendulum behind a drive under voltages [V] that hold for 2 ms each; MuJoCo's, at 0.5 ms."""
+def simulate_pendulum(drive, volts, name="swing"):
+    """Return a log of a pendulum in MuJoCo, at steps of 0.5 ms, under voltages [V] of 2 ms each."""
     spec = mujoco.MjSpec.from_string(
         f"""<mujoco><option timestep="{STEP}"/><worldbody><body><joint name="hinge" axis="0 1 0"/>
         <inertial mass="{MASS}" pos="0 0 {-ARM}" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody>
@@ -33,8 +33,8 @@ def swung(drive, volts, name="swing"):
     return Log(name, time, {"voltage": np.asarray(volts), "position": position})
 
 
-def voltages(seed, duration=3.0):
-    """A slow sine and random steps [V]."""
+def random_voltages(seed, duration=3.0):
+    """Return a slow sine plus random steps [V]."""
     random, time = (
         np.random.default_rng(seed),
         np.arange(round(duration / STEP / ROWS)) * STEP * ROWS,
@@ -45,7 +45,7 @@ def voltages(seed, duration=3.0):
 
 @pytest.fixture(scope="module")
 def swings():
-    return [swung(MX, voltages(seed), f"swing{seed}") for seed in (1, 2)]
+    return [simulate_pendulum(MX, random_voltages(seed), f"swing{seed}") for seed in (1, 2)]
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +54,8 @@ def geared(swings):
     return identify(swings[:1], "pendulum", known, held_out=swings[1:], base=MX.as_mapping())
 
 
-def test_a_geared_motor_is_found_beside_its_datasheet(geared):
-    """With an efficiency of 1 in the fit the torque constant was 15 % off, and the inertia 14 %."""
+def test_a_geared_motor_is_identified_with_its_datasheet(geared):
+    """The fit has to use the datasheet's efficiency: with 1 the constant would be 15 % off."""
     truth = {"torque_constant": MX.motor.torque_constant, "rotor_inertia": MX.motor.rotor_inertia}
     truth["inertia"] = LOAD + MX.motor.rotor_inertia * MX.motor.gear_ratio**2
     for name, value in truth.items():
@@ -68,18 +68,18 @@ def test_a_geared_motor_is_found_beside_its_datasheet(geared):
     assert "inductance = 0.0002927 H" in geared.base_text
 
 
-def test_what_is_written_moves_as_the_report_says(geared, swings, tmp_path):
-    """The whole log at once, of which the report has half a second at a time: no torque is lost twice."""
+def test_the_written_actuator_reproduces_the_prediction(geared, swings, tmp_path):
+    """A simulation of the whole log has the reported error: friction is not applied twice."""
     path, _ = geared.write(tmp_path)
     log = swings[1]
-    again = swung(resolve(str(path), None, "a test"), log.signals["voltage"])
-    error = np.abs(again.signals["position"] - log.signals["position"]).mean()
+    replayed = simulate_pendulum(resolve(str(path), None, "a test"), log.signals["voltage"])
+    error = np.abs(replayed.signals["position"] - log.signals["position"]).mean()
     assert error < 3.0 * geared.held_out[0].open_loop < 3e-3
 
 
-def test_an_efficiency_that_the_loads_contradict_is_hinted_at(swings):
+def test_a_wrong_efficiency_of_the_datasheet_gives_a_hint(swings):
     base = MX.replaced({"motor.gear_efficiency": 0.5}).as_mapping()
     known = {"mgl": MGL, "load_inertia": LOAD, "resistance": MX.motor.resistance}
-    found = identify(swings[:1], "pendulum", known, base=base)
-    (hint,) = (text for text in found.warnings if "--friction load" in text)
+    result = identify(swings[:1], "pendulum", known, base=base)
+    (hint,) = (text for text in result.warnings if "--friction load" in text)
     assert "instead of 0.5" in hint

@@ -1,4 +1,4 @@
-"""What is fitted, given to MuJoCo's own motor, moves as the log does."""
+"""Identified parameters in MuJoCo's native DC motor reproduce the log."""
 
 import math
 
@@ -12,22 +12,21 @@ from tests.identify import draws
 STEP = 2e-5
 
 
-def played(log, found, duration=1.0, **changes):
-    """Position of a `<dcmotor>` with joint friction of what was identified, under the voltage of a log, at its rows."""
-    number = {one.name: one.value for one in found.estimates} | changes
+def simulate_dcmotor(log, result, duration=1.0, **changes):
+    """Return the position of an identified `<dcmotor>` under the voltage of a log, at its rows."""
+    parameters = {estimate.name: estimate.value for estimate in result.estimates} | changes
     spec = mujoco.MjSpec.from_string(
         f"""<mujoco><option timestep="{STEP}" gravity="0 0 0"/><worldbody><body>
-        <joint name="hinge" damping="{number["viscous_friction"]}" frictionloss="{number["coulomb_friction"]}"
-        solreffriction="0.0001 1" armature="{number["inertia"] - 1e-9}"/>
+        <joint name="hinge" damping="{parameters["viscous_friction"]}" frictionloss="{parameters["coulomb_friction"]}"
+        solreffriction="0.0001 1" armature="{parameters["inertia"] - 1e-9}"/>
         <inertial mass="1e-6" pos="0 0 0" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody></mujoco>"""
     )
-    decay = -math.expm1(
-        -STEP * number["resistance"] / number["inductance"]
-    )  # MuJoCo's step is Euler's
+    # MuJoCo steps the current by Euler's method: this inductance makes its step exact.
+    decay = -math.expm1(-STEP * parameters["resistance"] / parameters["inductance"])
     spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target="hinge").set_to_dcmotor(
-        motorconst=[number["torque_constant"], number["back_emf_constant"]],
-        resistance=number["resistance"],
-        inductance=[number["resistance"] * STEP / decay, 0.0],
+        motorconst=[parameters["torque_constant"], parameters["back_emf_constant"]],
+        resistance=parameters["resistance"],
+        inductance=[parameters["resistance"] * STEP / decay, 0.0],
         ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE),
     )
     model = spec.compile()
@@ -43,14 +42,16 @@ def played(log, found, duration=1.0, **changes):
 
 @pytest.mark.matrix
 @pytest.mark.parametrize("draw", [0, 1])
-def test_a_dcmotor_of_what_was_identified_moves_as_the_log_does(draw):
-    """Half a second from standstill to a thousandth of the way; with 5 % more resistance it is not."""
-    log = draws.logged(draw, voltage="together")
-    found = identify([log], "free")
-    own = log.signals["position"][: round(0.5 / log.step)]
+def test_a_dcmotor_with_identified_parameters_reproduces_the_log(draw):
+    """The error in half a second is a thousandth of the motion; 5 % more resistance is visible."""
+    log = draws.make_log(draw, voltage="together")
+    result = identify([log], "free")
+    expected = log.signals["position"][: round(0.5 / log.step)]
 
     def error(**changes):
-        return np.abs(played(log, found, 0.5, **changes) - own).mean() / np.ptp(own)
+        return np.abs(simulate_dcmotor(log, result, 0.5, **changes) - expected).mean() / np.ptp(
+            expected
+        )
 
     assert error() < 0.001
-    assert error(resistance=1.05 * found["resistance"].value) > 5.0 * error()
+    assert error(resistance=1.05 * result["resistance"].value) > 5.0 * error()

@@ -1,4 +1,4 @@
-"""The two rigs whose logs others have published."""
+"""Identification from the published logs of two real rigs."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ PUBLISHED = {
     "viscous_friction": 0.0471,
     "coulomb_friction": 0.1839,
 }
-"""Of the pendulum, by its authors."""
+"""Parameters of the pendulum by its authors."""
 
 
 def servo_log(time):
@@ -21,49 +21,52 @@ def servo_log(time):
 
 
 @pytest.mark.matrix
-def test_the_published_pendulum_foretells_its_own_logs_badly():
-    """All numbers given, so nothing is fitted; half a second is off by 0.1 rad and more."""
+def test_published_parameters_of_the_pendulum_predict_its_logs_badly():
+    """With all parameters known nothing is fitted; the error in half a second exceeds 0.1 rad."""
     logs = [bench.pendulum_log(name) for name in ("ddp", "ilqr", "sysid")]
-    found = identify(logs, "pendulum", PUBLISHED)
-    assert {one.status for one in found.estimates} == {"given"}
-    assert all(one.open_loop > 0.1 for one in found.fitted)
+    result = identify(logs, "pendulum", PUBLISHED)
+    assert {estimate.status for estimate in result.estimates} == {"given"}
+    assert all(prediction.open_loop > 0.1 for prediction in result.fitted)
 
 
-def test_the_bad_log_is_said_to_be_bad_and_nothing_of_it_is_used():
-    found = identify([bench.pendulum_log("sysid")], "pendulum")
-    assert any("log sysid: residuals are" in text for text in found.warnings)
-    assert "identified" not in {one.status for one in found.estimates}
+def test_a_bad_log_gives_a_warning_and_no_identified_parameter():
+    result = identify([bench.pendulum_log("sysid")], "pendulum")
+    assert any("log sysid: mean residuals are" in text for text in result.warnings)
+    assert "identified" not in {estimate.status for estimate in result.estimates}
 
 
 @pytest.mark.matrix
-def test_the_pendulum_is_identified_and_foretells_what_it_was_not_fitted_to():
-    """Weight and inertia are what single logs of the rig have said; friction what its authors did."""
+def test_the_pendulum_is_identified_and_predicts_a_log_held_out():
+    """Weight and inertia agree with fits of single logs, friction with the authors' value."""
     logs = [bench.pendulum_log(name) for name in ("ddp", "ilqr")]
-    found = identify(logs, "pendulum", held_out=[bench.pendulum_log("sysid")])
-    assert found.problem() is None or "say nothing of" in found.problem()
-    assert found["inertia"].status == found["mgl"].status == "identified"
-    assert 0.17 < found["inertia"].value < 0.21
-    assert 3.5 < found["mgl"].value < 3.8
+    result = identify(logs, "pendulum", held_out=[bench.pendulum_log("sysid")])
+    assert result.problem() is None or "do not determine" in result.problem()
+    assert result["inertia"].status == result["mgl"].status == "identified"
+    assert 0.17 < result["inertia"].value < 0.21
+    assert 3.5 < result["mgl"].value < 3.8
     assert (
-        found["coulomb_friction"].low
+        result["coulomb_friction"].low
         < PUBLISHED["coulomb_friction"]
-        < found["coulomb_friction"].high
+        < result["coulomb_friction"].high
     )
-    assert max(one.open_loop for one in (*found.fitted, *found.held_out)) < 0.07
+    assert max(prediction.open_loop for prediction in (*result.fitted, *result.held_out)) < 0.07
 
 
 @pytest.mark.matrix
-def test_a_servo_without_a_current_sensor_tells_ratios_and_friction_that_depends_on_the_load():
-    logs = [
-        servo_log(time) for time in ("10h28m10", "10h28m24", "10h29m47", "10h30m02")
-    ]  # gains of 100 and 800
-    held_out = [servo_log(time) for time in ("10h28m42", "10h28m57")]  # 200
+def test_a_servo_without_a_current_sensor_shows_ratios_and_load_dependent_friction():
+    # The gains are 100 and 800 in the fitted logs, and 200 in those held out.
+    logs = [servo_log(time) for time in ("10h28m10", "10h28m24", "10h29m47", "10h30m02")]
+    held_out = [servo_log(time) for time in ("10h28m42", "10h28m57")]
     known = {"mgl": 0.49 * 9.81 * 0.1}
     plain, loaded = (
         identify(logs, "pendulum", known, kind, held_out) for kind in ("coulomb", "load")
     )
-    errors = [np.mean([one.closed_loop for one in found.held_out]) for found in (plain, loaded)]
+    errors = [
+        np.mean([prediction.closed_loop for prediction in result.held_out])
+        for result in (plain, loaded)
+    ]
     assert errors[1] < 0.7 * errors[0]
     assert errors[1] < 0.06
     assert plain["resistance"].status in ("ratio", "refused")
-    assert loaded["inertia"].low > 0.49 * 0.1**2  # of the mass alone
+    # The inertia of the mass without the rotor's is a lower limit.
+    assert loaded["inertia"].low > 0.49 * 0.1**2

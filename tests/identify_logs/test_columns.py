@@ -1,4 +1,4 @@
-"""The mapping of columns to signals."""
+"""Mappings of columns to signals, and proposals for them."""
 
 import math
 import re
@@ -18,9 +18,10 @@ TABLE = {
 TABLE |= {"lists[0]": np.array([1.0, 3.0]), "lists[1]": np.array([2.0, 4.0])}
 
 
-def value(entry):
+def evaluate_entry(entry):
+    """Return the values of a mapped signal in `TABLE`."""
     name = entry.partition("=")[0]
-    return parse_columns(f"time=t:s,{entry}")[name].value({**TABLE, "k": 4.0})
+    return parse_columns(f"time=t:s,{entry}")[name].evaluate({**TABLE, "k": 4.0})
 
 
 @pytest.mark.parametrize(
@@ -28,7 +29,8 @@ def value(entry):
     [
         ("voltage=a*b:V", [10.0, -21.0]),
         ("voltage=-a*b/k + 1:V", [-1.5, 6.25]),
-        ("voltage=a*b", [10.0, -21.0]),  # of a formula the unit may be left out
+        # The unit of a formula is optional.
+        ("voltage=a*b", [10.0, -21.0]),
         ("current=a:mA", [0.002, -0.003]),
         ("position=a:deg", np.deg2rad([2.0, -3.0])),
         ("position=a:mrad", [0.002, -0.003]),
@@ -47,19 +49,19 @@ def value(entry):
     ],
 )
 def test_formulas_and_units(entry, expected):
-    np.testing.assert_allclose(value(entry), expected, rtol=1e-12)
+    np.testing.assert_allclose(evaluate_entry(entry), expected, rtol=1e-12)
 
 
-def test_registers_are_cast_angles_unwrapped_and_voltages_declared_means():
+def test_registers_are_converted_angles_unwrapped_and_mean_voltages_declared():
     numbers = np.arange(0, 65536, 7)
     np.testing.assert_array_equal(
         twos_complement(numbers, 16), numbers.astype(np.uint16).astype(np.int16)
     )
     angle = np.linspace(0.0, 2000.0, 101)
-    found = parse_columns("time=t:s,position=unwrap(q, 360):deg")["position"].value(
+    position = parse_columns("time=t:s,position=unwrap(q, 360):deg")["position"].evaluate(
         {"t": angle, "q": angle % 360.0}
     )
-    np.testing.assert_allclose(found, np.deg2rad(angle), atol=1e-12)
+    np.testing.assert_allclose(position, np.deg2rad(angle), atol=1e-12)
     means = [
         parse_columns(f"time=t:s,voltage={text}:V")["voltage"].mean for text in ("mean(a*b)", "a*b")
     ]
@@ -67,25 +69,25 @@ def test_registers_are_cast_angles_unwrapped_and_voltages_declared_means():
 
 
 @pytest.mark.parametrize("bits", [11, 16])
-def test_a_sign_in_the_highest_bit_is_read(bits):
-    """As Feetech's servos write it: the magnitude below a bit that is set if the number is negative."""
+def test_a_sign_in_the_highest_bit_is_converted(bits):
+    """Feetech's servos write the magnitude below a bit that is set for negative numbers."""
     numbers = np.arange(-(2 ** (bits - 1)) + 1, 2 ** (bits - 1), 3)
     register = [abs(number) | (int(number < 0) << (bits - 1)) for number in map(int, numbers)]
     np.testing.assert_array_equal(sign_magnitude(np.array(register), bits), numbers)
 
 
-def test_mappings_are_as_good_as_text():
+def test_mappings_are_equivalent_to_text():
     assert parse_columns({"time": "t:s", "current": "a:A"}) == parse_columns(
         "time=t:s, current=a:A"
     )
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("time=t:s", "nothing but time"),
         ("current=a:A", "no time"),
-        ("time=t:s,current=a", "current=a:A"),  # the remedy
+        ("time=t:s,current=a", "current=a:A"),
         ("time=t,current=a:A", "time=t:s"),
         ("time=t:s,current=a:V", "no unit of current"),
         ("time=t:s,current=a:blub", "blub"),
@@ -103,7 +105,7 @@ def test_mappings_are_as_good_as_text():
         ("time=t:s,current=a[0]", "current=a[0]:A"),
         (
             "time=t:s,current=lists:A",
-            "lists holds lists of 2 numbers; write the one you want, such as lists[0]",
+            "lists holds lists of 2 numbers; choose an entry, such as lists[0]",
         ),
         (
             "time=t:s,position=a:UNIT",
@@ -119,9 +121,9 @@ def test_mappings_are_as_good_as_text():
         ("time=t:s,current=c*2:A", "unknown column"),
     ],
 )
-def test_what_is_refused_says_why(text, says):
-    with pytest.raises(ValueError, match=re.escape(says)):
-        parse_columns(text)["current"].value(TABLE)
+def test_invalid_columns_raise_an_error_with_the_reason(text, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        parse_columns(text)["current"].evaluate(TABLE)
 
 
 PROPOSED = {
@@ -168,25 +170,27 @@ PROPOSED = {
         " supply's current"
     ),
 }
-"""A file -> the columns that are proposed | what is to be checked of them."""
+"""Contents of a file -> proposed columns | part of a doubt."""
 
 
 @pytest.mark.parametrize("lines", PROPOSED)
-def test_columns_are_proposed_by_names_units_and_values(tmp_path, lines):
+def test_columns_are_proposed_from_names_units_and_values(tmp_path, lines):
     columns, _, doubt = PROPOSED[lines].partition(" | ")
     (tmp_path / "log.csv").write_text(lines)
-    found = propose_columns(tmp_path / "log.csv")
-    assert found.columns == columns
-    assert found.doubts == () if not doubt else doubt in " ".join(found.doubts)
+    proposal = propose_columns(tmp_path / "log.csv")
+    assert proposal.columns == columns
+    assert proposal.doubts == () if not doubt else doubt in " ".join(proposal.doubts)
     if "UNIT" in columns:
         with pytest.raises(ValueError, match="the unit is not filled in"):
             read_log(tmp_path / "log.csv", columns)
-    read_log(tmp_path / "log.csv", filled(columns))
+    read_log(tmp_path / "log.csv", fill_units(columns))
 
 
-def filled(columns):
-    """Return columns with a unit for each that is left open."""
-    return re.sub(r"(\w+)=([^,]*):UNIT", lambda one: f"{one[1]}={one[2]}:{SI[one[1]]}", columns)
+def fill_units(columns):
+    """Return columns with a unit instead of each `UNIT`."""
+    return re.sub(
+        r"(\w+)=([^,]*):UNIT", lambda match: f"{match[1]}={match[2]}:{SI[match[1]]}", columns
+    )
 
 
 SI = {
@@ -201,7 +205,7 @@ SI = {
 SI |= {"duty": "1", "command": "rad", "temperature": "degC"}
 
 
-def test_without_a_time_nothing_is_proposed(tmp_path):
+def test_raises_if_no_column_is_the_time(tmp_path):
     (tmp_path / "log.csv").write_text("a,u\n1,2\n")
     with pytest.raises(ValueError, match=r"no time.* a, u"):
         propose_columns(tmp_path / "log.csv")

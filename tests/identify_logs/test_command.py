@@ -1,4 +1,4 @@
-"""`codrl-mj identify check`, `plan` and `simulate`: what they print, write and refuse."""
+"""Output, files and errors of `codrl-mj identify check`, `plan`, `columns` and `simulate`."""
 
 import json
 import shlex
@@ -10,30 +10,32 @@ from codrl_mj.identify.reading import read_log
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
-    """Every test runs in an empty folder."""
+def in_empty_folder(tmp_path, monkeypatch):
+    """Run every test in an empty folder."""
     monkeypatch.chdir(tmp_path)
 
 
-def said(capsys, line, status=0):
+def run_identify(capsys, line, status=0):
+    """Run `codrl-mj identify`, and return its output, or its errors if the status is 2."""
     assert main(["identify", *shlex.split(line)]) == status
     out, error = capsys.readouterr()
     return out if status < 2 else error
 
 
-def test_a_simulated_log_is_checked_by_the_columns_that_are_printed(capsys, tmp_path):
-    told = said(
+def test_a_simulated_log_can_be_checked_with_the_printed_columns(capsys, tmp_path):
+    output = run_identify(
         capsys,
         "simulate maxon-ec45-flat-50w --out log.csv.gz --inertia 1e-4 --duration 1 --dropped 0.05"
         " --mean-voltage --sensor current:noise=0.1,delay=4e-4 position:resolution=0.00153398",
     )
-    columns = told.partition("--columns ")[2].strip()
+    columns = output.partition("--columns ")[2].strip()
     log = read_log(tmp_path / "log.csv.gz", columns.strip("'"))
     assert log.mean_voltage
     assert 4600 < len(log.time) < 4900
-    text = said(capsys, f"check log.csv.gz --columns {columns} --motor maxon-ec45-flat-50w")
+    text = run_identify(capsys, f"check log.csv.gz --columns {columns} --motor maxon-ec45-flat-50w")
     assert "dropped rows" in text
-    assert "2 rows" in text  # by which the current is late
+    # The current is delayed by 4e-4 s, which are 2 rows.
+    assert "2 rows" in text
     assert "error" not in text
 
 
@@ -41,54 +43,57 @@ QUBE = "simulate quanser-qube-servo-2 --out log.csv --duration 1"
 COLUMNS = "--columns time=time:s,voltage=voltage:V,current=current:A,position=position:rad"
 
 
-def test_a_log_is_simulated_anew_checked_once_and_has_no_findings(capsys):
+def test_a_repeated_simulation_has_no_findings_and_is_checked_once(capsys):
     for _ in range(2):
-        said(capsys, f"{QUBE} --sensor current:noise=0.01")
-    once = said(capsys, f"check log.csv {COLUMNS}")
+        run_identify(capsys, f"{QUBE} --sensor current:noise=0.01")
+    once = run_identify(capsys, f"check log.csv {COLUMNS}")
     assert "nothing is wrong" in once
-    assert said(capsys, f"check log.csv log.csv {COLUMNS}") == once
+    assert run_identify(capsys, f"check log.csv log.csv {COLUMNS}") == once
 
 
-def test_errors_are_an_exit_status_and_json(capsys):
-    said(capsys, f"{QUBE} --sensor current:gain=-1")
-    findings = json.loads(said(capsys, f"check log.csv {COLUMNS} --json", 1))
-    assert [one["check"] for one in findings if one["severity"] == "error"] == ["sign"]
+def test_errors_set_the_exit_status_and_are_printed_as_json(capsys):
+    run_identify(capsys, f"{QUBE} --sensor current:gain=-1")
+    findings = json.loads(run_identify(capsys, f"check log.csv {COLUMNS} --json", 1))
+    assert [finding["check"] for finding in findings if finding["severity"] == "error"] == ["sign"]
     assert {"log", "severity", "check", "row", "message", "remedy"} == findings[0].keys()
 
 
-def test_columns_are_proposed_with_the_line_to_type_next(capsys):
-    said(capsys, QUBE)
-    text = said(capsys, "columns log.csv")
+def test_proposed_columns_are_printed_with_the_next_command(capsys):
+    run_identify(capsys, QUBE)
+    text = run_identify(capsys, "columns log.csv")
     assert "to be checked: current: no unit is stated: replace UNIT by A or mA" in text
     line = text.splitlines()[-1].removeprefix("codrl-mj identify ")
     assert "current=current:UNIT" in line
     assert line.endswith("--rig free --known load_inertia=0 --out motor")
-    assert "current=current:UNIT: the unit is not filled in" in said(capsys, line, 2)
+    assert "current=current:UNIT: the unit is not filled in" in run_identify(capsys, line, 2)
     units = ("current:A", "position:rad", "velocity:rad/s", "torque:N*m")
     for unit in units:
         line = line.replace(f"{unit.partition(':')[0]}:UNIT", unit)
-    said(capsys, f"check {line.partition(' --rig')[0]} --rig free")
-    columns = json.loads(said(capsys, "columns log.csv --json"))["columns"]
+    run_identify(capsys, f"check {line.partition(' --rig')[0]} --rig free")
+    columns = json.loads(run_identify(capsys, "columns log.csv --json"))["columns"]
     assert columns.startswith("time=time:s,current=current:UNIT")
     columns = "time=time:s,current=current:A,voltage=voltage:V,position=position:rad"
-    assert "rig is not given (--rig on the command line" in said(
+    assert "rig is not given (--rig on the command line" in run_identify(
         capsys, f"log.csv --columns {columns}", 2
     )
 
 
 def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("codrl_mj.identify.plan.RATES", (1e3, 5e3))
-    text = said(capsys, "plan maxon-ec45-flat-50w --inertia 1e-4 --duration 1 --out plan")
+    text = run_identify(capsys, "plan maxon-ec45-flat-50w --inertia 1e-4 --duration 1 --out plan")
     assert "* play prbs" in text
     assert "viscous_friction: 0 on the datasheet" in text
     assert (tmp_path / "plan" / "excitation.csv").read_text().startswith("time,voltage\n")
-    found = json.loads(said(capsys, "plan maxon-ec45-flat-50w --inertia 1e-4 --duration 1 --json"))
-    assert found["best"]["excitation"]["kind"] == "prbs"
-    assert found["best"]["rms_current"] <= 2.52  # the continuous current that maxon prints
+    result = json.loads(
+        run_identify(capsys, "plan maxon-ec45-flat-50w --inertia 1e-4 --duration 1 --json")
+    )
+    assert result["best"]["excitation"]["kind"] == "prbs"
+    # The datasheet has a continuous current of 2.52 A.
+    assert result["best"]["rms_current"] <= 2.52
 
 
 @pytest.mark.parametrize(
-    ("line", "says"),
+    ("line", "message"),
     [
         ("check nowhere.csv --columns time=t:s,current=i:A", "no log at nowhere.csv"),
         ("check --columns time=t:s,current=i:A", "no log is given"),
@@ -104,6 +109,6 @@ def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path, monkeypa
         (f"{QUBE} --rate 0", "rate"),
     ],
 )
-def test_what_is_refused_says_why(capsys, tmp_path, line, says):
-    assert says in said(capsys, line, 2)
+def test_invalid_arguments_raise_an_error_with_the_reason(capsys, tmp_path, line, message):
+    assert message in run_identify(capsys, line, 2)
     assert list(tmp_path.iterdir()) == []

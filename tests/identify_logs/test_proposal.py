@@ -1,4 +1,4 @@
-"""Columns that are proposed for logs as people have them: nothing is guessed that nobody would find out later."""
+"""Proposed columns for logs of common tools; units that are ambiguous stay open."""
 
 import gzip
 import json
@@ -11,7 +11,7 @@ import pytest
 
 from codrl_mj.cli import main
 from codrl_mj.identify import check, propose_columns, read_log
-from codrl_mj.identify.identify import checked
+from codrl_mj.identify.identify import check_arguments
 from codrl_mj.identify.log import SIGNALS
 
 ROWS = np.arange(600)
@@ -26,7 +26,7 @@ LOAD = np.round(VOLTS / 12.0 * 1000).astype(int)
 ZERO = 0 * ROWS
 EPOCH = 1_700_000_000
 
-SLOPPY = {
+TOOLS = {
     "Dynamixel Wizard": (
         {
             "Time(ms)": 10 * ROWS,
@@ -189,45 +189,46 @@ SLOPPY = {
         "time=t_s:s,voltage=motor_voltage_V:V,bus=dc_voltage_V:V,current=motor_current_A:A",
     ),
 }
-"""Whose log -> its columns, what is to be proposed."""
+"""Source of a log -> its columns, and the expected proposal."""
 SI = {"duty": "1", "command": "1", "time": "s"} | {
     name: unit for name, unit in SIGNALS.items() if unit
 }
 
 
-def written(folder, columns, name="log.csv"):
+def write_columns(folder, columns, name="log.csv"):
+    """Write columns as CSV, and return the path."""
     table = np.column_stack([*columns.values()])
     lines = [
-        ",".join(f'"{one}"' for one in columns),
+        ",".join(f'"{column}"' for column in columns),
         *(",".join(f"{value:.17g}" for value in row) for row in table),
     ]
     (folder / name).write_text("\n".join(lines))
     return folder / name
 
 
-def filled(columns, time="s"):
-    """Return columns with a unit for each that is left open."""
+def fill_units(columns, time="s"):
+    """Return columns with a unit instead of each `UNIT`."""
     return re.sub(
         r"(\w+)=([^,]*):UNIT",
-        lambda one: f"{one[1]}={one[2]}:{(SI | {'time': time})[one[1]]}",
+        lambda match: f"{match[1]}={match[2]}:{(SI | {'time': time})[match[1]]}",
         columns,
     )
 
 
-@pytest.mark.parametrize("whose", SLOPPY)
-def test_a_log_of_somebody_is_proposed_and_taken_once_its_units_are_filled_in(tmp_path, whose):
-    columns, expected = SLOPPY[whose]
-    found = propose_columns(written(tmp_path, columns))
-    assert found.columns == expected
-    assert found.problem is None
+@pytest.mark.parametrize("source", TOOLS)
+def test_columns_are_proposed_and_valid_once_the_units_are_filled_in(tmp_path, source):
+    columns, expected = TOOLS[source]
+    proposal = propose_columns(write_columns(tmp_path, columns))
+    assert proposal.columns == expected
+    assert proposal.problem is None
     if "UNIT" in expected:
         with pytest.raises(
             ValueError, match="the unit is not filled in; write the column's own, such as"
         ):
             read_log(tmp_path / "log.csv", expected)
-    log = read_log(tmp_path / "log.csv", filled(expected, "ms"))
-    assert {one.check for one in check(log)}.isdisjoint({"signals", "rows", "wrapped"})
-    checked([log], "free", {"load_inertia": 0.0})
+    log = read_log(tmp_path / "log.csv", fill_units(expected, "ms"))
+    assert {finding.check for finding in check(log)}.isdisjoint({"signals", "rows", "wrapped"})
+    check_arguments([log], "free", {"load_inertia": 0.0})
 
 
 @pytest.mark.parametrize(
@@ -271,56 +272,59 @@ EFFORTS = {"torque_Nm": CURRENT, "current_A": CURRENT, "voltage_V": VOLTS}
     "effort", [(), ("torque_Nm",), ("current_A",), ("voltage_V",), ("voltage_V", "current_A")]
 )
 @pytest.mark.parametrize(("step", "count"), [(0.01, 600), (0.1, 600), (0.01, 12)])
-def test_what_is_proposed_and_passed_by_the_check_is_what_the_fit_takes(
-    tmp_path, motion, effort, step, count
-):
-    """By docs/identify.md: voltage and current, or an effort with a motion; rows within 50 ms; enough rows."""
+def test_proposal_check_and_fit_agree_on_usable_logs(tmp_path, motion, effort, step, count):
+    """A fit needs voltage and current, or effort and motion, and enough rows within 50 ms."""
     if not motion + effort:
         return
     columns = {
         "t_s": step * ROWS,
         **{name: (MOTION | EFFORTS)[name] for name in (*motion, *effort)},
     }
-    path = written(tmp_path, {name: values[:count] for name, values in columns.items()})
-    told = len(effort) == 2 or (motion and effort)
-    possible = told and (step <= 0.05 or not motion) and count > 20
-    found = propose_columns(path)
-    assert (found.problem is None) == bool(possible), found.problem
-    log = read_log(path, found.columns)
-    assert bool({one.check for one in check(log)} & {"signals", "rows"}) is not bool(possible)
+    path = write_columns(tmp_path, {name: values[:count] for name, values in columns.items()})
+    has_signals = len(effort) == 2 or (motion and effort)
+    possible = has_signals and (step <= 0.05 or not motion) and count > 20
+    proposal = propose_columns(path)
+    assert (proposal.problem is None) == bool(possible), proposal.problem
+    log = read_log(path, proposal.columns)
+    assert bool({finding.check for finding in check(log)} & {"signals", "rows"}) is not bool(
+        possible
+    )
     if possible:
-        checked([log], "free", {"load_inertia": 0.0})
+        check_arguments([log], "free", {"load_inertia": 0.0})
         return
     with pytest.raises(
         ValueError, match=r"nothing can be identified|a row every 0.1 s, must be at most|12 rows in"
     ):
-        checked([log], "free", {"load_inertia": 0.0})
+        check_arguments([log], "free", {"load_inertia": 0.0})
 
 
-def said(capsys, *words):
+def run_identify(capsys, *words):
+    """Run `codrl-mj identify`, and return its status, output and errors."""
     status = main(["identify", *map(str, words)])
     out, error = capsys.readouterr()
     return status, out, error
 
 
-def test_a_line_to_type_next_is_taken_as_it_is_or_there_is_none(tmp_path, capsys):
-    """Without open units: the fit if it would begin, the check where that finds errors, else nothing."""
+def test_the_printed_next_command_runs_or_there_is_none(tmp_path, capsys):
+    """Without open units it is the fit, or the check if that finds errors; there may be none."""
     good = {"t_s": TIME, "u_V": VOLTS, "i_A": CURRENT, "q_rad": np.round(ANGLE, 3)}
-    status, out, _ = said(capsys, "columns", written(tmp_path, good))
+    status, out, _ = run_identify(capsys, "columns", write_columns(tmp_path, good))
     line = out.splitlines()[-1]
     assert status == 0
     assert line.startswith("codrl-mj identify ")
     assert line.endswith("--rig free --known load_inertia=0 --out motor")
     bad = good | {"i_A": -CURRENT}
-    status, out, _ = said(capsys, "columns", written(tmp_path, bad))
+    status, out, _ = run_identify(capsys, "columns", write_columns(tmp_path, bad))
     line = out.splitlines()[-1]
     assert status == 0
     assert line.startswith("codrl-mj identify check ")
-    status, out, _ = said(capsys, *shlex.split(line)[2:])
+    status, out, _ = run_identify(capsys, *shlex.split(line)[2:])
     assert status == 1
     assert "sign" in out
-    status, out, _ = said(
-        capsys, "columns", written(tmp_path, {"t_s": TIME, "goal_deg": ANGLE, "present_deg": ANGLE})
+    status, out, _ = run_identify(
+        capsys,
+        "columns",
+        write_columns(tmp_path, {"t_s": TIME, "goal_deg": ANGLE, "present_deg": ANGLE}),
     )
     assert status == 1
     text = " ".join(out.split())
@@ -333,12 +337,12 @@ def test_a_line_to_type_next_is_taken_as_it_is_or_there_is_none(tmp_path, capsys
     assert "--columns time=t_s:s,command=goal_deg:deg,position=present_deg:deg" in out
 
 
-def test_of_a_duty_without_a_supply_it_says_what_to_write(tmp_path):
-    found = propose_columns(
-        written(tmp_path, {"t_s": TIME, "present_deg": ANGLE, "duty": VOLTS / 12.0})
+def test_a_duty_without_a_supply_gets_a_remedy(tmp_path):
+    proposal = propose_columns(
+        write_columns(tmp_path, {"t_s": TIME, "present_deg": ANGLE, "duty": VOLTS / 12.0})
     )
-    assert found.columns == "time=t_s:s,position=present_deg:deg,duty=duty:1"
-    assert "voltage=duty*12:V if the supply has 12 V" in found.problem
+    assert proposal.columns == "time=t_s:s,position=present_deg:deg,duty=duty:1"
+    assert "voltage=duty*12:V if the supply has 12 V" in proposal.problem
 
 
 EPISODE = [
@@ -355,11 +359,14 @@ FEATURES = {
     "observation.state": {"names": {"motors": ["shoulder_pan", "elbow"]}},
     "timestamp": {"names": None},
 }
-LISTED = "time=timestamp:s,torque=effort[0]:N*m,"
+LIST_COLUMNS = "time=timestamp:s,torque=effort[0]:N*m,"
 
 
-def episode(folder, kind):
-    """The episode in a file of one kind; that of Parquet by a stand-in for pyarrow."""
+def write_episode(folder, kind):
+    """Write the episode in a format, and return the path and the columns.
+
+    A file of Parquet is empty: tests replace pyarrow.
+    """
     columns = {name: [row[name] for row in EPISODE] for name in EPISODE[0]}
     rows = ["timestamp;action;observation.state;effort"]
     rows += [";".join(str(value) for value in row.values()) for row in EPISODE]
@@ -380,45 +387,47 @@ def episode(folder, kind):
 @pytest.mark.parametrize(
     "kind", ["json", "columns.json", "features.json", "csv", "numpy.csv", "parquet"]
 )
-def test_an_entry_of_a_list_is_a_column(tmp_path, monkeypatch, kind):
-    path, columns = episode(tmp_path, kind)
+def test_entries_of_lists_are_columns(tmp_path, monkeypatch, kind):
+    path, columns = write_episode(tmp_path, kind)
     table = SimpleNamespace(to_pydict=lambda: columns)
     monkeypatch.setitem(
         __import__("sys").modules, "pyarrow.parquet", SimpleNamespace(read_table=lambda _: table)
     )
-    log = read_log(path, LISTED + 'command=action[1]:deg,position="observation.state"[0]:deg')
+    log = read_log(path, LIST_COLUMNS + 'command=action[1]:deg,position="observation.state"[0]:deg')
     np.testing.assert_allclose(log.signals["command"], np.deg2rad(0.5))
     np.testing.assert_allclose(log.signals["position"], np.deg2rad(ANGLE[:90] - 1.0))
     with pytest.raises(
         ValueError,
-        match=r"action holds lists of 2 numbers; write the one you want, such as action\[0\]",
+        match=r"action holds lists of 2 numbers; choose an entry, such as action\[0\]",
     ):
-        read_log(path, LISTED + "command=action:deg")
-    found = propose_columns(path)
+        read_log(path, LIST_COLUMNS + "command=action:deg")
+    proposal = propose_columns(path)
     assert (
         'command=action[0]:UNIT,position="observation.state[0]":UNIT,torque=effort[0]:UNIT'
-        in found.columns
+        in proposal.columns
     )
-    read_log(path, filled(found.columns))
+    read_log(path, fill_units(proposal.columns))
 
 
-@pytest.mark.parametrize("where", ["in the file", "beside it"])
-def test_an_entry_of_a_list_has_the_joints_name_where_that_is_known(tmp_path, where):
-    path, _ = episode(tmp_path, "features.json" if where == "in the file" else "json")
-    if where == "beside it":
+@pytest.mark.parametrize("location", ["in the file", "beside it"])
+def test_entries_of_lists_have_the_names_of_joints_if_known(tmp_path, location):
+    path, _ = write_episode(tmp_path, "features.json" if location == "in the file" else "json")
+    if location == "beside it":
         (tmp_path / "meta").mkdir()
         (tmp_path / "meta" / "info.json").write_text(json.dumps({"fps": 30, "features": FEATURES}))
-    wanted = LISTED + "command=action[elbow]:deg,position=observation.state[shoulder_pan]:deg"
-    log = read_log(path, wanted)
+    columns = (
+        LIST_COLUMNS + "command=action[elbow]:deg,position=observation.state[shoulder_pan]:deg"
+    )
+    log = read_log(path, columns)
     np.testing.assert_allclose(log.signals["command"], np.deg2rad(0.5))
     np.testing.assert_allclose(log.signals["position"], np.deg2rad(ANGLE[:90] - 1.0))
-    (first,) = [one for one in propose_columns(path).doubts if one.startswith("action")]
+    (first,) = [doubt for doubt in propose_columns(path).doubts if doubt.startswith("action")]
     assert "the first of shoulder_pan.pos, elbow is taken" in first
     with pytest.raises(ValueError, match=r"unknown column action\[wrist\]"):
-        read_log(path, LISTED + "command=action[wrist]:deg")
+        read_log(path, LIST_COLUMNS + "command=action[wrist]:deg")
 
 
-def test_a_packed_log_is_proposed_too(tmp_path):
-    path = written(tmp_path, {"t_s": TIME, "u_V": VOLTS, "q_rad": ANGLE})
+def test_columns_of_a_compressed_log_are_proposed(tmp_path):
+    path = write_columns(tmp_path, {"t_s": TIME, "u_V": VOLTS, "q_rad": ANGLE})
     (tmp_path / "log.csv.gz").write_bytes(gzip.compress(path.read_bytes()))
     assert propose_columns(tmp_path / "log.csv.gz") == propose_columns(path)

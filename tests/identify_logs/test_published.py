@@ -1,4 +1,4 @@
-"""What others have published is fetched as it is, from a server of the test's own; nothing else passes for it."""
+"""Downloads of published data sets from a local server, and their verification by digests."""
 
 import functools
 import hashlib
@@ -9,22 +9,22 @@ import pytest
 
 from codrl_mj.cli import main
 from codrl_mj.identify import published as module
-from codrl_mj.identify.published import fetch, published
+from codrl_mj.identify.published import fetch, published_datasets
 from tests.published import folder_of
 
 LOG = b"time,position\n0,0\n"
 
 
 @pytest.fixture
-def served(tmp_path, monkeypatch):
-    """A set of one file on a server of this machine."""
-    there = tmp_path / "there" / "abc" / "results"
-    there.mkdir(parents=True)
-    (there / "measured.csv").write_bytes(LOG)
-    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=tmp_path / "there")
+def served_file(tmp_path, monkeypatch):
+    """Serve a data set of one file, and yield the path of the served file."""
+    folder = tmp_path / "served" / "abc" / "results"
+    folder.mkdir(parents=True)
+    (folder / "measured.csv").write_bytes(LOG)
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=tmp_path / "served")
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    about = {
+    dataset = {
         "title": "a rig",
         "source": f"http://127.0.0.1:{server.server_port}",
         "commit": "abc",
@@ -34,43 +34,46 @@ def served(tmp_path, monkeypatch):
             "ours.csv": {"path": "results/measured.csv", "sha256": hashlib.sha256(LOG).hexdigest()}
         },
     }
-    monkeypatch.setattr(module, "published", lambda: {"rig": about})
-    yield there / "measured.csv"
+    monkeypatch.setattr(module, "published_datasets", lambda: {"rig": dataset})
+    yield folder / "measured.csv"
     server.shutdown()
     server.server_close()
 
 
-def test_a_set_is_fetched_once(served, tmp_path, capsys):
+def test_a_data_set_is_downloaded_once(served_file, tmp_path, capsys):
     assert main(["data", "rig", "--out", str(tmp_path / "data")]) == 0
     file = tmp_path / "data" / "bench_logs" / "rig" / "ours.csv"
     assert file.read_bytes() == LOG
-    told = capsys.readouterr().out
-    assert [text for text in (str(file), "MIT", "time=time:s") if text not in told] == []
-    served.unlink()
+    output = capsys.readouterr().out
+    assert [text for text in (str(file), "MIT", "time=time:s") if text not in output] == []
+    served_file.unlink()
     assert fetch("rig", tmp_path / "data") == [file]
 
 
-def test_a_file_that_was_changed_since_or_cannot_be_had_is_refused(served, tmp_path, capsys):
-    served.write_bytes(b"something else")
-    for said in ("is not the file that was published", "results/measured.csv: cannot be had"):
+def test_raises_if_a_file_differs_or_cannot_be_downloaded(served_file, tmp_path, capsys):
+    served_file.write_bytes(b"something else")
+    for message in (
+        "differs from the published file",
+        "results/measured.csv: cannot be downloaded",
+    ):
         assert main(["data", "rig", "--out", str(tmp_path / "data")]) == 2
-        assert said in capsys.readouterr().err
+        assert message in capsys.readouterr().err
         assert not (tmp_path / "data" / "bench_logs" / "rig" / "ours.csv").exists()
-        served.unlink(missing_ok=True)
+        served_file.unlink(missing_ok=True)
 
 
-def test_what_there_is_is_listed_and_an_unknown_name_is_not_looked_for(capsys):
+def test_data_sets_are_listed_and_an_unknown_name_raises_an_error(capsys):
     assert main(["data"]) == 0
-    listed = capsys.readouterr().out
-    for name, about in published().items():
-        assert name in listed
-        assert about["licence"] in listed
+    output = capsys.readouterr().out
+    for name, dataset in published_datasets().items():
+        assert name in output
+        assert dataset["licence"] in output
     assert main(["data", "dfki"]) == 2
     assert "did you mean 'dfki_pendulum'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", published())
-def test_the_digests_are_those_of_the_files(name):
+@pytest.mark.parametrize("name", published_datasets())
+def test_the_digests_match_the_files(name):
     folder = folder_of(name)
-    for file, about in published()[name]["files"].items():
-        assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == about["sha256"], file
+    for file, entry in published_datasets()[name]["files"].items():
+        assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == entry["sha256"], file

@@ -1,4 +1,4 @@
-"""Logs from files."""
+"""Reading of logs from files."""
 
 import gzip
 import json
@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from codrl_mj.identify.log import Log, find_resolution, usable
+from codrl_mj.identify.log import Log, find_resolution, gapless_stretches
 from codrl_mj.identify.reading import read_log
 from codrl_mj.identify.synthetic import write_log
 
@@ -22,7 +22,7 @@ def write(folder, text, name="log.csv"):
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_csv(tmp_path, separator):
+def test_csv_is_read(tmp_path, separator):
     rows = ["t,i,other", "10,1.5,x", "10.5, 2e0,y", "", "11,-3,z"]
     log = read_log(write(tmp_path, "\n".join(rows).replace(",", separator)), COLUMNS)
     np.testing.assert_array_equal(log.time, [0.0, 0.5, 1.0])
@@ -51,7 +51,7 @@ BENCH = {
 
 @pytest.mark.parametrize("suffix", ["csv", "txt", "dat"])
 @pytest.mark.parametrize("name", BENCH)
-def test_what_instruments_and_spreadsheets_write_is_read(tmp_path, name, suffix):
+def test_formats_of_instruments_and_spreadsheets_are_read(tmp_path, name, suffix):
     path = tmp_path / f"log.{suffix}"
     path.write_bytes(BENCH[name].encode("latin-1"))
     log = read_log(path, COLUMNS)
@@ -65,7 +65,7 @@ ENTRIES = [dict(zip(ROWS, row, strict=True)) for row in zip(*ROWS.values(), stri
 
 @pytest.mark.parametrize("content", [ROWS, ENTRIES, {"entries": ENTRIES, "gain": 2, "name": "x"}])
 @pytest.mark.parametrize("packed", [False, True])
-def test_json(tmp_path, content, packed):
+def test_json_is_read(tmp_path, content, packed):
     path = tmp_path / ("log.json.gz" if packed else "log.json")
     text = json.dumps(content).encode()
     path.write_bytes(gzip.compress(text) if packed else text)
@@ -75,50 +75,48 @@ def test_json(tmp_path, content, packed):
     assert log.constants == ({"gain": 2.0} if "gain" in content else {})
 
 
-def test_constants_of_a_file_count_in_formulas(tmp_path):
+def test_formulas_can_use_constants_of_a_file(tmp_path):
     path = write(tmp_path, json.dumps({"entries": ENTRIES, "gain": 2}), "log.json")
     np.testing.assert_array_equal(
         read_log(path, "time=t:s,current=i*gain:A").signals["current"], [8.0, 10.0, 14.0]
     )
 
 
-def test_rows_that_cannot_be_used_are_left_out_and_named(tmp_path):
+def test_unusable_rows_are_left_out_and_reported(tmp_path):
     lines = ["t,i"] + [f"{k},{k}" for k in range(20)]
-    lines[4], lines[8], lines[12] = (
-        "3",
-        "5.5,7",
-        "11,NA",
-    )  # the row is cut; the clock goes back; a value is missing
+    # One row is incomplete, one is earlier than the row before, and one has a missing value.
+    lines[4], lines[8], lines[12] = ("3", "5.5,7", "11,NA")
     log = read_log(write(tmp_path, "\n".join(lines)), COLUMNS)
     np.testing.assert_array_equal(np.setdiff1d(np.arange(1, 21), log.row_numbers), [4, 8, 12])
     np.testing.assert_array_equal(log.row_numbers, log.time + 1.0)
-    assert {(one.check, one.row) for one in log.findings} == {
+    assert {(finding.check, finding.row) for finding in log.findings} == {
         ("missing", 4),
         ("stamps", 8),
         ("missing", 12),
     }
-    assert [one.severity for one in log.findings if one.check == "stamps"] == ["error"]
+    assert [finding.severity for finding in log.findings if finding.check == "stamps"] == ["error"]
 
 
-def test_only_leaves_out_rows_and_leaves_a_gap(tmp_path):
+def test_rows_left_out_by_only_leave_a_gap(tmp_path):
     lines = ["t,i,on"] + [f"{k},{k},{'false' if 20 <= k < 40 else 'true'}" for k in range(60)]
     log = read_log(write(tmp_path, "\n".join(lines)), f"{COLUMNS},only=on")
     assert len(log.time) == 40
-    assert usable(log) == [slice(0, 20), slice(20, 40)]
+    assert gapless_stretches(log) == [slice(0, 20), slice(20, 40)]
 
 
-def test_a_register_with_a_sign_is_seen(tmp_path):
+def test_a_register_in_twos_complement_is_reported(tmp_path):
     numbers = np.round(100.0 * np.sin(np.arange(60.0))).astype(np.int16)
     path = write(
         tmp_path, "\n".join(["t,i"] + [f"{k},{n.astype(np.uint16)}" for k, n in enumerate(numbers)])
     )
-    (found,) = read_log(path, COLUMNS).findings
+    (finding,) = read_log(path, COLUMNS).findings
     first = 1 + int(np.argmax(numbers < 0))
-    assert (found.check, found.row) == ("register", first)
+    assert (finding.check, finding.row) == ("register", first)
     lines = path.read_text().splitlines()
-    lines[1:1] = ["-2,", "-1"]  # a value is missing; the row is cut
-    found, *_ = read_log(write(tmp_path, "\n".join(lines), "less.csv"), COLUMNS).findings
-    assert (found.check, found.row) == ("register", first + 2)
+    # A row with a missing value and an incomplete row count as rows of the file, too.
+    lines[1:1] = ["-2,", "-1"]
+    finding, *_ = read_log(write(tmp_path, "\n".join(lines), "less.csv"), COLUMNS).findings
+    assert (finding.check, finding.row) == ("register", first + 2)
     log = read_log(path, "time=t:s,current=twos_complement(i, 16):A")
     assert log.findings == ()
     np.testing.assert_array_equal(log.signals["current"], numbers)
@@ -127,36 +125,37 @@ def test_a_register_with_a_sign_is_seen(tmp_path):
 @pytest.mark.parametrize(
     ("signal", "bits"), [("duty", 11), ("voltage", 11), ("current", 16), ("velocity", 16)]
 )
-def test_a_register_whose_highest_bit_is_the_sign_is_seen(tmp_path, signal, bits):
+def test_a_register_with_a_sign_bit_is_reported(tmp_path, signal, bits):
     numbers = np.round(300.0 * np.sin(0.2 * np.arange(200.0))).astype(int)
-    register = [abs(one) | (int(one < 0) << (bits - 1)) for one in map(int, numbers)]
+    register = [abs(number) | (int(number < 0) << (bits - 1)) for number in map(int, numbers)]
     path = write(
-        tmp_path, "\n".join(["t,x"] + [f"{row},{one}" for row, one in enumerate(register)])
+        tmp_path, "\n".join(["t,x"] + [f"{row},{number}" for row, number in enumerate(register)])
     )
     unit = {"duty": "1", "voltage": "V", "current": "A", "velocity": "rad/s"}[signal]
-    (found,) = read_log(path, f"time=t:s,{signal}=x:{unit}").findings
-    assert (found.severity, found.check, found.row) == (
+    (finding,) = read_log(path, f"time=t:s,{signal}=x:{unit}").findings
+    assert (finding.severity, finding.check, finding.row) == (
         "error",
         "register",
         1 + int(np.argmax(numbers < 0)),
     )
-    assert found.remedy == f"write sign_magnitude(x, {bits})"
+    assert finding.remedy == f"write sign_magnitude(x, {bits})"
     log = read_log(path, f"time=t:s,{signal}=sign_magnitude(x, {bits}):{unit}")
     assert log.findings == ()
     np.testing.assert_array_equal(log.signals[signal], numbers)
-    assert (
-        read_log(path, "time=t:s,position=x:rad").findings == ()
-    )  # an encoder's counts may be there
+    # The counts of an encoder may have these values.
+    assert read_log(path, "time=t:s,position=x:rad").findings == ()
 
 
-def test_a_voltage_in_whole_millivolts_has_no_sign_to_lose(tmp_path):
+def test_a_voltage_in_whole_millivolts_is_not_a_register(tmp_path):
     numbers = np.round(700.0 + 600.0 * np.sin(0.2 * np.arange(200.0))).astype(int)
-    path = write(tmp_path, "\n".join(["t,x"] + [f"{row},{one}" for row, one in enumerate(numbers)]))
+    path = write(
+        tmp_path, "\n".join(["t,x"] + [f"{row},{number}" for row, number in enumerate(numbers)])
+    )
     assert read_log(path, "time=t:s,voltage=x:mV").findings == ()
 
 
 @pytest.mark.parametrize(
-    ("text", "name", "says"),
+    ("text", "name", "message"),
     [
         ("t,i\n1,2\n2,a\n", "log.csv", "column i in line 3 is 'a'"),
         ('t,i\n1,"2,5"\n2,"3,5"\n', "log.csv", "decimal point"),
@@ -175,14 +174,14 @@ def test_a_voltage_in_whole_millivolts_has_no_sign_to_lose(tmp_path):
         (None, "nowhere.csv", r"no log at .*nowhere"),
     ],
 )
-def test_bad_files_say_what_is_wrong(tmp_path, text, name, says):
+def test_invalid_files_raise_an_error_with_the_reason(tmp_path, text, name, message):
     if text is not None:
         write(tmp_path, text, name)
-    with pytest.raises((ValueError, FileNotFoundError), match=says):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
         read_log(tmp_path / name, COLUMNS)
 
 
-def test_parquet_is_read_by_pyarrow_and_says_so_without(tmp_path, monkeypatch):
+def test_parquet_is_read_by_pyarrow_or_raises_an_error(tmp_path, monkeypatch):
     path = write(tmp_path, "", "log.parquet")
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     with pytest.raises(ValueError, match="pip install pyarrow"):
@@ -196,25 +195,25 @@ def test_parquet_is_read_by_pyarrow_and_says_so_without(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["log.csv", "log.csv.gz"])
 @pytest.mark.parametrize("mean", [False, True])
-def test_what_is_written_is_read_again(tmp_path, name, mean):
+def test_a_written_log_is_read_back(tmp_path, name, mean):
     random = np.random.default_rng(0)
     signals = {
         signal: random.standard_normal(50)
         for signal in ("voltage", "current", "duty", "temperature")
     }
     log = Log("log", np.cumsum(random.uniform(0.5, 1.5, 50)) * 1e-3, signals, mean_voltage=mean)
-    again = read_log(tmp_path / name, write_log(tmp_path / name, log))
-    assert again.mean_voltage is mean
-    np.testing.assert_allclose(again.time, log.time - log.time[0], atol=1e-9)
+    copy = read_log(tmp_path / name, write_log(tmp_path / name, log))
+    assert copy.mean_voltage is mean
+    np.testing.assert_allclose(copy.time, log.time - log.time[0], atol=1e-9)
     for signal, values in signals.items():
-        np.testing.assert_allclose(again.signals[signal], values, rtol=1e-8)
+        np.testing.assert_allclose(copy.signals[signal], values, rtol=1e-8)
 
 
 TIME = np.arange(5.0)
 
 
 @pytest.mark.parametrize(
-    ("time", "signal", "values", "says"),
+    ("time", "signal", "values", "message"),
     [
         (TIME, "currant", TIME, "unknown signal"),
         (TIME, "current", TIME[1:], "shape"),
@@ -222,29 +221,30 @@ TIME = np.arange(5.0)
         (np.array([0.0, 1.0, 2.0, 2.0, 3.0]), "current", TIME, r"time\[3\]"),
     ],
 )
-def test_a_log_holds_what_it_says(time, signal, values, says):
-    with pytest.raises(ValueError, match=says):
+def test_invalid_signals_raise_an_error(time, signal, values, message):
+    with pytest.raises(ValueError, match=message):
         Log("x", time, {signal: values})
-    part = Log("x", TIME, {"current": TIME}).part(slice(2, 4))
+    part = Log("x", TIME, {"current": TIME}).slice_rows(slice(2, 4))
     np.testing.assert_array_equal(part.row_numbers, [3, 4])
     np.testing.assert_array_equal(part.signals["current"], [2.0, 3.0])
 
 
-def test_usable_stretches_have_no_gap_and_two_rows_at_least():
+def test_stretches_have_no_gap_and_at_least_two_rows():
     time = np.array([0.0, 1.0, 2.0, 4.0, 5.0, 20.0, 40.0, 41.0, 42.0])
     log = Log("x", time, {"current": time})
-    assert usable(log) == [slice(0, 5), slice(6, 9)]
+    assert gapless_stretches(log) == [slice(0, 5), slice(6, 9)]
 
 
 @pytest.mark.parametrize("step", [2.0 * np.pi / 4096, 0.0088, 3.0])
-@pytest.mark.parametrize("every", [1, 2])
-def test_resolution_is_found(step, every):
-    levels = np.round(np.random.default_rng(1).normal(0.0, 40.0, 500)) * every
-    levels[0] += every > 1  # a single odd level: neighbours do not occur
+@pytest.mark.parametrize("multiple", [1, 2])
+def test_the_resolution_is_detected(step, multiple):
+    levels = np.round(np.random.default_rng(1).normal(0.0, 40.0, 500)) * multiple
+    # With a single odd level no two neighboring levels occur.
+    levels[0] += multiple > 1
     assert find_resolution(0.1 + step * levels) == pytest.approx(step, rel=1e-9)
 
 
-def test_what_is_continuous_or_constant_has_no_resolution():
+def test_continuous_and_constant_signals_have_no_resolution():
     assert find_resolution(np.random.default_rng(0).standard_normal(1000)) == 0.0
     assert find_resolution(np.zeros(9)) == 0.0
     assert find_resolution(np.array([-1.0, 1.0, 1.0])) == 0.0

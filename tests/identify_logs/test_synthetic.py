@@ -1,4 +1,4 @@
-"""Computed logs, against closed forms and scipy."""
+"""Synthetic logs, compared with closed forms and scipy."""
 
 import dataclasses
 
@@ -13,8 +13,8 @@ from codrl_mj.identify.synthetic import (
     Load,
     Sampler,
     Sensor,
-    run,
     simulate,
+    simulate_drive,
 )
 
 MOTOR = GearMotor(
@@ -24,14 +24,17 @@ DRIVE = Drive(MOTOR, SampledLoop(), Supply(24.0))
 LOAD = Load(inertia=1e-3)
 
 
-def changed(**fields):
+def change_motor(**fields):
+    """Return the drive with other fields of its motor."""
     return dataclasses.replace(DRIVE, motor=dataclasses.replace(MOTOR, **fields))
 
 
 @pytest.mark.parametrize("load", [LOAD, Load(1e-3, gravity=0.4), Load(1e-3, against=0.05)])
-def test_motion_is_what_scipy_integrates(load):
-    drive = changed(coulomb_friction=0.0)
-    course = run(drive, Excitation("chirp", 12.0, 0.5, highest=50.0), load, position=0.3)
+def test_the_motion_agrees_with_scipy(load):
+    drive = change_motor(coulomb_friction=0.0)
+    samples = simulate_drive(
+        drive, Excitation("chirp", 12.0, 0.5, highest=50.0), load, position=0.3
+    )
     motor, ratio = drive.motor, drive.motor.gear_ratio
     inertia = motor.rotor_inertia + load.inertia / ratio**2
 
@@ -42,56 +45,62 @@ def test_motion_is_what_scipy_integrates(load):
         voltage_left = voltage - motor.resistance * current - motor.back_emf_constant * speed
         return voltage_left / motor.inductance, (torque - outside) / inertia, speed
 
-    state, found = np.array([0.0, 0.0, 0.3 * ratio]), []
+    state, states = np.array([0.0, 0.0, 0.3 * ratio]), []
     for row in range(3000):
-        found.append(state)
-        span, volts = course.time[row : row + 2], course.signals["voltage"][row]
+        states.append(state)
+        span, volts = samples.time[row : row + 2], samples.signals["voltage"][row]
         state = solve_ivp(slope, span, state, args=(volts,), rtol=1e-8).y[:, -1]
-    expected = np.array(found) / [1.0, ratio, ratio]
+    expected = np.array(states) / [1.0, ratio, ratio]
     actual = np.column_stack(
-        [course.signals[name][:3000] for name in ("current", "velocity", "position")]
+        [samples.signals[name][:3000] for name in ("current", "velocity", "position")]
     )
     largest = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(actual / largest, expected / largest, atol=2e-4)
 
 
 def test_a_locked_winding_is_exact():
-    course = run(DRIVE, Excitation("square", 6.0, 0.4, frequency=2.0), Load(locked=True))
-    half = course.time < 0.25
-    expected = 6.0 / 0.9 * -np.expm1(-course.time[half] * 0.9 / 4e-4)
-    np.testing.assert_allclose(course.signals["current"][half], expected, rtol=1e-12)
-    assert not course.signals["position"].any()
-    bare = run(
-        changed(rotor_inertia=0.0), Excitation("locked_prbs", 6.0, 0.1)
-    )  # which needs no inertia
+    samples = simulate_drive(
+        DRIVE, Excitation("square", 6.0, 0.4, frequency=2.0), Load(locked=True)
+    )
+    half = samples.time < 0.25
+    expected = 6.0 / 0.9 * -np.expm1(-samples.time[half] * 0.9 / 4e-4)
+    np.testing.assert_allclose(samples.signals["current"][half], expected, rtol=1e-12)
+    assert not samples.signals["position"].any()
+    # A locked shaft needs no inertia.
+    bare = simulate_drive(change_motor(rotor_inertia=0.0), Excitation("locked_prbs", 6.0, 0.1))
     assert not bare.signals["position"].any()
 
 
-def test_friction_holds_slows_and_heats_what_it_has_to():
-    held = run(DRIVE, Excitation("square", 0.07, 0.4, frequency=1.0), LOAD)  # 0.07/0.9*0.036 < 3e-3
+def test_friction_holds_the_shaft_and_slows_it():
+    # The torque 0.07/0.9*0.036 is below the Coulomb friction of 3e-3.
+    held = simulate_drive(DRIVE, Excitation("square", 0.07, 0.4, frequency=1.0), LOAD)
     assert not held.signals["position"].any()
-    course = run(DRIVE, Excitation("square", 6.0, 4.0, frequency=0.1), LOAD)
-    # steady: kT*i = c + b*omega and u = R*i + kE*omega
+    samples = simulate_drive(DRIVE, Excitation("square", 6.0, 4.0, frequency=0.1), LOAD)
+    # At constant speed kT*i = c + b*omega and u = R*i + kE*omega.
     speed = (6.0 - 0.9 * 3e-3 / 0.036) / (0.036 + 0.9 * 2e-5 / 0.036)
-    assert course.signals["velocity"][-1] * 5.0 == pytest.approx(speed, rel=1e-6)
-    assert course.signals["current"][-1] == pytest.approx((3e-3 + 2e-5 * speed) / 0.036, rel=1e-6)
+    assert samples.signals["velocity"][-1] * 5.0 == pytest.approx(speed, rel=1e-6)
+    assert samples.signals["current"][-1] == pytest.approx((3e-3 + 2e-5 * speed) / 0.036, rel=1e-6)
 
 
-def test_a_gear_loses_its_share():
-    drive = changed(gear_efficiency=0.8, coulomb_friction=0.0, viscous_friction=0.0)
-    course = run(drive, Excitation("square", 6.0, 4.0, frequency=0.1), Load(1e-3, against=0.3))
-    assert course.signals["current"][-1] * 0.036 * 5.0 * 0.8 == pytest.approx(0.3, rel=1e-6)
+def test_a_gear_loses_torque_by_its_efficiency():
+    drive = change_motor(gear_efficiency=0.8, coulomb_friction=0.0, viscous_friction=0.0)
+    samples = simulate_drive(
+        drive, Excitation("square", 6.0, 4.0, frequency=0.1), Load(1e-3, against=0.3)
+    )
+    assert samples.signals["current"][-1] * 0.036 * 5.0 * 0.8 == pytest.approx(0.3, rel=1e-6)
 
 
-def test_a_supply_sags_by_what_it_gives():
+def test_a_supply_sags_by_its_current():
     drive = dataclasses.replace(DRIVE, supply=Supply(24.0, 0.3))
-    course = run(drive, Excitation("square", 12.0, 0.2, frequency=1.0), Load(locked=True))
-    current = course.signals["current"][-2]
-    assert course.signals["bus"][-2] == pytest.approx(24.0 - 0.3 * 0.5 * current)
-    assert current == pytest.approx(0.5 * course.signals["bus"][-2] / 0.9)
+    samples = simulate_drive(
+        drive, Excitation("square", 12.0, 0.2, frequency=1.0), Load(locked=True)
+    )
+    current = samples.signals["current"][-2]
+    assert samples.signals["bus"][-2] == pytest.approx(24.0 - 0.3 * 0.5 * current)
+    assert current == pytest.approx(0.5 * samples.signals["bus"][-2] / 0.9)
 
 
-def test_sensors_show_what_they_are_told():
+def test_sensors_have_their_noise_gain_bias_delay_and_outliers():
     excitation = Excitation("slow_sine", 12.0, 2.0)
     plain = simulate(DRIVE, excitation, LOAD)
     sensors = {
@@ -114,7 +123,7 @@ def test_sensors_show_what_they_are_told():
     assert off[off > 0.0].min() > 2.9 * np.std(plain.signals["torque"])
 
 
-def test_samplers_jitter_drop_and_average():
+def test_samplers_have_jitter_dropped_rows_and_mean_voltages():
     excitation = Excitation("prbs", 12.0, 2.0, clock=1.7e-3)
     log = simulate(
         DRIVE,
@@ -127,26 +136,25 @@ def test_samplers_jitter_drop_and_average():
     assert 2001 - len(log.time) == pytest.approx(100, abs=40)
     whole = np.diff(log.time)[np.diff(log.row_numbers) == 1]
     assert np.std(whole) == pytest.approx(0.1e-3 * np.sqrt(2.0), rel=0.1)
-    course = run(DRIVE, excitation, LOAD)
-    for row in np.flatnonzero(np.diff(log.row_numbers) == 1)[
-        ::97
-    ]:  # the mean, by sums over a fine grid
-        fine = np.linspace(log.time[row], log.time[row + 1], 2001)[:-1]
-        expected = course.signals["command"][np.floor(fine * 20e3 + 1e-6).astype(int)].mean()
+    samples = simulate_drive(DRIVE, excitation, LOAD)
+    # The expected mean is a sum over a fine grid.
+    for row in np.flatnonzero(np.diff(log.row_numbers) == 1)[::97]:
+        grid = np.linspace(log.time[row], log.time[row + 1], 2001)[:-1]
+        expected = samples.signals["command"][np.floor(grid * 20e3 + 1e-6).astype(int)].mean()
         assert log.signals["voltage"][row] == pytest.approx(expected, abs=0.02)
 
 
-def test_a_seed_repeats_and_another_differs():
-    made = [
+def test_a_seed_makes_logs_reproducible():
+    logs = [
         simulate(DRIVE, Excitation(duration=1.0), LOAD, {"current": Sensor(0.1)}, seed=seed)
         for seed in (1, 1, 2)
     ]
-    np.testing.assert_array_equal(made[0].signals["current"], made[1].signals["current"])
-    assert np.any(made[0].signals["current"] != made[2].signals["current"])
+    np.testing.assert_array_equal(logs[0].signals["current"], logs[1].signals["current"])
+    assert np.any(logs[0].signals["current"] != logs[2].signals["current"])
 
 
 @pytest.mark.parametrize("kind", EXCITATIONS)
-def test_excitations_keep_to_their_amplitude_and_end(kind):
+def test_excitations_have_their_amplitude_and_duration(kind):
     excitation = Excitation(kind, 3.0, 2.0)
     voltage = excitation.voltage(np.linspace(0.0, 3.0, 3001))
     assert np.abs(voltage).max() == pytest.approx(3.0, rel=0.01)
@@ -154,12 +162,11 @@ def test_excitations_keep_to_their_amplitude_and_end(kind):
     assert abs(np.mean(voltage[:2000])) < 0.3
 
 
-def test_a_prbs_is_white_up_to_its_clock():
+def test_a_prbs_is_white_up_to_its_clock_rate():
     bits = Excitation("locked_prbs", 1.0, 100.0, clock=0.01).voltage(0.01 * np.arange(8191) + 0.005)
     correlation = np.fft.ifft(np.abs(np.fft.fft(bits)) ** 2).real / 8191
-    np.testing.assert_allclose(
-        correlation[1:], -1.0 / 8191, atol=1e-9
-    )  # of a maximum length sequence
+    # A maximum length sequence has this autocorrelation at all other lags.
+    np.testing.assert_allclose(correlation[1:], -1.0 / 8191, atol=1e-9)
     assert set(bits) == {-1.0, 1.0}
 
 
@@ -172,12 +179,12 @@ def test_a_chirp_reaches_its_frequency():
 
 
 @pytest.mark.parametrize(
-    ("act", "says"),
+    ("act", "message"),
     [
         (lambda: Excitation("prbz"), "did you mean prbs"),
         (lambda: Excitation("prbs", 0.0), "amplitude"),
         (
-            lambda: run(changed(rotor_inertia=0.0), Excitation()),
+            lambda: simulate_drive(change_motor(rotor_inertia=0.0), Excitation()),
             "one must be > 0.*load its inertia",
         ),
         (
@@ -186,15 +193,15 @@ def test_a_chirp_reaches_its_frequency():
         ),
     ],
 )
-def test_bad_excitations_shafts_and_sensors_are_refused(act, says):
-    with pytest.raises(ValueError, match=says):
+def test_invalid_excitations_shafts_and_sensors_raise_an_error(act, message):
+    with pytest.raises(ValueError, match=message):
         act()
 
 
-def test_a_motor_that_is_warm_from_the_start_has_the_resistance_of_that():
-    """35 K above the 25 degC of datasheets copper has 13.8 % more: a held shaft takes V/R as long as it is held."""
+def test_a_warm_motor_has_a_higher_resistance():
+    """At 35 K above the datasheet's 25 degC copper has 13.8 % more resistance."""
     warm = DRIVE.replaced({"motor.ambient_temperature": 60.0})
-    current = run(warm, np.full(20001, 2.0), Load(locked=True)).signals["current"][-1]
+    current = simulate_drive(warm, np.full(20001, 2.0), Load(locked=True)).signals["current"][-1]
     assert current == pytest.approx(
         2.0 / (DRIVE.motor.resistance * (1.0 + 0.00393 * 35.0)), rel=1e-6
     )

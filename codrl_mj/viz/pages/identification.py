@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from codrl_mj.identify.log import SIGNALS
 from codrl_mj.identify.result import USABLE, Identified, Trace
-from codrl_mj.identify.trust import CAUSES
+from codrl_mj.identify.uncertainty import CAUSES
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.plots import Curve, Plot
 
