@@ -60,6 +60,10 @@ _UNITS = {
 }
 """Spelling of a unit in files -> unit of the mapping."""
 _TURNS = {"deg": 360.0, "rad": 2.0 * math.pi, "turn": 1.0}  # unit of an angle -> size of a turn
+_SCALED_UNIT = re.compile(
+    r"[x×*]?\s*(\d+(?:\.\d+)?(?:e[-+]?\d+)?)\s*[x×*·]?\s*(\D+)", re.IGNORECASE
+)
+"""Pattern of a factor and a unit, as in `[0.1 deg]`."""
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # unit of time -> size in [s]
 _USUAL_RANGES = {
     "voltage": (1.0, 60.0),
@@ -146,7 +150,7 @@ def _signal(name: str, table: Table, used: Collection[str]) -> tuple[str | None,
 
     Signal and unit are None if they are unknown.
     """
-    stated, bare = _stated(name, table)
+    stated, bare = _stated_units(name, table)
     # Words of iMotor and i_motor are the same, but a unit such as mA must not be split.
     words = [
         word
@@ -154,9 +158,9 @@ def _signal(name: str, table: Table, used: Collection[str]) -> tuple[str | None,
         if word
     ]
     parts = [part for part in re.split(r"[\W_]+", name.lower() if name.isupper() else name) if part]
-    two_units = len(ends) > 2 and not any(re.search(r"\d", one) for one in ends[-2:])
     # The last two parts may be a unit, as in deg_s or N_m.
-    pairs = [f"{parts[-2]}{sign}{parts[-1]}" for sign in "/*"] if len(parts) > 2 else []
+    has_pair = len(parts) > 2 and not any(re.search(r"\d", part) for part in parts[-2:])
+    pairs = [f"{parts[-2]}{sign}{parts[-1]}" for sign in "/*"] if has_pair else []
     # Single letters inside a name are rarely units.
     inner = [
         fragment for fragment in (*reversed(parts[1:-1]), *reversed(words)) if len(fragment) > 1
@@ -166,9 +170,9 @@ def _signal(name: str, table: Table, used: Collection[str]) -> tuple[str | None,
         signal: next((unit for text in texts if (unit := _valid_unit(signal, text))), None)
         for signal in _NAMES
     }
-    # Without its factor a unit would be a wrong one: it stays open, unless `_entry` knows what the
-    # factor is.
-    units |= {one: None for one in _NAMES if _factor(one, stated, ends)[0]}
+    # A unit without its factor would be a wrong one. It stays open here, and `_entry` applies the
+    # factor if it is clear.
+    units |= {signal: None for signal in _NAMES if _unit_factor(signal, stated, parts)[0]}
     if {*words} & _NO_SIGNALS or ("state" in words and "observation" not in words):
         return None, None, "by its name not a signal that a fit uses, left out"
     if "erpm" in words:
@@ -204,14 +208,57 @@ def _signal(name: str, table: Table, used: Collection[str]) -> tuple[str | None,
     return best, units[best], ""
 
 
-def _valid_unit(name: str, table: Cells) -> tuple[list[str], str]:
-    """Return what the file states in a spelling of the mapping; None in brackets, after not a unit as a sign), its bare name."""
+def _stated_units(name: str, table: Table) -> tuple[list[str], str]:
+    """Return the unit texts that the file states for a column, and the column's name without them.
+
+    A unit stands beside the name, in brackets, after "in", or as a sign at the end.
+    """
     bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]", name)
-    bare == OPEN_UNIT:
+    bare = (name.replace(bracket[0], " ") if bracket else name).strip()
+    suffix = re.search(r"\sin\s+(\S+)$|([°º%](?:/\w+)?)$", bare)
+    texts = [
+        table.units.get(name, ""),
+        bracket[1] if bracket else "",
+        (suffix[1] or suffix[2]) if suffix else "",
+    ]
+    units = [text.strip("[]() ") for text in texts if text]
+    return units, bare[: suffix.start()] if suffix else bare
+
+
+def _unit_factor(
+    signal: str, stated: Collection[str], parts: Collection[str] = ()
+) -> tuple[str, str | None]:
+    """Return the factor and the unit in texts such as `0.1 deg`.
+
+    The unit is None if the meaning of the factor is unclear, as in `deg x10`. Without a factor the
+    result is an empty text and None.
+    """
+    for text in stated:
+        if not re.search(r"\d", text) or _valid_unit(signal, text):
+            continue
+        match = _SCALED_UNIT.fullmatch(text)
+        if match and (unit := _valid_unit(signal, match[2].strip())):
+            return match[1], unit
+        if any(_valid_unit(signal, word) for word in re.split(r"[\W\d_]+", text)):
+            return text, None
+    # A name such as pos_01deg or pos_x10 states a factor, but not how it is meant.
+    matches = (re.fullmatch(r"x\d+|\d+x|\d+(\D+)", part) for part in parts)
+    return next(
+        (
+            (match[0], None)
+            for match in matches
+            if match and (not match[1] or _valid_unit(signal, match[1]))
+        ),
+        ("", None),
+    )
+
+
+def _valid_unit(signal: str, unit: str) -> str | None:
+    """Return a unit in the spelling of the mapping; None if it is not a unit of the signal."""
+    if not re.search(r"[^\W\d]|[%°º]", unit) or unit == OPEN_UNIT:
         return None
     # A column duty_cycle is not in cycles: only percent is a unit of a share.
-    if COLUMN_UNITS[0], " ") if bracket else name).strip()
-    after = re.search(r"\sin\s+(\S+)$|([°º%](?:
+    if COLUMN_UNITS[signal] == "" and _UNITS.get(unit, unit) != "percent":
         return None
     # Names in capitals or lower case lose the case of their units: v for V, ma for mA.
     for spelling in (
@@ -234,13 +281,11 @@ def _entry(signal: str, name: str, unit: str | None, table: Table) -> tuple[_Ent
     is_identifier = bare.isascii() and bare.isidentifier() and not keyword.iskeyword(bare)
     formula = name if is_identifier else json.dumps(name, ensure_ascii=False)
     values, doubt = _finite_values(name, table), ""
-    factor, scaled = _factor(signal, _stated(name, table)[0])
-    if scaled:
-        values, unit = values * float(factor), scaled
-        formula, doubt = (
-            f"{formula}*{factor}",
-            f"a factor of {factor} is stated beside its unit, and taken: see to it",
-        )
+    factor, scaled_unit = _unit_factor(signal, _stated_units(name, table)[0])
+    if scaled_unit:
+        values, unit = values * float(factor), scaled_unit
+        formula = f"{formula}*{factor}"
+        doubt = f"its unit is stated with a factor of {factor}, which is applied: check it"
     elif unit is None:
         unit, doubt = _infer_unit(signal, name, formula, values, table)
     # ROS 2 writes seconds and nanoseconds in two columns.
