@@ -22,7 +22,7 @@ import numpy as np
 from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel, current_loop, drive
 from codrl_mj.engine import control
-from codrl_mj.engine.families import SLOT, replaced
+from codrl_mj.engine.families import SLOT_HEADER_SIZE, family_replaced
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import MujocoPhysics, compiled_task, mjcf
 from codrl_mj.physics.variation import bare_model
@@ -152,7 +152,7 @@ def wrong_loop(
     with contextlib.ExitStack() as stack:
         for family in _wrong_families(module, edits):
             right = getattr(module, family.__name__)
-            stack.enter_context(replaced(right, family))
+            stack.enter_context(family_replaced(right, family))
             if everywhere:
                 stack.enter_context(mock.patch.object(right, "advance", vars(family)["advance"]))
         yield
@@ -189,9 +189,9 @@ _LATE_FORCE: tuple[Edit, ...] = (
 _EVERY_PASS: Edit = ("if time != f64(slot)[0]:", "if True:")
 _EVERY_STAGE: Edit = ("if DATA.pbase(data) != 0:", "if False:")
 _ADVANCED = "if size_of(number, INERTIA) else math.inf,\n            )\n"
-_CANDIDATE = SLOT + len(current_loop.State._fields)
+_CANDIDATE = SLOT_HEADER_SIZE + len(current_loop.State._fields)
 _SHARED_CURRENT: tuple[Edit, ...] = (
-    (_COMMIT, f"{_COMMIT}                f64(slot)[{SLOT}] = f64(HIDDEN)[0]\n"),
+    (_COMMIT, f"{_COMMIT}                f64(slot)[{SLOT_HEADER_SIZE}] = f64(HIDDEN)[0]\n"),
     (_ADVANCED, f"{_ADVANCED}            f64(HIDDEN)[0] = f64(slot)[{_CANDIDATE}]\n"),
 )
 

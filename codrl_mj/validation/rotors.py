@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, CurrentLoop, DCMotorActuator, Motor
-from codrl_mj.engine.families import signals_at, slot_size
+from codrl_mj.engine.families import signals_offset, slot_size
 from codrl_mj.physics import install_callbacks, mjcf
 from codrl_mj.tasks import OURS
 
@@ -108,7 +108,7 @@ def drive(model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None
     """
     data = mujoco.MjData(model)
     entry = (
-        signals_at(DCMotorActuator)
+        signals_offset(DCMotorActuator)
         if model.na == model.nactuator * slot_size(DCMotorActuator)
         else 0
     )  # current comes first

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
-from codrl_mj.engine.families import SLOT, Slot, signals_at
+from codrl_mj.engine.families import SLOT_HEADER_SIZE, SlotHeader, signals_offset
 from codrl_mj.physics.mjcf import drive
 from codrl_mj.user_code import asset_path
 
@@ -28,12 +28,12 @@ FULL = DCMotorActuator(
 """An actuator with every feature in use."""
 
 
-TICK = Slot._fields.index("tick")
+TICK = SlotHeader._fields.index("tick")
 _SIZE = len(DCMotorActuator.State._fields)
-STATE = [SLOT + _SIZE + entry for entry in range(_SIZE)]
+STATE = [SLOT_HEADER_SIZE + _SIZE + entry for entry in range(_SIZE)]
 """Where a current loop's state of the last step is in `data.act`: current, integral, error."""
 CURRENT = STATE[0]
-VOLTAGE = signals_at(DCMotorActuator) + DCMotorActuator.Signals._fields.index("voltage")
+VOLTAGE = signals_offset(DCMotorActuator) + DCMotorActuator.Signals._fields.index("voltage")
 
 
 def changed(actuator, **fields):

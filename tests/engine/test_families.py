@@ -24,7 +24,7 @@ from codrl_mj.actuators import (
     parameters_type,
 )
 from codrl_mj.actuators.noise import standard_normal
-from codrl_mj.engine.families import SLOT, Slot, loaded_families, signals_at, slot_size, user_head
+from codrl_mj.engine.families import SLOT_HEADER_SIZE, SlotHeader, loaded_families, signals_offset, slot_size, user_header
 from codrl_mj.fields import flag, integer, part, real
 from codrl_mj.physics import (
     AnalyticPhysics,
@@ -203,8 +203,8 @@ pytestmark = pytest.mark.usefixtures("_families")
 def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integrator):
     model, family = rotor(actuator, integrator=integrator), type(actuator)
     data, parameters = mujoco.MjData(model), parameters_type(family)(*actuator.numbers)
-    states, shown = len(family.State._fields), signals_at(family)
-    data.act[Slot._fields.index("noise_key")] = KEY
+    states, shown = len(family.State._fields), signals_offset(family)
+    data.act[SlotHeader._fields.index("noise_key")] = KEY
     state, timestep, gear = (
         family.State(*[0.0] * states),
         model.opt.timestep,
@@ -219,10 +219,10 @@ def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integr
         data.ctrl[:] = ctrl
         mujoco.mj_step(model, data)
         state, torque, signals = family.advance(parameters, timestep, state, inputs)
-        candidate = data.act[SLOT + states : shown]
+        candidate = data.act[SLOT_HEADER_SIZE + states : shown]
         np.testing.assert_array_equal(candidate, state)
         np.testing.assert_array_equal(data.act[shown:], [*signals, 0.0])
-        assert data.act[Slot._fields.index("torque")] == torque
+        assert data.act[SlotHeader._fields.index("torque")] == torque
         assert data.actuator_force[0] == torque
         torques.append(torque)
     assert np.ptp(torques) > 0.05
@@ -353,7 +353,7 @@ def test_two_families_of_one_number_are_refused_and_the_first_stays(monkeypatch)
 def test_a_familys_number_is_its_own_and_survives_an_xml_file(tmp_path):
     numbers = [family_number(type(one)) for one in ALL]
     assert len(set(numbers)) == len({type(one) for one in ALL})
-    assert user_head(Spring)[2] == family_number(Spring)
+    assert user_header(Spring)[2] == family_number(Spring)
     spec = rotor_spec(Spring())
     spec.compile()
     path = tmp_path / "model.xml"

@@ -6,15 +6,15 @@ import pytest
 
 from codrl_mj import engine
 from codrl_mj.actuators import DCMotorActuator
-from codrl_mj.engine.families import slot_size, user_head
+from codrl_mj.engine.families import slot_size, user_header
 from tests.engine.models import controls, rotor_spec, trajectory
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
 
-HEAD, SIZE = user_head(DCMotorActuator), slot_size(DCMotorActuator)
+USER_HEADER_SIZE, SIZE = user_header(DCMotorActuator), slot_size(DCMotorActuator)
 
 
-OURS = (*HEAD, *DCMotorActuator().numbers)
+OURS = (*USER_HEADER_SIZE, *DCMotorActuator().numbers)
 
 
 def general(user=(), actdim=SIZE, **kinds):
@@ -34,18 +34,18 @@ def general(user=(), actdim=SIZE, **kinds):
 FOREIGN = {
     "user dynamics and bias without user data": general(actdim=3),
     "as many activations and no user data": general(),
-    "as many activations and other user data": general((HEAD[0], HEAD[1] + 1, *OURS[2:])),
+    "as many activations and other user data": general((USER_HEADER_SIZE[0], USER_HEADER_SIZE[1] + 1, *OURS[2:])),
     "our signature and a family that nobody loaded": general(
-        (*HEAD[:2], (HEAD[2] + 1) % 10**6, *OURS[3:])
+        (*USER_HEADER_SIZE[:2], (USER_HEADER_SIZE[2] + 1) % 10**6, *OURS[3:])
     ),
-    "our signature and a number that is no family's": general((*HEAD[:2], -1.0, *OURS[3:])),
-    "short user data": general(HEAD[:2]),
+    "our signature and a number that is no family's": general((*USER_HEADER_SIZE[:2], -1.0, *OURS[3:])),
+    "short user data": general(USER_HEADER_SIZE[:2]),
     "our user data on a plain motor": general(OURS, actdim=0, dyntype="", biastype=""),
     "our user data on another dynamics": general(OURS, actdim=0, dyntype="filter", dynprm="0.1"),
     "our user data on another bias": general(OURS, biastype="affine", biasprm="1 2 3"),
     "our user data with another number of activations": general(OURS, actdim=SIZE - 1),
     "user gain": general(
-        (HEAD[0], HEAD[1] + 1), actdim=0, dyntype="", biastype="", gaintype="user"
+        (USER_HEADER_SIZE[0], USER_HEADER_SIZE[1] + 1), actdim=0, dyntype="", biastype="", gaintype="user"
     ),
     "integrator": '<general joint="a" dyntype="integrator"/>',
     "muscle": '<muscle joint="a" lengthrange="-1 1" force="1"/>',

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.engine.doors import MOST_ON_STACK, shaft_inertia
+from codrl_mj.engine.model_access import MAX_STACK_DOFS, shaft_inertia
 
 MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
@@ -36,7 +36,7 @@ def test_it_is_one_over_the_moment_through_the_inverse_inertia_matrix(name):
         np.testing.assert_allclose(found, expected / 9.0, rtol=1e-12)
 
 
-@pytest.mark.parametrize("count", [3, MOST_ON_STACK + 1])
+@pytest.mark.parametrize("count", [3, MAX_STACK_DOFS + 1])
 def test_a_slide_of_many_that_are_not_connected_has_its_bodys_mass(count):
     spec = mujoco.MjSpec()
     for index in range(count):

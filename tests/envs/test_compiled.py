@@ -11,7 +11,7 @@ import pytest
 
 from codrl_mj import Uniform
 from codrl_mj.actuators import IDEAL, DCMotorActuator, actuator_over
-from codrl_mj.engine.families import signals_at
+from codrl_mj.engine.families import signals_offset
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.compiled import compiled_env
 from codrl_mj.tasks import TASKS, named_actuator
@@ -71,7 +71,7 @@ def _plain_step(env, task, state, force):
             data.qpos[:], data.qvel[:] = state[positions], state[velocities]
     if env.actuator == IDEAL:
         return state, force
-    return state, env.actuator.motor.torque_constant * data.act[signals_at(DCMotorActuator)] / arm
+    return state, env.actuator.motor.torque_constant * data.act[signals_offset(DCMotorActuator)] / arm
 
 
 @every_rebuilt

@@ -26,7 +26,7 @@ from codrl_mj.actuators import (
     VoltageDrive,
 )
 from codrl_mj.catalogue import motor_entry
-from codrl_mj.engine.reading import slots
+from codrl_mj.engine.reading import motor_slots
 from codrl_mj.envs.config import EnvConfig
 from tests.add_motors.models import full_state
 from tests.external_envs.models import ARM, V5, ArmEnv, BareEnv, actions, assert_same, run
@@ -211,7 +211,7 @@ def test_resets_bring_motors_to_rest(env_id, actuator):
 
 def test_every_motor_has_noise_of_its_own_in_every_episode():
     env = codrl_mj.make(CHEETAH, {"b.*": NOISY, "f.*": "lag"}, allow_unstable=True)
-    views, keys = slots(env.unwrapped.data, env.motors), []
+    views, keys = motor_slots(env.unwrapped.data, env.motors), []
     for seed in (7, None, 7):
         env.reset(seed=seed)
         keys.append([view[1] for view in views.values()])
