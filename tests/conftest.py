@@ -12,7 +12,7 @@ from codrl_mj import engine
 from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.tasks import TASKS
 
-OURS = frozenset(TASKS)
+PAPER_TASKS = frozenset(TASKS)
 
 hypothesis.settings.register_profile(
     "deterministic", derandomize=True, deadline=None, max_examples=100, database=None
@@ -30,7 +30,7 @@ def pytest_collection_modifyitems(items):
         parameters = getattr(item, "callspec", None)
         if parameters and len(parameters.params) > 1:
             task = parameters.params.get("task")
-            if isinstance(task, str) and task in OURS and task not in REPRESENTATIVES:
+            if isinstance(task, str) and task in PAPER_TASKS and task not in REPRESENTATIVES:
                 item.add_marker(pytest.mark.matrix)
 
 
@@ -64,7 +64,7 @@ def installed(bare_engine):
 def _only_our_tasks():
     """Whatever task a test registers is forgotten after it: others go through all that are known."""
     yield
-    for name in set(TASKS) - OURS:
+    for name in set(TASKS) - PAPER_TASKS:
         registry.pop(TASKS.pop(name).env_id, None)
 
 

@@ -16,7 +16,7 @@ from gymnasium.spaces import Box, Discrete
 import codrl_mj
 import tests
 from codrl_mj.fields import real
-from codrl_mj.tasks.twin import ReferenceStates
+from codrl_mj.tasks.reference_env import ReferenceStates
 
 ROOT, _NUMBERS = Path(__file__).parent, itertools.count()
 STATE = "state[0], state[1], state[2], state[3]"
@@ -175,7 +175,7 @@ TASKS = pairs(
         "action_space": (Box(-1, 1, (2,)), Discrete(3), 3),
         "options": (Undefaulted, Worded, dict, 3),
         "paper name env_id": (3,),
-        "trials": (ReferenceStates((1.0,) * 4, ((0.0,),) * 4, (0.0,) * 3, 2, 1),),
+        "reference_states": (ReferenceStates((1.0,) * 4, ((0.0,),) * 4, (0.0,) * 3, 2, 1),),
         "goal_hold": (-1.0, np.nan, "1"),
     }
 )

@@ -9,7 +9,7 @@ import imageio
 import numpy as np
 import pytest
 
-from codrl_mj.tasks import OURS
+from codrl_mj.tasks import PAPER_TASKS
 
 pytestmark = pytest.mark.matrix
 
@@ -121,7 +121,7 @@ def test_every_setting_that_we_ship_makes_a_model(tmp_path):
         kind.lower() == algorithm and asked == "True" for _, algorithm, _, kind, asked, _ in built
     )
     covered = {(algorithm, env_id) for _, algorithm, env_id, *_ in built}
-    every = {registered.env_id for registered in OURS}
+    every = {registered.env_id for registered in PAPER_TASKS}
     continuous = {"codrl_mj/Pendulum-v0", "codrl_mj/MountainCarContinuous-v0"}
     assert covered == (
         {("ppo", env_id) for env_id in every}

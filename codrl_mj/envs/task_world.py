@@ -234,7 +234,7 @@ class TaskEnvSource(EnvSource):
         )
         driven = [
             self.task.state_names[self.task.qpos[self.task.qvel.index(at)]]
-            for at in self.task.speeds
+            for at in self.task.speed_indices
         ]
         at_joint = ["N*m" if name.endswith("[rad]") else "N" for name in driven]
         forced = config.action == "force"

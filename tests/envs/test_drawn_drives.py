@@ -173,7 +173,7 @@ def test_everything_drawn_moves_as_the_equations_say(task, seed):
     env = ActuatedEnv(task, nominal, randomize=ranges)
     env.reset(seed=seed)
     one, definition, state = env.actuator, env.task, env.state
-    timestep, at = definition.step_duration, definition.speeds[0]
+    timestep, at = definition.step_duration, definition.speed_indices[0]
     bench, mechanics = (
         Bench(one, timestep),
         Mechanics(definition, one, timestep, definition.integrators[0]),
