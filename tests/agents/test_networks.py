@@ -9,11 +9,11 @@ import torch
 from torch import nn
 
 from codrl_mj.agents import AGENTS, DDPGConfig, PPOConfig
-from codrl_mj.agents.presets import ELSEWHERE, PRESETS, find_preset
+from codrl_mj.agents.presets import OTHER_ENV, PRESETS, find_preset
 from tests.agents.small import make_envs, make_model
 
 EVERY = [
-    (agent, task, name) for (agent, task), of in PRESETS.items() for name in of if task != ELSEWHERE
+    (agent, task, name) for (agent, task), of in PRESETS.items() for name in of if task != OTHER_ENV
 ]
 
 

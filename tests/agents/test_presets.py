@@ -5,7 +5,7 @@ import re
 import pytest
 
 from codrl_mj.agents import AGENTS
-from codrl_mj.agents.presets import ELSEWHERE, PRESETS, SETTINGS, find_preset
+from codrl_mj.agents.presets import OTHER_ENV, PRESETS, SETTINGS, find_preset
 from codrl_mj.tasks import TASKS, find_task
 from codrl_mj.training import TrainConfig
 from tests.tasks.faces import every_rebuilt
@@ -90,7 +90,7 @@ def test_furutas_small_torques_are_commanded_in_units():
 
 
 def test_settings_have_the_names_that_are_known_and_one_budget():
-    assert {task for _, task in PRESETS} == {*TASKS, ELSEWHERE}
+    assert {task for _, task in PRESETS} == {*TASKS, OTHER_ENV}
     for (agent, _), named in PRESETS.items():
         assert {"default"} <= set(named) <= set(SETTINGS)
         for name, preset in named.items():

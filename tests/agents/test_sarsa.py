@@ -18,7 +18,7 @@ from stable_baselines3.common.logger import configure
 import codrl_mj
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.agents.sarsa import SARSAConfig
-from codrl_mj.agents.sarsa_algorithm import FORGOTTEN, SARSA
+from codrl_mj.agents.sarsa_algorithm import MIN_ELIGIBILITY, SARSA
 from codrl_mj.physics.base import SimulationDivergedError
 from codrl_mj.tasks import find_task
 
@@ -68,7 +68,7 @@ def test_it_does_what_the_box_says(trace_decay):
             target = -1.0 + (0.0 if then is None else gamma * values[then])
             error = target - values[done]
             traces *= gamma * trace_decay
-            traces[traces < FORGOTTEN] = 0.0
+            traces[traces < MIN_ELIGIBILITY] = 0.0
             traces[done] = 1.0
             values += step_size * error * traces
     assert len(env.history) > 5

@@ -13,7 +13,7 @@ from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.files import sealed, write_json
 from codrl_mj.training import TrainConfig, TrainingStoppedError, train
-from codrl_mj.training.folder import admit
+from codrl_mj.training.folder import prepare_run
 from codrl_mj.training.watcher import Watcher
 
 
@@ -32,7 +32,7 @@ outcome, differing = kill_test.outcome, kill_test.differing
 
 def begin(run, config):
     """Leave a run folder in which a training has begun, and nothing is learned."""
-    write_json(run / "config.json", sealed(admit(run, config, resume=False, accept_changes=False)))
+    write_json(run / "config.json", sealed(prepare_run(run, config, resume=False, accept_changes=False)))
 
 
 def tiny(task, agent, num_envs=1, actuator="paper", total_episodes=None, **env):

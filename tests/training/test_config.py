@@ -9,7 +9,7 @@ import pytest
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.agents import AGENTS, DDPGConfig, PPOConfig
-from codrl_mj.agents.presets import ELSEWHERE, PRESETS
+from codrl_mj.agents.presets import OTHER_ENV, PRESETS
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.tasks import named_actuator
@@ -39,7 +39,7 @@ def test_a_configuration_survives_json_and_a_run_folder(tmp_path, actuator):
 @pytest.mark.parametrize(
     ("agent", "task", "settings"),
     [
-        (agent, task if task != ELSEWHERE else "InvertedPendulum-v5", name)
+        (agent, task if task != OTHER_ENV else "InvertedPendulum-v5", name)
         for (agent, task), named in PRESETS.items()
         for name in named
     ],

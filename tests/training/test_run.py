@@ -24,7 +24,7 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, history, load_config, train, watcher
-from codrl_mj.training.folder import owned
+from codrl_mj.training.folder import locked
 from codrl_mj.training.watcher import Watcher
 from tests.training.interruptions import begin
 
@@ -308,7 +308,7 @@ def test_a_folder_in_use_is_refused_before_anything_is_made(tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     begin(tmp_path / "run", TrainConfig.preset("cartpole", "ppo"))
     monkeypatch.setattr(PPOConfig, "make_model", lambda *_: pytest.fail("it was made"))
-    with owned(tmp_path / "run"):
+    with locked(tmp_path / "run"):
         assert main(line.split()) == 2
     shown = capsys.readouterr()
     assert shown.out == ""
