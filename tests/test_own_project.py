@@ -24,7 +24,7 @@ from codrl_mj.tasks.attributes import Fixed
 from codrl_mj.tasks.reference_env import ReferenceStates
 from codrl_mj.training import TrainConfig, load_config
 from codrl_mj.validation import try_mutations, validate
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.own_project import arm, series_elastic, slow_motion
 from tests.training.interruptions import TERMINATE, after, differing, outcome
 
@@ -90,7 +90,7 @@ CURRENT_LOOP = codrl_mj.actuators.DCMotorActuator()
 
 
 @pytest.mark.parametrize(
-    "actuator", but([SOFT, CURRENT_LOOP], ["ideal", "lag", SOFT, CURRENT_LOOP]), ids=str
+    "actuator", matrix_params([SOFT, CURRENT_LOOP], ["ideal", "lag", SOFT, CURRENT_LOOP]), ids=str
 )
 def test_a_vector_of_arms_is_the_arms_alone(actuator):
     arguments = {"actuator": actuator, "disturbances": DISTURBED}

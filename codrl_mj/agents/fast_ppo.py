@@ -243,8 +243,8 @@ class FastPPO(PPO):
         """Learn from the rollout."""
         if not self._networks.holds(self.policy):
             raise RuntimeError(
-                "the policy is not the one that the model was created with: copy a model by save and"
-                " load"
+                "the policy is not the one that the model was created with: copy a model by save"
+                " and load"
             )
         optimizer, buffer = self.policy.optimizer, self.rollout_buffer
         self._update_learning_rate(optimizer)

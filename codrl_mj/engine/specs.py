@@ -199,7 +199,7 @@ def match_pattern(pattern: str, names: list[list[str]], needed: bool = True) -> 
         if not matches:
             known = list(dict.fromkeys(name for candidates in names for name in candidates))
             raise ValueError(
-                f"{part!r}: no actuator has this name, nor drives a target of this name; "
+                f"{part!r}: no actuator has such a name, nor drives a target of this name; "
                 f"{did_you_mean(part, known)}there are {', '.join(known) or 'none'}"
             )
         matched += matches

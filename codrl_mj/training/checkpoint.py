@@ -93,7 +93,7 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
 
 
 def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
-    """Restore the result of `capture` in a model of the same configuration that has begun to learn.
+    """Restore the result of `capture` in a model of the same configuration after the start of its `learn`.
 
     Raises:
         ValueError: the state belongs to another configuration. Model and environments are then
@@ -127,7 +127,7 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
         )
         model._last_episode_starts = arrays["last_episode_starts"].copy()
         if new_observations is not None:
-            # The environments cannot restore their states and have begun new episodes.
+            # The environments cannot restore their states and have started new episodes.
             model._last_episode_starts[:] = True
         if (buffer := getattr(model, "replay_buffer", None)) is not None:
             buffer.pos, buffer.full = facts["buffer"]["pos"], facts["buffer"]["full"]

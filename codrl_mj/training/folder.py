@@ -112,9 +112,9 @@ def prepare_run(
 
 
 def is_unused(run: Path) -> bool:
-    """Return True if no training has begun in a folder.
+    """Return True if no training has started in a folder.
 
-    It is then empty, or has only leftovers of a process that was killed before it began.
+    It is then empty, or has only leftovers of a process that was killed before it started.
     """
     return {path.name for path in run.iterdir()} <= {LOCK, *(path.name for path in _leftovers(run))}
 
@@ -178,8 +178,8 @@ def check_resumable(
         ValueError: the configuration or the software differs.
     """
     # The caller has named the same configuration, and has thereby imported the same modules.
-    begun = load_config(run, trust=True)
-    if differences := differing(begun.as_mapping(), config.as_mapping()):
+    started_config = load_config(run, trust=True)
+    if differences := differing(started_config.as_mapping(), config.as_mapping()):
         changes = "; ".join(
             f"{name}: {started!r} and {requested!r}"
             for name, (started, requested) in differences.items()

@@ -23,7 +23,7 @@ from codrl_mj.envs import ActuatedEnv
 from codrl_mj.validation.motor_catalogue import Bench, Mechanics
 from tests.envs.faces import run
 from tests.envs.vectors import assert_equal_episodes, assert_same, batched, looped
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.tasks.faces import actions
 
 # every field counts: 60 turns make the rod light for its motor, so that its speed changes within a
@@ -121,7 +121,7 @@ IN_TURN = [
 ]
 
 
-@pytest.mark.parametrize("name", but(IN_TURN, ["everything", *NOMINAL]))
+@pytest.mark.parametrize("name", matrix_params(IN_TURN, ["everything", *NOMINAL]))
 def test_a_drawn_field_is_drawn_in_a_batch_as_alone_and_brought_back(name):
     randomize = DRAWN if name == "everything" else {name: DRAWN[name]}
     arguments = {"actuator": ONE, "randomize": randomize, "max_episode_steps": 5}

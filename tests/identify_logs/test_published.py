@@ -10,7 +10,7 @@ import pytest
 from codrl_mj.cli import main
 from codrl_mj.identify import published as module
 from codrl_mj.identify.published import fetch, published
-from tests.published import folder_of
+from tests.published import published_folder
 
 LOG = b"time,position\n0,0\n"
 
@@ -71,6 +71,6 @@ def test_what_there_is_is_listed_and_an_unknown_name_is_not_looked_for(capsys):
 
 @pytest.mark.parametrize("name", published())
 def test_the_digests_are_those_of_the_files(name):
-    folder = folder_of(name)
+    folder = published_folder(name)
     for file, about in published()[name]["files"].items():
         assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == about["sha256"], file

@@ -5,7 +5,7 @@ import pytest
 from codrl_mj.identify.balances import torque_balance, velocity_lag
 from codrl_mj.identify.checks import check
 from codrl_mj.identify.reading import read_log
-from tests.published import folder_of
+from tests.published import published_folder
 
 PENDULUM = "time=time:s,position=position:rad,velocity=velocity:rad/s,torque=torque:N*m"
 SERVO = (
@@ -19,11 +19,11 @@ PLAIN = SERVO.replace("twos_complement(load, 16)", "load")
 
 
 def servo_log(place, columns=SERVO):
-    return read_log(folder_of("bam_xl330") / SERVO_LOGS[place], columns)
+    return read_log(published_folder("bam_xl330") / SERVO_LOGS[place], columns)
 
 
 def pendulum_log(name, columns=PENDULUM):
-    return read_log(folder_of("dfki_pendulum") / f"{name}.csv", columns)
+    return read_log(published_folder("dfki_pendulum") / f"{name}.csv", columns)
 
 
 def kinds(log):
