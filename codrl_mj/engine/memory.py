@@ -43,13 +43,11 @@ def llvm_intrinsic(signature: Callable[..., Any]) -> Callable[[Any], Any]:
 
         # numba binds an intrinsic's arguments by the names in its signature, the typing context
         # first.
-        positional, parameters = (
+        kind, rest = (
             inspect.Parameter.POSITIONAL_OR_KEYWORD,
             inspect.signature(signature).parameters.values(),
         )
-        typed.__signature__ = inspect.Signature(
-            [inspect.Parameter("context", positional), *parameters]
-        )  # type: ignore[attr-defined]
+        typed.__signature__ = inspect.Signature([inspect.Parameter("context", kind), *rest])  # type: ignore[attr-defined]
         typed.__name__, typed.__doc__ = generate.__name__, generate.__doc__
         return intrinsic(typed)
 

@@ -265,7 +265,7 @@ class Task(fields.Checked):
         return name or self.integrators[0]
 
     @functools.cached_property
-    def speeds(self) -> tuple[int, ...]:
+    def speed_indices(self) -> tuple[int, ...]:
         """Indices of the state entries that are the velocities of the motors' joints, in order."""
         # The MJCF model knows which joints the motors drive.
         model = mujoco.MjSpec.from_file(str(asset_path(self.asset))).compile()
@@ -318,7 +318,7 @@ class Task(fields.Checked):
                 )
         return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
 
-    def initial(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
+    def draw_initial_state(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
         """Draw an initial state, shape (n,), the same as Gymnasium's with the same generator."""
         low, high = self.bounds(options)
         state = np.array(self.initial_state(low + (high - low) * generator.random(len(low))))

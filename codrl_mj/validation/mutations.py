@@ -117,9 +117,9 @@ def _wrong_callbacks(edits: tuple[Edit, ...]) -> Callable[[], Any]:
 @contextlib.contextmanager
 def wrong_callback(*edits: Edit) -> Iterator[None]:
     """MuJoCo runs a callback that was compiled from edited source."""
-    names, _, remedy = control._PARTS["motor"]
+    names, _, remedy = control._GROUPS["motor"]
     engine.uninstall()
-    with mock.patch.dict(control._PARTS, motor=(names, _wrong_callbacks(edits), remedy)):
+    with mock.patch.dict(control._GROUPS, motor=(names, _wrong_callbacks(edits), remedy)):
         try:
             yield
         finally:
@@ -188,7 +188,7 @@ _LATE_FORCE: tuple[Edit, ...] = (
 )
 _EVERY_PASS: Edit = ("if time != f64(slot)[0]:", "if True:")
 _EVERY_STAGE: Edit = ("if DATA.pbase(data) != 0:", "if False:")
-_ADVANCED = "if size_of(number, INERTIA) else math.inf,\n            )\n"
+_ADVANCED = "if family_size(number, INERTIA) else math.inf,\n            )\n"
 _CANDIDATE = SLOT_HEADER_SIZE + len(current_loop.State._fields)
 _SHARED_CURRENT: tuple[Edit, ...] = (
     (_COMMIT, f"{_COMMIT}                f64(slot)[{SLOT_HEADER_SIZE}] = f64(HIDDEN)[0]\n"),

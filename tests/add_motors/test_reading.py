@@ -108,7 +108,7 @@ def test_clear_motors_brings_both_backends_to_rest_and_an_invalid_key_changes_no
     message = f"noise_keys[1] = {key!r}: must be a whole number from 0 to 2**53 - 1"
     with pytest.raises(ValueError, match=re.escape(message)):
         codrl_mj.engine.clear_motors(data, [3, key])
-    with pytest.raises(ValueError, match="there are 1, must be 2, one for each motor"):
+    with pytest.raises(ValueError, match="got 1 keys, must be 2: one for each motor"):
         codrl_mj.engine.clear_motors(data, 7)
     np.testing.assert_array_equal(np.concatenate((data.act, data.plugin_state)), before)
     codrl_mj.engine.clear_motors(data)

@@ -211,7 +211,7 @@ def register_anew(model):
     [
         (register_anew, f"plugin slot = 0: a motor of codrl_mj needs {registered()[NAME][0]}"),
         (set_user(0, 1.0), "its actuator's user data do not begin with codrl_mj's signature"),
-        (swap_families, "family = 'codrl_mj.actuators.current_loop:Actuator' of its plugin"),
+        (swap_families, "family = 'codrl_mj.actuators.current_loop:DCMotorActuator' of its plugin"),
         (set_user(2, 123.0), "family 123 is not known in this process: import its module and call"),
         (set_user(4, -1.0), r"Motor\.resistance = -1\.0: must be"),
     ],

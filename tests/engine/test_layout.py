@@ -162,7 +162,7 @@ def test_a_wrong_layout_is_not_compiled(owner, monkeypatch):
         owner,
         [("added_by_a_new_version", ctypes.c_int64), *layout.struct(owner)._fields_],
     )
-    fields, name = layout.Fields(owner), "nactuator" if owner == "mjModel" else "time"
+    fields, name = layout.StructFields(owner), "nactuator" if owner == "mjModel" else "time"
 
     @numba.njit
     def read(address):

@@ -256,7 +256,7 @@ def test_a_full_disk_gives_one_line_and_the_run_continues_later(stopped, expecte
         assert main(line) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert error.startswith(f"codrl-mj: error: training in {stopped} was broken off: ")
+    assert error.startswith(f"codrl-mj: error: training in {stopped} was interrupted: ")
     assert "File too large" in error
     assert error.endswith(f"continue with codrl-mj train --resume {stopped}\n")
     assert {path.name: path.read_bytes() for path in checkpoints(stopped)} == before
