@@ -318,7 +318,9 @@ class Task(fields.Checked):
                 )
         return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
 
-    def draw_initial_state(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
+    def draw_initial_state(
+        self, generator: np.random.Generator, options: dict[str, Any] | None
+    ) -> np.ndarray:
         """Draw an initial state, shape (n,), the same as Gymnasium's with the same generator."""
         low, high = self.bounds(options)
         state = np.array(self.initial_state(low + (high - low) * generator.random(len(low))))

@@ -93,7 +93,7 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
 
 
 def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
-    """Restore the result of `capture` in a model of the same configuration after the start of its `learn`.
+    """Restore the result of `capture` in a model of the same configuration, within its `learn`.
 
     Raises:
         ValueError: the state belongs to another configuration. Model and environments are then

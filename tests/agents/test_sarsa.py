@@ -316,7 +316,7 @@ def test_a_diverging_simulation_is_an_error(compiled):
         (
             "MountainCar",
             SARSAConfig(intervals=(8, 8, 8)),
-            "of 3 observation entries, but there are 2",
+            "need 3 observation entries, but there are 2",
         ),
         ("Acrobot", SARSAConfig(intervals=(8, 8), angles=3), "angles = 3: must be from 0"),
         ("CartPole", SARSAConfig(intervals=(4, 4, 4, 4)), "axis 1 from -inf to inf"),

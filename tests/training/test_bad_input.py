@@ -198,8 +198,9 @@ def test_other_software_raises_and_can_be_accepted(capsys, changes, expected):
     edit(Path("unfinished/config.json"), **changes)
     error = error_of(capsys, "train", "--resume", "unfinished")
     assert expected in error
-    assert error.count(" was ") == 2  # it "was started" with one other thing
-    assert "accept it with --accept-changes" in error
+    # The message has "was started" and a single difference.
+    assert error.count(" was ") == 2
+    assert "accept the change with --accept-changes" in error
     do("train --resume unfinished --accept-changes")
     assert Path("unfinished/result.json").exists()
 
