@@ -50,7 +50,7 @@ $(MUJOCO4)/.installed: pyproject.toml constraints.txt
 MUJOCO4_WITHOUT := --ignore tests/external_envs/test_dm_control.py \
 	--deselect tests/external_envs/test_divergence.py::test_dm_controls_environment_stops \
 	--deselect tests/add_motors/test_ideal.py::test_there_are_enough_robots \
-	--deselect tests/add_motors/test_round_trips.py::test_another_process_has_the_same_motors_and_imports_no_code_because_a_model_says_so \
+	--deselect tests/add_motors/test_round_trips.py::test_another_process_has_the_same_motors_and_a_model_cannot_import_code \
 	--deselect "tests/add_motors/test_joint_dynamics.py::test_kept_losses_brake_a_joint_and_replaced_ones_do_not[True]"
 
 mujoco4: $(MUJOCO4)/.installed  ## the engine's tests and the certificate on MuJoCo 4, which dm_control does not work with

@@ -149,7 +149,7 @@ def _door() -> Any:
 def _states(model: int, instance: int) -> int:
     """`nstate`: asked once by the compiler of a model, which asks `init` next."""
     try:
-        return _door().states_of(model, instance)
+        return _door().num_states(model, instance)
     except Exception:
         return 0  # `init` will say why
 

@@ -24,13 +24,13 @@ from codrl_mj.catalogue import motor_entry, motor_names
 from codrl_mj.runs.files import writing
 from codrl_mj.sizing import design, find_drive, torque_limits
 from codrl_mj.study.bench import BLOCKED, on_bench
-from codrl_mj.tasks import OURS, named_actuator
+from codrl_mj.tasks import PAPER_TASKS, named_actuator
 from codrl_mj.validation.motor_catalogue import COLD
 
 FOLDER = Path(__file__).parent.parent / "docs"
 PAGE = "actuators_in_numbers.md"
 TABLES = {"tasks": "actuators_in_numbers_tasks.csv", "motors": "actuators_in_numbers_motors.csv"}
-TASKS = {task.name: task for task in OURS}
+TASKS = {task.name: task for task in PAPER_TASKS}
 """Those that have the paper's actuators."""
 LONG = 200.0
 """Time [s] after which the slowest of the tasks' loops has settled."""

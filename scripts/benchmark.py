@@ -34,7 +34,7 @@ from codrl_mj.cli.terminal import console
 from codrl_mj.physics.sharing import cpus
 from codrl_mj.runs.files import read_json, write_json
 from codrl_mj.study import markdown_table, read_csv, write_csv, write_page
-from codrl_mj.tasks import OURS
+from codrl_mj.tasks import PAPER_TASKS
 
 Makers = list[Callable[[], Subject]]
 NUM_ENVS = 1024
@@ -47,7 +47,7 @@ ENVPOOL = {
     "mountain_car": ("MountainCar-v0",),
     "mountain_car_continuous": ("MountainCarContinuous-v0",),
 }
-TASKS = {task.name: task for task in OURS}
+TASKS = {task.name: task for task in PAPER_TASKS}
 APART = (
     "mountain_car",
     "mountain_car_continuous",

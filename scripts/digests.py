@@ -35,10 +35,10 @@ from codrl_mj.identify import identify, read_log
 from codrl_mj.identify.synthetic import Excitation, Load, Sampler, Sensor, simulate
 from codrl_mj.runs.files import read_json, write_json
 from codrl_mj.sizing import find_drive
-from codrl_mj.tasks import OURS, find_task, named_actuator
+from codrl_mj.tasks import PAPER_TASKS, find_task, named_actuator
 from codrl_mj.training import TrainConfig, train
 
-TASKS = {task.name: task for task in OURS}
+TASKS = {task.name: task for task in PAPER_TASKS}
 EVERY = TASKS | {"furuta": find_task("furuta")}
 
 _COMMAND = {"command_delay": 0.027, "command_quantum": 0.3, "command_rate": 1.5}

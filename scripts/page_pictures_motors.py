@@ -16,7 +16,7 @@ from PIL import Image
 from codrl_mj.actuators import Drive, GearMotor, Lag, SampledLoop, Supply, TorqueSpeed
 from codrl_mj.cli import main
 from codrl_mj.study.bench import BLOCKED, on_bench
-from codrl_mj.tasks import OURS, named_actuator
+from codrl_mj.tasks import PAPER_TASKS, named_actuator
 from codrl_mj.viz.pages.plots import Curve, Plot, save
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -138,7 +138,7 @@ def actuators_in_numbers(out: Path) -> None:
     """Shares of the largest force that the paper's actuators deliver on a blocked joint, on three tasks."""
     plots = []
     for task in (
-        one for one in OURS if one.name in ("pendulum", "cartpole", "acrobot", "mountain_car")
+        one for one in PAPER_TASKS if one.name in ("pendulum", "cartpole", "acrobot", "mountain_car")
     ):
         timestep = task.step_duration / task.motor_inner_steps
         curves = []

@@ -24,7 +24,7 @@ from codrl_mj import LogUniform
 from codrl_mj.actuators import spectral_radius
 from codrl_mj.cli.terminal import console
 from codrl_mj.envs import ActuatedVectorEnv
-from codrl_mj.tasks import OURS, TASKS, named_actuator
+from codrl_mj.tasks import PAPER_TASKS, TASKS, named_actuator
 
 GROWTH = 4 * 2**20
 """Largest growth of resident memory after the first tenth [bytes]: 4 MiB, less than 5 bytes a step."""
@@ -158,7 +158,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--task", choices=[task.name for task in OURS], default="cartpole")
+    parser.add_argument("--task", choices=[task.name for task in PAPER_TASKS], default="cartpole")
     parser.add_argument("--num-envs", type=int, default=1024)
     parser.add_argument(
         "--steps",

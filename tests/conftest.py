@@ -1,4 +1,4 @@
-"""Settings and fixtures of the whole suite."""
+"""Settings and fixtures of all tests."""
 
 import gc
 import os
@@ -12,7 +12,7 @@ from codrl_mj import engine
 from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.tasks import TASKS
 
-OURS = frozenset(TASKS)
+BUILT_IN_TASKS = frozenset(TASKS)
 
 hypothesis.settings.register_profile(
     "deterministic", derandomize=True, deadline=None, max_examples=100, database=None
@@ -21,21 +21,24 @@ hypothesis.settings.load_profile("deterministic")
 
 
 REPRESENTATIVES = ("pendulum", "cartpole", "mountain_car")
-"""Of products of the tasks with something else `make test` runs these: a continuous, an unbounded and a walled one."""
+"""Tasks that `make test` runs in products of tasks with other parameters.
+
+They have continuous actions, an unbounded state, and walls.
+"""
 
 
 def pytest_collection_modifyitems(items):
-    """Leave the other tasks' rows of such products to `make check`."""
+    """Mark rows of other tasks in such products as matrix, which only `make check` runs."""
     for item in items:
         parameters = getattr(item, "callspec", None)
         if parameters and len(parameters.params) > 1:
             task = parameters.params.get("task")
-            if isinstance(task, str) and task in OURS and task not in REPRESENTATIVES:
+            if isinstance(task, str) and task in BUILT_IN_TASKS and task not in REPRESENTATIVES:
                 item.add_marker(pytest.mark.matrix)
 
 
 def pytest_collection_finish():
-    """Spare the collector what lives as long as the process: thousands of tests, and all that they import."""
+    """Freeze objects that live as long as the process, so that garbage collection skips them."""
     gc.collect()
     gc.freeze()
 
@@ -47,7 +50,7 @@ def _remove_callbacks():
 
 @pytest.fixture
 def bare_engine():
-    """MuJoCo without any callback, before and after the test."""
+    """Remove all MuJoCo callbacks before and after the test."""
     _remove_callbacks()
     yield
     _remove_callbacks()
@@ -55,20 +58,20 @@ def bare_engine():
 
 @pytest.fixture
 def installed(bare_engine):
-    """MuJoCo with our motors' callbacks during the test, and without any after it."""
+    """Install our motors' callbacks during the test, and remove all afterwards."""
     engine.load_family(DCMotorActuator)
     engine.install()
 
 
 @pytest.fixture(autouse=True)
-def _only_our_tasks():
-    """Whatever task a test registers is forgotten after it: others go through all that are known."""
+def _remove_test_tasks():
+    """Remove tasks that a test has registered, because other tests use all registered tasks."""
     yield
-    for name in set(TASKS) - OURS:
+    for name in set(TASKS) - BUILT_IN_TASKS:
         registry.pop(TASKS.pop(name).env_id, None)
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _as_wide_as_a_file():
-    """Processes of a parallel run have a COLUMNS of their own."""
+def _remove_columns():
+    """Remove COLUMNS, which processes of a parallel run have, so that tables are wide."""
     os.environ.pop("COLUMNS", None)

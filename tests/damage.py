@@ -1,10 +1,10 @@
-"""Damage to files: as a failing disk or a careless transfer does it, and on purpose."""
+"""Damage to files, as by a failing disk or a transfer in text mode, and on purpose."""
 
 from pathlib import Path
 
 
 class Bomb:
-    """Leaves a file where it is unpickled."""
+    """Object that creates a file when it is unpickled."""
 
     def __init__(self, marker):
         """Take the file's path."""
@@ -15,7 +15,9 @@ class Bomb:
 
 
 def damage(content, random):
-    """The content with one to four bytes changed: other ones anywhere, or a bit flipped, which often is text still.
+    """Return the content with one to four bytes changed, by random values or by a flipped low bit.
+
+    With a flipped low bit, text often stays text.
 
     Args:
         content: bytes.

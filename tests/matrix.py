@@ -1,13 +1,13 @@
-"""Which of many combinations `make test` runs; the others are `make check`'s."""
+"""Marks for large products of parameters: `make test` runs some rows, `make check` all."""
 
 import pytest
 
 
-def but(kept, values):
-    """The values as parameters, all but those that are `kept` marked as parts of the full matrix."""
+def matrix_params(default, values):
+    """Return the values as parameters; those that are not in `default` are marked as matrix."""
     rows = [value if isinstance(value, tuple) else (value,) for value in values]
-    assert {one if isinstance(one, tuple) else (one,) for one in kept} <= set(rows)
+    assert {value if isinstance(value, tuple) else (value,) for value in default} <= set(rows)
     return [
-        pytest.param(*row, marks=() if row in kept or row[0] in kept else pytest.mark.matrix)
+        pytest.param(*row, marks=() if row in default or row[0] in default else pytest.mark.matrix)
         for row in rows
     ]

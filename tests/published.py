@@ -1,4 +1,4 @@
-"""Measurements of others, which are not part of the repository: read from the folder that CODRL_MJ_DATA names."""
+"""Published measurements, which are not in the repository: read from the folder CODRL_MJ_DATA."""
 
 import os
 from pathlib import Path
@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 
-def folder_of(name):
-    """The folder of a published set; without it the test that asks is not run, and says so."""
+def published_folder(name):
+    """Return the folder of a published set; skip the test with a message if there is none."""
     data = os.environ.get("CODRL_MJ_DATA")
     if not data or not Path(data, "bench_logs", name).is_dir():
         pytest.skip(

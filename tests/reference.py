@@ -1,4 +1,4 @@
-"""Independent oracles: the paper's equations and textbook mechanics, written out by hand in plain Python.
+"""Independent references: the paper's equations and textbook mechanics in plain Python.
 
 Nothing here uses the package: a mistake in it cannot hide in both.
 """
@@ -22,11 +22,12 @@ def paper_loop(
     td=0.0,
     arm=1.0,
 ):
-    """Algorithm 1 (DCMotorENVStep) as a function (dt, i, I, e_old, force, velocity) -> (i, I, e, u, force delivered).
+    """Return Algorithm 1 (DCMotorENVStep) as (dt, i, I, e_old, force, velocity) -> (i, I, e, u, f).
 
-    `leak` and `td` are the appendix's low-pass integral and high-pass derivative, by backward
-    Euler: (I - I_old)/dt = e - leak*I and (D - D_old)/dt*td + D = (e - e_old)/dt. With `td` the
-    third state is the low-passed error, y = e - td*D, for which D = (e - y_old)/(dt + td).
+    f is the delivered force. `leak` and `td` are the appendix's low-pass integral and
+    high-pass derivative, by backward Euler: (I - I_old)/dt = e - leak*I and (D - D_old)/dt*td + D =
+    (e - e_old)/dt. With `td` the third state is the low-passed error, y = e - td*D, for which D =
+    (e - y_old)/(dt + td).
     """
 
     def step(dt, i, integral, e_old, force, velocity):
@@ -52,7 +53,7 @@ def paper_loop(
 
 
 def of_actuator(actuator, u_max=None):
-    """`paper_loop` with the parameters of an `DCMotorActuator` (of one substep), or under another voltage limit."""
+    """Return `paper_loop` for a `DCMotorActuator` of one substep, or with another voltage limit."""
     motor, loop = actuator.motor, actuator.controller
     return paper_loop(
         r=motor.resistance,
@@ -72,7 +73,7 @@ def of_actuator(actuator, u_max=None):
 
 
 class MotorSimulation:
-    """A motor that remembers its state between steps; electrical substeps as repeated calls."""
+    """Motor that stores its state between steps; electrical substeps are repeated calls."""
 
     def __init__(self, actuator):
         """Start at rest."""
@@ -87,7 +88,7 @@ class MotorSimulation:
         return self.state[0]
 
     def step(self, dt, force, velocity):
-        """Advance by `dt`; returns the force delivered."""
+        """Advance by `dt`; return the delivered force."""
         for _ in range(self._substeps):
             *state, self.voltage, delivered = self._step(
                 dt / self._substeps, *self.state, force, velocity
@@ -100,7 +101,7 @@ GRAVITY, CART_MASS, POLE_MASS, HALF_LENGTH = 9.8, 1.0, 0.1, 0.5
 
 
 def cartpole_accelerations(theta, theta_dot, force):
-    """Accelerations of cart and pole from the Lagrangian of a cart and a uniform rod of length 2*l.
+    """Return the accelerations of cart and pole, a uniform rod of length 2*l, by Lagrange.
 
     (M + m) x'' + m l cos(theta) theta'' = F + m l theta'^2 sin(theta)
     m l cos(theta) x'' + (4/3) m l^2 theta'' = m g l sin(theta)
@@ -114,7 +115,7 @@ def cartpole_accelerations(theta, theta_dot, force):
 
 
 def cartpole_rk4(state, force, dt):
-    """One classical Runge-Kutta step of (x, x_dot, theta, theta_dot), with the force held over it."""
+    """Return (x, x_dot, theta, theta_dot) after a Runge-Kutta step with a constant force."""
 
     def derivative(y):
         x_acc, theta_acc = cartpole_accelerations(y[2], y[3], force)

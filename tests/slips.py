@@ -1,6 +1,7 @@
-"""Tasks and families with one slip each; `python -m tests.slips FACE N` runs every Nth that only numba can refuse.
+"""Tasks and families with one error each.
 
-A line for each says how it ended: a process that dies by a signal prints no more of them.
+`python -m tests.slips FACE N` runs every Nth error that only numba can find. It prints a line for
+each, which says how it ended; a process that dies by a signal prints no further lines.
 """
 
 import dataclasses
@@ -16,7 +17,7 @@ from gymnasium.spaces import Box, Discrete
 import codrl_mj
 import tests
 from codrl_mj.fields import real
-from codrl_mj.tasks.twin import ReferenceStates
+from codrl_mj.tasks.reference_env import ReferenceStates
 
 ROOT, _NUMBERS = Path(__file__).parent, itertools.count()
 STATE = "state[0], state[1], state[2], state[3]"
@@ -32,16 +33,16 @@ FUNCTIONS = {
     "terminated": ("state", "np.abs(state[0]) > 1.0"),
     "goal": ("state", "np.abs(state[1]) < 0.1"),
 }
-"""Function -> (arguments, what it returns)."""
+"""Function -> (arguments, result)."""
 
 
 def plain(state: Any) -> Any:
-    """A helper, which is found by its name."""
+    """Helper function that compiled functions find by its name."""
     return state[0] > 1.0
 
 
 def function(name: str, arguments: str, body: str) -> Any:
-    """A function of these arguments; its body is an expression to be returned, or statements."""
+    """Return a function of these arguments; its body is an expression or statements."""
     lines = body if "return" in body or "raise" in body else f"return {body}"
     namespace: dict[str, Any] = {
         "np": np,
@@ -55,7 +56,7 @@ def function(name: str, arguments: str, body: str) -> Any:
 
 
 def task(**changes: Any) -> Any:
-    """A task with other fields, of which functions are given as text."""
+    """Return a task with other values of fields; functions are given as text."""
     number = next(_NUMBERS)
     fields: dict[str, Any] = {
         "name": f"slip{number}",
@@ -100,13 +101,13 @@ class Undefaulted(NamedTuple):
 
 
 class Worded(NamedTuple):
-    """Options that are no numbers."""
+    """Options that are not numbers."""
 
     weight: str = "heavy"
 
 
 def pairs(table: dict[str, tuple]) -> list[tuple[str, Any]]:
-    """Every field of a row's with each of its values."""
+    """Return each field of a row with each of the row's values."""
     return [
         (field, value)
         for fields, values in table.items()
@@ -175,11 +176,11 @@ TASKS = pairs(
         "action_space": (Box(-1, 1, (2,)), Discrete(3), 3),
         "options": (Undefaulted, Worded, dict, 3),
         "paper name env_id": (3,),
-        "trials": (ReferenceStates((1.0,) * 4, ((0.0,),) * 4, (0.0,) * 3, 2, 1),),
+        "reference_states": (ReferenceStates((1.0,) * 4, ((0.0,),) * 4, (0.0,) * 3, 2, 1),),
         "goal_hold": (-1.0, np.nan, "1"),
     }
 )
-"""(field, what is wrong with it): refused when the task is made."""
+"""(field, invalid value): errors that are found when the task is created."""
 LATE = pairs(
     {
         "initial_state": ("return tuple(draws)",),
@@ -196,18 +197,18 @@ LATE = pairs(
         ),
     }
 )
-"""The same: refused by numba alone, because nothing is wrong with it on the numbers that it is tried with."""
+"""(field, invalid function): errors that only numba finds; calls with plain numbers succeed."""
 
 
 class State(NamedTuple):
-    """What a family remembers."""
+    """State of a family."""
 
     a: float
     b: float
 
 
 class Signals(NamedTuple):
-    """What a family shows."""
+    """Signals of a family."""
 
     heat: float
 
@@ -222,7 +223,7 @@ PARTS = {
 
 
 def family(**changes: Any) -> Any:
-    """A family with other parts, of which functions are given as text."""
+    """Return a family with other parts; functions are given as text."""
     parts: dict[str, Any] = {
         "State": State,
         "Signals": Signals,
@@ -235,12 +236,12 @@ def family(**changes: Any) -> Any:
             function(name, arguments, change) if isinstance(change, str) else change
         )
     gain = changes.pop("gain", real(1.0))
-    made = type(
+    slipped = type(
         "Slipped",
         (codrl_mj.actuators.ActuatorModel,),
         parts | changes | {"gain": gain, "__annotations__": {"gain": float}},
     )
-    return dataclasses.dataclass(frozen=True)(made)
+    return dataclasses.dataclass(frozen=True)(slipped)
 
 
 class One(NamedTuple):
@@ -258,7 +259,7 @@ class Three(NamedTuple):
 
 
 class Reserved(NamedTuple):
-    """A signal that every family has."""
+    """Signal that every family has."""
 
     speed: float
 
@@ -325,14 +326,16 @@ LATE_FAMILIES = [
 
 
 def late_task(field: str, body: str) -> Any:
-    """A task of `LATE`."""
+    """Return a task of `LATE`."""
     return task(**{field: body.format(FUNCTIONS[field][1])})
 
 
-def run(face: str, made: Any, actuator: Any = "ideal", **options: Any) -> None:
-    """Make a task's environments and step them, as the single one, as many, or to train on."""
+def run(face: str, task_to_run: Any, actuator: Any = "ideal", **options: Any) -> None:
+    """Create a task's environments and step them: a single one, several, or those for training."""
     if face == "single":
-        env = gymnasium.make(made.env_id, actuator=actuator, disable_env_checker=True, **options)
+        env = gymnasium.make(
+            task_to_run.env_id, actuator=actuator, disable_env_checker=True, **options
+        )
         env.reset(seed=0)
         for _ in range(3):
             env.step(env.action_space.sample())
@@ -342,29 +345,35 @@ def run(face: str, made: Any, actuator: Any = "ideal", **options: Any) -> None:
             parts.reset(env.unwrapped.np_random, parts.low, parts.high, parts.where)
     elif face == "vector":
         envs = gymnasium.make_vec(
-            made.env_id, 3, vectorization_mode="vector_entry_point", actuator=actuator, **options
+            task_to_run.env_id,
+            3,
+            vectorization_mode="vector_entry_point",
+            actuator=actuator,
+            **options,
         )
         envs.reset(seed=0)
         for _ in range(3):
             envs.step(envs.action_space.sample())
     else:
-        envs = codrl_mj.make_sb3_vec_env(codrl_mj.EnvConfig(made.name, actuator, **options), 2)
+        envs = codrl_mj.make_sb3_vec_env(
+            codrl_mj.EnvConfig(task_to_run.name, actuator, **options), 2
+        )
         envs.reset()
         envs.step(np.zeros((2, 1), np.float32))
 
 
 def main(face: str, every: int) -> None:
-    """Run late slips, one of so many; each is to be refused."""
+    """Run every Nth late error; each must be refused."""
     sound = codrl_mj.register(task())
     for field, body in LATE[every // 2 :: every]:
         if face == "single" or field != "initial_state":
-            told(
+            report_outcome(
                 field,
                 body,
                 lambda field=field, body=body: run(face, codrl_mj.register(late_task(field, body))),
             )
     for part, body in LATE_FAMILIES[every // 2 :: every]:
-        told(
+        report_outcome(
             part,
             body,
             lambda part=part, body=body: run(
@@ -375,13 +384,13 @@ def main(face: str, every: int) -> None:
     print("the sound one runs")
 
 
-def told(what: str, body: str, act: Any) -> None:
-    """Say how it ended."""
+def report_outcome(name: str, body: str, act: Any) -> None:
+    """Run an action and print how it ended."""
     try:
         act()
-        print("RAN", what, body, flush=True)
+        print("RAN", name, body, flush=True)
     except ValueError as error:
-        print("refused", what, "|", error, flush=True)
+        print("refused", name, "|", error, flush=True)
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.trials import Grid
 from codrl_mj.tasks import pendulum
 from codrl_mj.training import TrainConfig, train
-from tests.matrix import but
-from tests.published import folder_of
+from tests.matrix import matrix_params
+from tests.published import published_folder
 
 ROOT = Path(__file__).parent.parent
 PAGES = {
@@ -96,12 +96,12 @@ def folder_of_a_reader(trained, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "page", but([name for name in WITH_PYTHON if name not in LONG], WITH_PYTHON)
+    "page", matrix_params([name for name in WITH_PYTHON if name not in LONG], WITH_PYTHON)
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_python_of_a_page_runs(page, monkeypatch):
     if "data/bench_logs/dfki_pendulum" in PAGES[page]:
-        Path("data").symlink_to(folder_of("dfki_pendulum").parents[1])
+        Path("data").symlink_to(published_folder("dfki_pendulum").parents[1])
     monkeypatch.setattr(Grid, "compute", lambda *_: None)  # hours
     namespace = {}
     for block in re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL):

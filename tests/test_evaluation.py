@@ -96,7 +96,7 @@ def made_up(
         observation=states,
         action=np.zeros(steps),
         reward=np.ones(steps) if reward is None else np.array(reward),
-        first_speeds=states[0, list(definition.speeds)],
+        first_speeds=states[0, list(definition.speed_indices)],
         trace=trace,
         signals=ends | {"desired_force": asked},
         terminated=terminated,

@@ -19,12 +19,12 @@ from codrl_mj.physics import PHYSICS
 from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import read_run
 from codrl_mj.study.advice import measurement
-from codrl_mj.tasks import OURS, TASKS, find_task, reference_of
+from codrl_mj.tasks import PAPER_TASKS, TASKS, find_task, reference_of
 from codrl_mj.tasks.attributes import Fixed
-from codrl_mj.tasks.twin import ReferenceStates
+from codrl_mj.tasks.reference_env import ReferenceStates
 from codrl_mj.training import TrainConfig, load_config
 from codrl_mj.validation import try_mutations, validate
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.own_project import arm, series_elastic, slow_motion
 from tests.training.interruptions import TERMINATE, after, differing, outcome
 
@@ -90,7 +90,7 @@ CURRENT_LOOP = codrl_mj.actuators.DCMotorActuator()
 
 
 @pytest.mark.parametrize(
-    "actuator", but([SOFT, CURRENT_LOOP], ["ideal", "lag", SOFT, CURRENT_LOOP]), ids=str
+    "actuator", matrix_params([SOFT, CURRENT_LOOP], ["ideal", "lag", SOFT, CURRENT_LOOP]), ids=str
 )
 def test_a_vector_of_arms_is_the_arms_alone(actuator):
     arguments = {"actuator": actuator, "disturbances": DISTURBED}
@@ -140,7 +140,7 @@ def test_a_variation_of_one_of_our_tasks_is_found_where_it_stands(monkeypatch):
     monkeypatch.setattr(sys.modules["__main__"], "PENDULUM", mine, raising=False)
     assert reference_of(mine) == place
     assert reference_of(arm.TASK) == "tests.own_project.arm:TASK"
-    assert [reference_of(task) for task in OURS] == [task.name for task in OURS]
+    assert [reference_of(task) for task in PAPER_TASKS] == [task.name for task in PAPER_TASKS]
 
 
 def test_dm_control_lists_tasks_that_are_registered_late_and_has_the_arm_too():
@@ -349,11 +349,11 @@ def test_a_run_that_is_not_smooth_is_left_out_and_said():
     other(constrain=lambda state, _: (state[0], state[1], np.minimum(state[2], 0.5), state[3]))
     for name, reason in skipped():
         assert name in ("all checks", "the balances of a whole run")
-        assert "meets the task's bounds: name another in Task.trials" in reason
+        assert "meets the task's bounds: name another in Task.reference_states" in reason
 
 
 def test_a_hill_without_a_twin_has_no_ledger_and_says_so():
-    other(TASKS["mountain_car"], twin=None, paper=())
+    other(TASKS["mountain_car"], reference_env=None, paper=())
     assert skipped(["energy"]) == [
         ("all checks", "its model has a hill, whose height only a twin knows")
     ]
@@ -363,7 +363,7 @@ def test_a_run_of_ones_own_is_taken():
     trials = ReferenceStates(
         (math.pi,) * 4, ((0.0,),) * 4, start=(0.3, 0.1, 0.0, 0.0), steps=4, balanced_steps=2
     )
-    other(trials=trials)
+    other(reference_states=trials)
     result = validate("other", quick=True, groups=["convergence"])
     assert [skip.name for skip in result.skipped] == ["equations of motion that are not MuJoCo's"]
     assert len(result.checks) == 3
@@ -373,11 +373,11 @@ class Swing:
     """Drives the pendulum's twin by a name of its own."""
 
     def __new__(cls):
-        return TASKS["pendulum"].twin()
+        return TASKS["pendulum"].reference_env()
 
 
 def test_a_twin_without_paper_or_states_is_compared_where_it_can_be():
-    other(TASKS["pendulum"], twin=Swing, paper=(), trials=None)
+    other(TASKS["pendulum"], reference_env=Swing, paper=(), reference_states=None)
     result = validate("other", quick=True, groups=["dynamics", "trajectories"])
     assert result.passed
     assert {check.name for check in result.checks} == {

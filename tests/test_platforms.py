@@ -42,8 +42,8 @@ def test_everything_is_imported_and_a_policy_trained_without_what_other_systems_
 @pytest.mark.matrix
 def test_a_run_folder_in_use_is_refused_by_any_lock(tmp_path):
     """Two processes, one of which holds it."""
-    hold = "import sys; from codrl_mj.training.folder import owned; from pathlib import Path\n"
-    hold += "with owned(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    hold = "import sys; from codrl_mj.training.folder import locked; from pathlib import Path\n"
+    hold += "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     holder = subprocess.Popen(
         [sys.executable, "-c", hold, str(tmp_path)], stdin=-1, stdout=-1, text=True
     )

@@ -1,4 +1,4 @@
-"""rl-zoo3's own command line trains, evaluates and films our environments, with the settings that we ship."""
+"""rl-zoo3's command line trains, evaluates and films our environments with our settings."""
 
 import os
 import re
@@ -9,7 +9,7 @@ import imageio
 import numpy as np
 import pytest
 
-from codrl_mj.tasks import OURS
+from codrl_mj.tasks import PAPER_TASKS
 
 pytestmark = pytest.mark.matrix
 
@@ -33,9 +33,9 @@ for algorithm in {algorithms}:
 
 
 def run(folder, *arguments):
-    """Run Python in a folder, and return what it printed."""
+    """Run Python in a folder, and return its output."""
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, *arguments],
         cwd=folder,
         env=environment,
@@ -43,17 +43,16 @@ def run(folder, *arguments):
         text=True,
         timeout=300,
     )
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr
-    return done.stdout
+    assert result.returncode == 0, result.stdout[-2000:] + result.stderr
+    return result.stdout
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A folder in which rl-zoo3 trained PPO, in two processes, with scaled observations and evaluations."""
+    """Return a folder in which rl-zoo3 has trained PPO in two processes, with scaling."""
     folder = tmp_path_factory.mktemp("zoo")
-    (folder / "custom_envs.py").write_text(
-        "import codrl_mj\n"
-    )  # where rl-zoo3 looks for other people's environments
+    # rl-zoo3 looks in this file for third-party environments.
+    (folder / "custom_envs.py").write_text("import codrl_mj\n")
     command = (
         f"--algo ppo --env {ENV_ID} --conf-file codrl_mj.rl_zoo3.ppo --gym-packages codrl_mj"
         " --vec-env subproc"
@@ -69,17 +68,16 @@ def trained(tmp_path_factory):
 def test_it_trains_in_processes_evaluates_and_keeps_the_scales(trained):
     (log,) = (trained / "logs" / "ppo").iterdir()
     assert log.name == "codrl_mj-CartPole-v0_1"
-    for kept in (
+    for file in (
         "best_model.zip",
         "codrl_mj-CartPole-v0.zip",
         "codrl_mj-CartPole-v0/vecnormalize.pkl",
     ):
-        assert (log / kept).is_file()
+        assert (log / file).is_file()
     with np.load(log / "evaluations.npz") as evaluations:
         assert len(evaluations["timesteps"]) >= 2
-        assert (
-            evaluations["results"] <= evaluations["ep_lengths"]
-        ).all()  # off the centre a step pays nothing
+        # A step away from the center has no reward.
+        assert (evaluations["results"] <= evaluations["ep_lengths"]).all()
     assert "weaker" in (log / "codrl_mj-CartPole-v0" / "args.yml").read_text()
 
 
@@ -88,9 +86,8 @@ def test_it_runs_the_trained_agent(trained):
         f"--algo ppo --env {ENV_ID} --gym-packages codrl_mj -f logs --no-render -n 300 --device cpu"
     )
     printed = run(trained, "-m", "rl_zoo3.enjoy", *command.split())
-    assert (
-        float(re.search(r"Mean episode length: ([\d.]+)", printed)[1]) >= 8
-    )  # a pole cannot fall faster
+    # The pole cannot fall faster.
+    assert float(re.search(r"Mean episode length: ([\d.]+)", printed)[1]) >= 8
 
 
 def test_it_films_the_cart_and_the_pole(trained):
@@ -118,10 +115,11 @@ def test_every_setting_that_we_ship_makes_a_model(tmp_path):
     printed = run(tmp_path, "-c", EVERY_MODEL.format(algorithms=ALGORITHMS))
     built = [line.split() for line in printed.splitlines() if line.startswith("built ")]
     assert all(
-        kind.lower() == algorithm and asked == "True" for _, algorithm, _, kind, asked, _ in built
+        kind.lower() == algorithm and has_steps == "True"
+        for _, algorithm, _, kind, has_steps, _ in built
     )
     covered = {(algorithm, env_id) for _, algorithm, env_id, *_ in built}
-    every = {registered.env_id for registered in OURS}
+    every = {registered.env_id for registered in PAPER_TASKS}
     continuous = {"codrl_mj/Pendulum-v0", "codrl_mj/MountainCarContinuous-v0"}
     assert covered == (
         {("ppo", env_id) for env_id in every}

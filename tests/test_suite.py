@@ -21,7 +21,7 @@ from codrl_mj.physics import SimulationDivergedError
 from codrl_mj.tasks import TASKS, named_actuator
 from tests.conftest import REPRESENTATIVES
 from tests.engine.models import FULL, changed
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.tasks.faces import every_rebuilt
 
 VOLTAGES = (-12.0, -1.0, 0.0, 12.0)
@@ -324,7 +324,7 @@ def test_a_diverging_simulation_raises_and_works_again_after_reset(tmp_path, mon
 # -- pixels -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", but(REPRESENTATIVES, TASKS))
+@pytest.mark.parametrize("task", matrix_params(REPRESENTATIVES, TASKS))
 def test_pixels_show_the_present_state_and_change_nothing(task):
     env, blind = (suite.load(task, task_kwargs={"random": 3}, actuator="ideal") for _ in range(2))
     wrapped = pixels.Wrapper(env, render_kwargs={"height": 48, "width": 64, "camera_id": "fixed"})

@@ -22,7 +22,7 @@ from codrl_mj.external_envs import environments
 from codrl_mj.physics.compiled_task import compiled_constrain, compiled_outcomes
 from codrl_mj.user_code import read_yaml
 from tests import slips
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 FOUND, FACES = None, ("single", "vector", "training")
 
@@ -72,7 +72,7 @@ def test_a_family_that_is_no_dataclass_or_has_no_advance_is_refused():
 NUMBA = (*slips.LATE[1:], *slips.LATE_FAMILIES)
 
 
-@pytest.mark.parametrize(("name", "body"), but(NUMBA[::4], NUMBA), ids=name_of)
+@pytest.mark.parametrize(("name", "body"), matrix_params(NUMBA[::4], NUMBA), ids=name_of)
 def test_what_only_numba_can_refuse_is_a_sentence_too(name, body):
     if name in slips.PARTS:
         family = slips.family(**{name: body})
@@ -101,7 +101,7 @@ def test_functions_that_a_function_calls_are_found_by_their_names_or_their_packa
 
 
 @pytest.mark.parametrize(
-    ("face", "every"), but([("vector", 4)], [("vector", 4), *((one, 1) for one in FACES)])
+    ("face", "every"), matrix_params([("vector", 4)], [("vector", 4), *((one, 1) for one in FACES)])
 )
 def test_no_slip_ends_the_process(face, every):
     program = [sys.executable, "-m", "tests.slips", face, str(every)]
@@ -180,9 +180,9 @@ def test_a_model_that_is_not_there_is_refused_when_the_task_is_made():
 
 
 def test_the_speeds_of_a_task_follow_from_its_model():
-    assert slips.task().speeds == (2,)
-    assert slips.task(motors=("elbow",)).speeds == (3,)
-    assert [task.speeds for task in codrl_mj.tasks.TASKS.values() if task.name == "acrobot"] == [
+    assert slips.task().speed_indices == (2,)
+    assert slips.task(motors=("elbow",)).speed_indices == (3,)
+    assert [task.speed_indices for task in codrl_mj.tasks.TASKS.values() if task.name == "acrobot"] == [
         (3,)
     ]
 

@@ -407,7 +407,7 @@ def test_one_nan_among_good_samples_fails_the_check(monkeypatch, at):
         return signals
 
     monkeypatch.setattr(MujocoPhysics, "step", broken)
-    check, *_ = dynamics.one_step(TASKS["cartpole"], TASKS["cartpole"].trials, "euler", quick=True)
+    check, *_ = dynamics.one_step(TASKS["cartpole"], TASKS["cartpole"].reference_states, "euler", quick=True)
     assert math.isnan(check.worst)
     assert not check.passed
     assert "x [m] from" in check.where
@@ -485,11 +485,11 @@ def test_the_growth_near_an_unstable_equilibrium_is_its_eigenvalue():
 
 def test_the_grid_reaches_the_bounds_and_the_edges_lie_on_them():
     for task in TASKS.values():
-        states = dynamics.grid(task.trials.bounds, 5)
+        states = dynamics.grid(task.reference_states.bounds, 5)
         assert len(states) == 5 ** len(task.state_names)
-        assert states.max(axis=0).tolist() == list(task.trials.bounds)
-    assert {-1.2, 0.6} <= set(TASKS["mountain_car"].trials.edges[0])
-    assert math.pi in TASKS["acrobot"].trials.edges[0]
+        assert states.max(axis=0).tolist() == list(task.reference_states.bounds)
+    assert {-1.2, 0.6} <= set(TASKS["mountain_car"].reference_states.edges[0])
+    assert math.pi in TASKS["acrobot"].reference_states.edges[0]
 
 
 def test_bits_are_compared_and_not_values():

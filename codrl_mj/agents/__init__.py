@@ -1,4 +1,4 @@
-"""Agents: their settings, and how to make them."""
+"""Agents: learning algorithms with their settings."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,7 +13,7 @@ AGENTS: dict[str, type[AgentConfig]] = {
     config.name: config
     for config in (PPOConfig, DDPGConfig, DQNConfig, TD3Config, SACConfig, SARSAConfig)
 }
-"""Every agent's settings by the agent's name."""
+"""Classes of the agents' settings by the agents' names."""
 
 __all__ = [
     "AGENTS",
@@ -32,10 +32,10 @@ __all__ = [
 
 
 def find_agent(name: str) -> type[AgentConfig]:
-    """The settings of an agent by its name.
+    """Return the class of an agent's settings by its name.
 
     Args:
-        name: a key of `AGENTS`; or `module:Class` of somebody's `AgentConfig`, which is imported.
+        name: a key of `AGENTS`, or `module:Class` of a custom `AgentConfig`, which is imported.
 
     Raises:
         ValueError: unknown agent; the nearest known one is suggested.
@@ -45,7 +45,7 @@ def find_agent(name: str) -> type[AgentConfig]:
 
 
 def agent_from_mapping(mapping: Mapping[str, Any]) -> AgentConfig:
-    """The settings that `AgentConfig.as_mapping` described.
+    """Return an agent's settings from the result of `AgentConfig.as_mapping`.
 
     Raises:
         ValueError: unknown agent, or a field that is unknown or out of bounds.
@@ -55,16 +55,17 @@ def agent_from_mapping(mapping: Mapping[str, Any]) -> AgentConfig:
 
 
 def check_fits(agent: str, env: Any) -> None:
-    """Raise if an agent cannot act in an environment's action space.
+    """Raise an error if an agent cannot act in an environment's action space.
 
     Args:
         agent: the agent's name.
-        env: the environment's configuration, whose module is too heavy for those that only want
-            settings.
+        env: the environment's `EnvConfig`.
 
     Raises:
         ValueError: it cannot; the message names the agents that can.
     """
+    # `env` is not annotated: the import of its module would take long for callers that only need
+    # settings.
     space = env.action_space
     if not isinstance(space, find_agent(agent).action_spaces):
         fitting = [

@@ -1,4 +1,4 @@
-"""What every agent's settings have in common."""
+"""Base classes of the agents' settings."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from codrl_mj.fields import Checked, check_memory, check_names, factors
 
 @dataclasses.dataclass(frozen=True)
 class AgentConfig(Checked):
-    """Settings of an agent, and how to make it from them. Subclasses add the fields.
+    """Settings of an agent, and its construction from them; subclasses add the fields.
 
     Raises:
         ValueError: a field is out of bounds; the message names field, value and bound.
@@ -20,10 +20,10 @@ class AgentConfig(Checked):
     name: ClassVar[str]
     """Name on the command line, such as `ppo`."""
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]]
-    """Kinds of action spaces that the agent can act in."""
+    """Classes of action spaces in which the agent can act."""
 
     def __post_init__(self) -> None:
-        """Turn lists, which JSON and YAML have, into tuples, and validate."""
+        """Convert lists, as read from JSON and YAML, to tuples, and validate the fields."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, list):
@@ -31,42 +31,44 @@ class AgentConfig(Checked):
         super().__post_init__()
 
     def make_model(self, env: Any, seed: int) -> Any:
-        """The agent, ready to learn.
+        """Create the agent.
 
         Args:
             env: a Stable-Baselines3 `VecEnv`.
-            seed: of weights, minibatches and actions.
+            seed: seed of weights, minibatches and actions.
 
         Returns:
             A Stable-Baselines3 `BaseAlgorithm` on the CPU.
 
         Raises:
-            ValueError: the settings do not go with the environments.
+            ValueError: the settings do not fit the environments.
         """
         raise NotImplementedError
 
     def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
-        """The policy of such an agent with fresh weights: what its saved weights are loaded into.
+        """Create a policy with initial weights, into which saved weights can be loaded.
 
         Returns:
-            A Stable-Baselines3 `BasePolicy` on the CPU, whose `state_dict` has the keys of the
-            agent's own.
+            A Stable-Baselines3 `BasePolicy` on the CPU, whose `state_dict` has the same keys as the
+            policy of the agent.
         """
         raise NotImplementedError
 
     def as_mapping(self) -> dict[str, Any]:
-        """The settings as JSON-serialisable values, with the `name` that `find_agent` finds the agent by."""
-        return {"name": self.known_as(), **dataclasses.asdict(self)}
+        """Return the settings as JSON-serializable values, with `registry_name` as `name`."""
+        return {"name": self.registry_name(), **dataclasses.asdict(self)}
 
     @classmethod
-    def known_as(cls) -> str:
-        """The name that `codrl_mj.agents.find_agent` finds the agent by: `module:Class` if it is not one of ours."""
-        ours = cls.__module__.startswith("codrl_mj.")
-        return cls.name if ours else f"{cls.__module__}:{cls.__qualname__}"
+    def registry_name(cls) -> str:
+        """Return the agent's name for `find_agent`: `module:Class` for a custom agent."""
+        is_built_in = cls.__module__.startswith("codrl_mj.")
+        return cls.name if is_built_in else f"{cls.__module__}:{cls.__qualname__}"
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> "AgentConfig":
-        """The settings that `as_mapping` described, `name` left out; missing fields keep their defaults.
+        """Return settings from the result of `as_mapping` without `name`.
+
+        Missing fields have their defaults.
 
         Raises:
             ValueError: a field is unknown or out of bounds.
@@ -76,7 +78,14 @@ class AgentConfig(Checked):
 
 
 def check_buffer(name: str, steps: int, env: Any, observations: int) -> None:
-    """Refuse a buffer of steps, each with one or two observations, that memory does not hold; `name` is its field's."""
+    """Raise an error if a buffer does not fit into memory.
+
+    Args:
+        name: the field that sets the buffer's size, for the message.
+        steps: number of steps in the buffer.
+        env: the environments.
+        observations: number of observations stored for each step.
+    """
     numbers = observations * spaces.flatdim(env.observation_space) + spaces.flatdim(
         env.action_space
     )
@@ -85,26 +94,27 @@ def check_buffer(name: str, steps: int, env: Any, observations: int) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class DeepAgentConfig(AgentConfig):
-    """Settings of an agent with networks, on Stable-Baselines3."""
+    """Settings of an agent with neural networks, based on Stable-Baselines3."""
 
     input_scale: tuple[float, ...] | None = factors()
-    """Fixed factors > 0 on the observation's entries before they enter a network, in their order;
-    entries without one stay as they are. Velocities of the mountain cars are below 0.07, too small
+    """Fixed factors > 0 that multiply the observation's entries before they enter a network, in
+    order; further entries are not scaled. Velocities of the mountain cars are below 0.07, too small
     for a network to notice.
     """
 
     def make_policy(self, observation_space: spaces.Box, action_space: spaces.Space[Any]) -> Any:
         """See `AgentConfig.make_policy`."""
-        # no optimiser: torch's first takes almost two seconds to import a compiler
+        # A policy for evaluation needs no optimizer, and the construction of torch's first one
+        # imports a compiler, which takes almost two seconds.
         arguments = {**self._policy_arguments(), "optimizer_class": lambda *_, **__: None}
         return self._policy_class()(observation_space, action_space, lambda _: 0.0, **arguments)
 
     def _policy_class(self) -> Any:
-        """The class of the agent's policy."""
+        """Return the class of the agent's policy."""
         raise NotImplementedError
 
     def _policy_arguments(self) -> dict[str, Any]:
-        """Keyword arguments of that class, besides spaces and learning rate."""
+        """Return keyword arguments of the policy's class, without spaces and learning rate."""
         if self.input_scale is None:
             return {}
         from codrl_mj.agents.models import ScaledObservation

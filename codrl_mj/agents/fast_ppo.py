@@ -1,7 +1,7 @@
-"""PPO whose arithmetic is written out for small networks.
+"""PPO with explicit forward and backward passes, for small networks.
 
-How an actor's outputs become actions, and the slopes of the actions' probabilities; then the
-algorithm. Imports torch: import it where an agent is made.
+The distributions of the actions come first, with the gradients of their log-probabilities; then the
+algorithm. The module imports torch, so import it only where an agent is created.
 """
 
 import math
@@ -15,120 +15,136 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import explained_variance
 
-from codrl_mj.agents.twin_networks import TwinNetworks, VectorAdam
+from codrl_mj.agents.stacked_networks import StackedNetworks, VectorAdam
 
-_LEARNT_FROM = ("actions", "log_probs", "advantages", "returns")
+_TRAINING_FIELDS = ("actions", "log_probs", "advantages", "returns")
 
 
-class Judged(NamedTuple):
-    """How probable N actions are."""
+class ActionEvaluation(NamedTuple):
+    """Log-probabilities of N actions, and the entropies of their distributions."""
 
     log_prob: torch.Tensor
-    """Logarithm of their probability or density, shape (N, 1)."""
+    """Logarithms of the probabilities or densities, shape (N, 1)."""
     entropy: torch.Tensor
-    """Of the distributions that they are held against, shape (N, 1)."""
+    """Entropies of the distributions, shape (N, 1)."""
     backward: Callable[[torch.Tensor, float], tuple[torch.Tensor, torch.Tensor | None]]
-    """A loss's gradient by `log_prob` (N, 1), and that by every entry of `entropy` -> its gradient
-    by the actor's outputs (N, a), and that by `log_std` where there is one.
+    """Function (gradient of a loss with respect to `log_prob`, shape (N, 1); that with respect to
+    each entry of `entropy`) -> its gradients with respect to the actor's outputs, shape (N, a), and
+    to `log_std`, or None.
     """
 
 
 class Categorical:
-    """Discrete actions, whose outputs are logits."""
+    """Distribution of discrete actions; the actor's outputs are logits."""
 
-    every = 1
-    """Steps between two draws."""
+    sample_freq = 1
+    """Steps between two draws of noise."""
 
-    def draws(self, steps: int, envs: int, outputs: int) -> torch.Tensor:
-        """Gumbel's noise (steps, envs, outputs): the largest of logits plus this has the softmax's probabilities."""
+    def draw_noise(self, steps: int, envs: int, outputs: int) -> torch.Tensor:
+        """Draw Gumbel noise, shape (steps, envs, outputs)."""
+        # The index of the largest logit plus noise has the probabilities of the softmax.
         return torch.empty(steps, envs, outputs).exponential_().log_().neg_()
 
     def actions(
         self, hidden: torch.Tensor, outputs: torch.Tensor, draw: torch.Tensor
     ) -> torch.Tensor:
-        """Actions (N,) from outputs (N, a)."""
+        """Return actions (N,) for outputs (N, a)."""
         del hidden
         return (outputs + draw).argmax(1)
 
-    def judge(self, hidden: torch.Tensor, outputs: torch.Tensor, actions: torch.Tensor) -> Judged:
-        """Actions (N, 1) against outputs (N, a)."""
+    def evaluate(
+        self, hidden: torch.Tensor, outputs: torch.Tensor, actions: torch.Tensor
+    ) -> ActionEvaluation:
+        """Evaluate actions (N, 1) for outputs (N, a)."""
         del hidden
         log_probs, chosen = torch.log_softmax(outputs, 1), actions.long()
         probs = log_probs.exp()
         entropy = -(probs * log_probs).sum(1, keepdim=True)
 
-        def backward(by_log_prob: torch.Tensor, by_entropy: float) -> tuple[torch.Tensor, None]:
-            by_outputs = (probs * -by_log_prob).scatter_add_(1, chosen, by_log_prob)
-            if by_entropy:
-                by_outputs -= by_entropy * probs * (log_probs + entropy)
-            return by_outputs, None
+        def backward(
+            log_prob_gradient: torch.Tensor, entropy_gradient: float
+        ) -> tuple[torch.Tensor, None]:
+            output_gradient = (probs * -log_prob_gradient).scatter_add_(
+                1, chosen, log_prob_gradient
+            )
+            if entropy_gradient:
+                output_gradient -= entropy_gradient * probs * (log_probs + entropy)
+            return output_gradient, None
 
-        return Judged(log_probs.gather(1, chosen), entropy, backward)
+        return ActionEvaluation(log_probs.gather(1, chosen), entropy, backward)
 
 
 class Gaussian:
-    """Continuous actions, whose outputs are means.
+    """Distribution of continuous actions; the actor's outputs are means.
 
-    The logarithms of the standard deviations are a parameter (a,). With state-dependent noise they
-    are (h, a), and the noise is a linear function of the actor's h last hidden units, the factors
-    of which are drawn every so many steps.
+    The logarithms of the standard deviations are a parameter, shape (a,). With state-dependent
+    noise its shape is (h, a), and the noise is a linear function of the h units of the actor's last
+    hidden layer; the function's factors are drawn every `sample_freq` steps.
     """
 
-    def __init__(self, policy: ActorCriticPolicy, every: int) -> None:
-        """Share the policy's parameter."""
-        self.log_std, self.every = policy.log_std, every
+    def __init__(self, policy: ActorCriticPolicy, sample_freq: int) -> None:
+        """Take `log_std` from the policy, and share it with the policy."""
+        self.log_std, self.sample_freq = policy.log_std, sample_freq
         self._state_dependent = policy.use_sde
-        self._least = (
-            policy.action_dist.epsilon if policy.use_sde else 0.0
-        )  # variance, as Stable-Baselines3 has it
-        self._unit = getattr(policy, "largest", torch.ones(policy.log_std.shape[-1]))
+        # Stable-Baselines3 adds this to the variance of state-dependent noise.
+        self._min_variance = policy.action_dist.epsilon if policy.use_sde else 0.0
+        self._action_scale = getattr(policy, "largest", torch.ones(policy.log_std.shape[-1]))
 
-    def draws(self, steps: int, envs: int, outputs: int) -> torch.Tensor:
-        """Noise (steps, envs, a), or its factors (steps / every, envs, h, a)."""
+    def draw_noise(self, steps: int, envs: int, outputs: int) -> torch.Tensor:
+        """Draw noise (steps, envs, a), or its factors (steps / sample_freq, envs, h, a)."""
         del outputs
-        return torch.randn(-(-steps // self.every), envs, *self.log_std.shape) * self.log_std.exp()
+        return (
+            torch.randn(-(-steps // self.sample_freq), envs, *self.log_std.shape)
+            * self.log_std.exp()
+        )
 
     def actions(
         self, hidden: torch.Tensor, outputs: torch.Tensor, draw: torch.Tensor
     ) -> torch.Tensor:
-        """Actions (N, a) from outputs (N, a) and hidden units (N, h)."""
+        """Return actions (N, a) for outputs (N, a) and hidden units (N, h)."""
         noise = torch.bmm(hidden[:, None], draw)[:, 0] if self._state_dependent else draw
-        return (outputs + noise) * self._unit
+        return (outputs + noise) * self._action_scale
 
-    def judge(self, hidden: torch.Tensor, outputs: torch.Tensor, actions: torch.Tensor) -> Judged:
-        """Actions (N, a) against outputs (N, a) and hidden units (N, h)."""
+    def evaluate(
+        self, hidden: torch.Tensor, outputs: torch.Tensor, actions: torch.Tensor
+    ) -> ActionEvaluation:
+        """Evaluate actions (N, a) for outputs (N, a) and hidden units (N, h)."""
         squares = (2 * self.log_std).exp()
         features = hidden.square() if self._state_dependent else torch.ones(len(hidden), 1)
-        variances = features @ squares.view(features.shape[1], -1) + self._least
-        error = actions / self._unit - outputs
+        variances = features @ squares.view(features.shape[1], -1) + self._min_variance
+        error = actions / self._action_scale - outputs
         slope = error / variances
-        entropy = 0.5 * (2 * math.pi * math.e * self._unit.square() * variances).log().sum(
+        entropy = 0.5 * (2 * math.pi * math.e * self._action_scale.square() * variances).log().sum(
             1, keepdim=True
         )
         log_prob = 0.5 * (1 - slope * error).sum(1, keepdim=True) - entropy
 
         def backward(
-            by_log_prob: torch.Tensor, by_entropy: float
+            log_prob_gradient: torch.Tensor, entropy_gradient: float
         ) -> tuple[torch.Tensor, torch.Tensor]:
-            # hidden units count as constants in the noise, as in Stable-Baselines3
-            by_variances = 0.5 * (by_log_prob * (slope * error - 1) + by_entropy) / variances
-            return slope * by_log_prob, (features.T @ by_variances).view_as(squares) * (2 * squares)
+            # The hidden units that multiply the noise count as constants, as in Stable-Baselines3.
+            variance_gradient = (
+                0.5 * (log_prob_gradient * (slope * error - 1) + entropy_gradient) / variances
+            )
+            return slope * log_prob_gradient, (features.T @ variance_gradient).view_as(squares) * (
+                2 * squares
+            )
 
-        return Judged(log_prob, entropy, backward)
+        return ActionEvaluation(log_prob, entropy, backward)
 
 
 class FastPPO(PPO):
-    """Stable-Baselines3's PPO in a fraction of its time: the same policy, rollouts, losses and minibatches.
+    """Faster implementation of Stable-Baselines3's PPO.
 
-    Only the order in which floating-point numbers are added and the way in which noise is drawn
-    differ. A rollout takes the actor's products for each step; values and probabilities of all its
-    actions are found in one go at its end. Gradients are written out and not found by automatic
-    differentiation.
+    The policy, rollouts, losses and minibatches are the same. Only the order of floating-point
+    additions and the draws of noise differ. Each step of a rollout runs only the actor; the values
+    and probabilities of all its actions are computed together at its end. Gradients are explicit
+    formulas instead of automatic differentiation.
 
     Raises:
-        ValueError: observations of several parts, a clipped value loss, or a policy with other
-            parameters than those of its two networks, such as a features extractor that learns:
-            those are Stable-Baselines3's own `PPO`'s.
+        ValueError: observations of several parts, a clipped value loss, or a policy with parameters
+            outside its two networks, such as a features extractor that learns. Use
+            Stable-Baselines3's `PPO` for these.
     """
 
     _last_obs: Any
@@ -146,11 +162,11 @@ class FastPPO(PPO):
             )
         super()._setup_model()
         policy = self.policy
-        self._networks = TwinNetworks(policy)
-        every = self.sde_sample_freq if self.sde_sample_freq > 0 else self.n_steps
+        self._networks = StackedNetworks(policy)
+        sample_freq = self.sde_sample_freq if self.sde_sample_freq > 0 else self.n_steps
         discrete = isinstance(policy.action_space, spaces.Discrete)
         self._exploration = (
-            Categorical() if discrete else Gaussian(policy, every if policy.use_sde else 1)
+            Categorical() if discrete else Gaussian(policy, sample_freq if policy.use_sde else 1)
         )
         self._networks.parameters.grad = self._networks.gradient
         policy.optimizer = VectorAdam(
@@ -161,26 +177,26 @@ class FastPPO(PPO):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        """What a saved model leaves out: `_setup_model` makes it anew, of the policy that is loaded."""
+        """Return the attributes that a saved model omits."""
+        # `_setup_model` creates them again from the loaded policy.
         return [*super()._excluded_save_params(), "_networks", "_exploration"]
 
     @torch.no_grad()
     def collect_rollouts(
         self, env: Any, callback: Any, rollout_buffer: Any, n_rollout_steps: int
     ) -> bool:
-        """Fill the buffer, as `PPO.collect_rollouts` does."""
+        """Fill the buffer as `PPO.collect_rollouts` does."""
         callback.on_rollout_start()
-        seen, starts = self._last_obs, self._last_episode_starts
+        obs, starts = self._last_obs, self._last_episode_starts
         rollout_buffer.reset()
-        draws = self._exploration.draws(n_rollout_steps, env.num_envs, self._networks.outputs)
+        noise = self._exploration.draw_noise(n_rollout_steps, env.num_envs, self._networks.outputs)
         box = self.action_space if isinstance(self.action_space, spaces.Box) else None
-        cut: list[
-            tuple[int, int, np.ndarray]
-        ] = []  # step, environment and last observation where time ran out
+        # (step, environment, last observation) of each episode that a time limit ended.
+        truncated: list[tuple[int, int, np.ndarray]] = []
         for step in range(n_rollout_steps):
-            acted = self._networks.act(self._features(seen))
+            actor_layers = self._networks.act(self._features(obs))
             actions = self._exploration.actions(
-                *acted, draws[step // self._exploration.every]
+                *actor_layers, noise[step // self._exploration.sample_freq]
             ).numpy()
             clipped = (
                 actions
@@ -191,7 +207,7 @@ class FastPPO(PPO):
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
             if not callback.on_step():
-                self._last_obs, self._last_episode_starts = seen, starts
+                self._last_obs, self._last_episode_starts = obs, starts
                 return False
             self._update_info_buffer(infos, dones)
             timed_out = [
@@ -199,21 +215,22 @@ class FastPPO(PPO):
                 for row in np.flatnonzero(dones).tolist()
                 if infos[row].get("TimeLimit.truncated")
             ]
-            cut += [(step, row, infos[row]["terminal_observation"]) for row in timed_out]
-            rollout_buffer.observations[step] = seen.reshape(rollout_buffer.observations.shape[1:])
+            truncated += [(step, row, infos[row]["terminal_observation"]) for row in timed_out]
+            rollout_buffer.observations[step] = obs.reshape(rollout_buffer.observations.shape[1:])
             rollout_buffer.actions[step] = actions.reshape(env.num_envs, -1)
             rollout_buffer.rewards[step] = rewards
             rollout_buffer.episode_starts[step] = starts
-            seen, starts = observations, dones
-        self._last_obs, self._last_episode_starts = seen, starts
+            obs, starts = observations, dones
+        self._last_obs, self._last_episode_starts = obs, starts
         rollout_buffer.pos, rollout_buffer.full = n_rollout_steps, True
         layers = self._networks.forward(self._features(_rows(rollout_buffer.observations)))
         actions = torch.as_tensor(_rows(rollout_buffer.actions)).float()
-        judged = self._exploration.judge(layers[-2][0], layers[-1][0], actions)
-        rollout_buffer.log_probs[:] = judged.log_prob.view(rollout_buffer.log_probs.shape)
+        evaluation = self._exploration.evaluate(layers[-2][0], layers[-1][0], actions)
+        rollout_buffer.log_probs[:] = evaluation.log_prob.view(rollout_buffer.log_probs.shape)
         rollout_buffer.values[:] = layers[-1][1, :, 0].view(rollout_buffer.values.shape)
-        if cut:  # a time limit is no failure: the value of the last state is added
-            steps, rows, last = zip(*cut, strict=True)
+        if truncated:
+            # The task would have gone on, so the value of the last state is added to the reward.
+            steps, rows, last = zip(*truncated, strict=True)
             rollout_buffer.rewards[list(steps), list(rows)] += (
                 self.gamma * self._values(np.array(last)).numpy()
             )
@@ -226,26 +243,29 @@ class FastPPO(PPO):
         """Learn from the rollout."""
         if not self._networks.holds(self.policy):
             raise RuntimeError(
-                "the policy is another than the model was made with: copy a model by save and load"
+                "the policy is not the one that the model was created with: copy a model by save"
+                " and load"
             )
         optimizer, buffer = self.policy.optimizer, self.rollout_buffer
         self._update_learning_rate(optimizer)
         features = self._features(buffer.swap_and_flatten(buffer.observations))
         rest = [
             torch.as_tensor(buffer.swap_and_flatten(getattr(buffer, name))).float()
-            for name in _LEARNT_FROM
+            for name in _TRAINING_FIELDS
         ]
         for _ in range(self.n_epochs):
-            order = torch.as_tensor(
-                np.random.permutation(len(features))
-            )  # as Stable-Baselines3 draws it
-            shuffled = [one[order].split(self.batch_size) for one in (features, *rest)]
-            going_on = all(self._improve(*minibatch) for minibatch in zip(*shuffled, strict=True))
+            # numpy's global generator, which Stable-Baselines3 seeds and uses for its minibatches.
+            order = torch.as_tensor(np.random.permutation(len(features)))
+            shuffled = [values[order].split(self.batch_size) for values in (features, *rest)]
+            is_within_limit = all(
+                self._improve(*minibatch) for minibatch in zip(*shuffled, strict=True)
+            )
             self._n_updates += 1
-            if not going_on:
+            if not is_within_limit:
                 break
-        layers, (actions, _, _, returns) = self._networks.forward(features), rest  # as they are now
-        entropy = self._exploration.judge(layers[-2][0], layers[-1][0], actions).entropy
+        # Losses are logged for the networks after all updates.
+        layers, (actions, _, _, returns) = self._networks.forward(features), rest
+        entropy = self._exploration.evaluate(layers[-2][0], layers[-1][0], actions).entropy
         self.logger.record(
             "train/value_loss", (layers[-1][1, :, :1] - returns).square().mean().item()
         )
@@ -266,31 +286,38 @@ class FastPPO(PPO):
         advantages: torch.Tensor,
         returns: torch.Tensor,
     ) -> bool:
-        """A step down the gradient of a minibatch; False, and no step, if the policy has moved too far."""
-        networks, count = self._networks, len(features)
+        """Take a gradient step on a minibatch; return True if it was taken.
+
+        It is not taken if the policy has diverged too far from that of the rollout.
+        """
+        networks, size = self._networks, len(features)
         layers = networks.forward(features)
-        judged = self._exploration.judge(layers[-2][0], layers[-1][0], actions)
-        log_ratio = judged.log_prob - old_log_prob
+        evaluation = self._exploration.evaluate(layers[-2][0], layers[-1][0], actions)
+        log_ratio = evaluation.log_prob - old_log_prob
         ratio = log_ratio.exp()
         if self.target_kl is not None:
             divergence = (ratio - 1 - log_ratio).mean().item()
             self.logger.record("train/approx_kl", divergence)
             if divergence > 1.5 * self.target_kl:
                 return False
-        if self.normalize_advantage and count > 1:
+        if self.normalize_advantage and size > 1:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        reach = self.clip_range(self._current_progress_remaining)
+        clip_range = self.clip_range(self._current_progress_remaining)
         gains = advantages * ratio
-        # where the clipped gain is the smaller one, it is constant
-        by_log_prob = gains * (gains <= advantages * ratio.clamp(1 - reach, 1 + reach)) / -count
+        # If the clipped gain is the smaller one, it is constant, and its gradient is 0.
+        log_prob_gradient = (
+            gains * (gains <= advantages * ratio.clamp(1 - clip_range, 1 + clip_range)) / -size
+        )
         gradient = torch.zeros_like(layers[-1])
-        gradient[0], by_log_std = judged.backward(by_log_prob, -self.ent_coef / count)
+        gradient[0], log_std_gradient = evaluation.backward(
+            log_prob_gradient, -self.ent_coef / size
+        )
         torch.sub(layers[-1][1, :, :1], returns, out=gradient[1, :, :1]).mul_(
-            2 * self.vf_coef / count
+            2 * self.vf_coef / size
         )
         networks.backward(layers, gradient)
         if networks.log_std_gradient is not None:
-            networks.log_std_gradient.copy_(by_log_std)
+            networks.log_std_gradient.copy_(log_std_gradient)
         networks.gradient.mul_(
             (self.max_grad_norm / (networks.gradient.norm() + 1e-6)).clamp(max=1.0)
         )
@@ -298,14 +325,14 @@ class FastPPO(PPO):
         return True
 
     def _features(self, observations: np.ndarray) -> torch.Tensor:
-        """Observations (N, ...) as the networks take them (N, k)."""
+        """Return the networks' inputs (N, k) for observations (N, ...)."""
         return self.policy.extract_features(torch.as_tensor(observations))
 
     def _values(self, observations: np.ndarray) -> torch.Tensor:
-        """What the critic thinks of observations (N, ...), shape (N,)."""
+        """Return the critic's values, shape (N,), of observations (N, ...)."""
         return self._networks.forward(self._features(observations))[-1][1, :, 0]
 
 
 def _rows(array: np.ndarray) -> np.ndarray:
-    """An array (steps, envs, ...) as (steps * envs, ...)."""
+    """Reshape an array (steps, envs, ...) to (steps * envs, ...)."""
     return array.reshape(-1, *array.shape[2:])

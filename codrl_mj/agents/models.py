@@ -1,6 +1,6 @@
-"""What the agents' networks and algorithms have that Stable-Baselines3's do not.
+"""Networks and algorithms of the agents that extend those of Stable-Baselines3.
 
-Imports torch: import it where an agent is made.
+The module imports torch, so import it only where an agent is created.
 """
 
 from collections.abc import Sequence
@@ -19,10 +19,13 @@ from torch.nn import functional
 
 
 class ScaledObservation(FlattenExtractor):
-    """Multiplies the entries of an observation by fixed factors; entries without a factor stay as they are."""
+    """Features extractor that multiplies an observation's entries by fixed factors.
+
+    Entries without a factor are not scaled.
+    """
 
     def __init__(self, observation_space: spaces.Box, factors: Sequence[float]) -> None:
-        """Take at most as many factors as an observation has entries."""
+        """Store the factors, at most one for each entry of an observation."""
         super().__init__(observation_space)
         if len(factors) > self.features_dim:
             raise ValueError(
@@ -34,12 +37,15 @@ class ScaledObservation(FlattenExtractor):
         self.register_buffer("factors", padded, persistent=False)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Observations (N, k) times the factors (k,)."""
+        """Return observations (N, k) times the factors (k,)."""
         return super().forward(observations) * self.factors
 
 
 class UnitActionPolicy(ActorCriticPolicy):
-    """Its actor's mean and noise are in units of the largest action: a torque of 0.08 N*m or a voltage of 18 V is 1."""
+    """Policy whose actor has its mean and noise in units of the largest action.
+
+    For example, the largest torque of 0.08 N*m or the largest voltage of 18 V is 1.
+    """
 
     def _build(self, lr_schedule: Any) -> None:
         if not isinstance(self.action_space, spaces.Box):
@@ -57,7 +63,7 @@ class UnitActionPolicy(ActorCriticPolicy):
 
 
 class TwoStreams(nn.Module):
-    """Q(state, action): state and action each through layers of their own, then joined, then through joint layers."""
+    """Network for Q(state, action) with separate layers for state and action, then joint layers."""
 
     def __init__(
         self,
@@ -67,7 +73,15 @@ class TwoStreams(nn.Module):
         action: Sequence[int],
         joint: Sequence[int],
     ) -> None:
-        """Make layers of so many units for state and action, none letting it through, and joint ones; with ReLUs."""
+        """Create layers with ReLUs.
+
+        Args:
+            state_size: number of entries of a state.
+            action_size: number of entries of an action.
+            state: units of the state's layers; an empty sequence passes the state on.
+            action: units of the action's layers; an empty sequence passes the action on.
+            joint: units of the joint layers.
+        """
         super().__init__()
         self.state_size = state_size
         self.state_stream = nn.Sequential(*create_mlp(state_size, -1, list(state), nn.ReLU))
@@ -76,7 +90,7 @@ class TwoStreams(nn.Module):
         self.joint = nn.Sequential(*create_mlp(joined, 1, list(joint), nn.ReLU))
 
     def forward(self, state_and_action: torch.Tensor) -> torch.Tensor:
-        """States and actions, concatenated, (N, state_size + action_size) -> values (N, 1)."""
+        """Return values (N, 1) of concatenated states and actions (N, state_size + action_size)."""
         state, action = (
             state_and_action[:, : self.state_size],
             state_and_action[:, self.state_size :],
@@ -85,7 +99,7 @@ class TwoStreams(nn.Module):
 
 
 class TwoStreamPolicy(TD3Policy):
-    """Actor and critic of DDPG, the critic's networks being `TwoStreams`."""
+    """Actor and critic of DDPG, with `TwoStreams` as networks of the critic."""
 
     def __init__(
         self,
@@ -95,12 +109,12 @@ class TwoStreamPolicy(TD3Policy):
         joint_units: Sequence[int],
         **kwargs: Any,
     ) -> None:
-        """Take what `TD3Policy` takes, and the critic's layers as `TwoStreams` does."""
+        """Take the arguments of `TD3Policy`, and the units of `TwoStreams`."""
         self._streams = state_units, action_units, joint_units
         super().__init__(*args, **kwargs)
 
     def make_critic(self, features_extractor: Any = None) -> ContinuousCritic:
-        """A critic, as `TD3Policy` asks for it."""
+        """Create the critic of `TD3Policy`, with `TwoStreams` as its networks."""
         critic = super().make_critic(features_extractor)
         state_size, (action_size,) = critic.features_extractor.features_dim, self.action_space.shape
         for index in range(critic.n_critics):
@@ -110,19 +124,22 @@ class TwoStreamPolicy(TD3Policy):
 
 
 class TwoRatePPO(PPO):
-    """Stable-Baselines3's PPO with separate passes, and separate learning rates, for actor and critic.
+    """Stable-Baselines3's PPO with separate passes and learning rates for actor and critic.
 
-    The update of Spinning Up and of Keras's example: passes over the rollout improve the actor
-    until it has moved too far (1.5 times `target_kl`), and the critic is fitted whether the actor
-    stopped or not. Gradients are not clipped. One Adam optimiser holds both, in two groups: Adam
-    keeps moments and count for each tensor, and leaves out those without a gradient, so this is two
-    optimisers in one state dict.
+    This is the update of Spinning Up and of Keras's example: passes over the rollout improve the
+    actor until its divergence exceeds 1.5 times `target_kl`; the critic is fitted in any case.
+    Gradients are not clipped. One Adam optimizer has both networks, in two groups. Adam keeps
+    moments and counts for each tensor and skips tensors without a gradient, so it acts like two
+    optimizers with one state dict.
     """
 
     def __init__(
         self, *args: Any, critic_learning_rate: float, critic_epochs: int, **kwargs: Any
     ) -> None:
-        """Take what `PPO` takes, whose `learning_rate` is the actor's and whose `n_epochs` are the actor's at most."""
+        """Take the arguments of `PPO`, and two of the critic.
+
+        `learning_rate` is the actor's, and `n_epochs` the largest number of its passes.
+        """
         self.critic_learning_rate = critic_learning_rate
         self.critic_epochs = critic_epochs
         super().__init__(*args, **kwargs)
@@ -131,8 +148,8 @@ class TwoRatePPO(PPO):
         super()._setup_model()
         policy = self.policy
         critic = [*policy.mlp_extractor.value_net.parameters(), *policy.value_net.parameters()]
-        of_critic = {id(parameter) for parameter in critic}
-        actor = [parameter for parameter in policy.parameters() if id(parameter) not in of_critic]
+        critic_ids = {id(parameter) for parameter in critic}
+        actor = [parameter for parameter in policy.parameters() if id(parameter) not in critic_ids]
         groups = [{"params": actor}, {"params": critic}]
         policy.optimizer = policy.optimizer_class(
             groups, lr=self.lr_schedule(1), **policy.optimizer_kwargs
@@ -153,7 +170,10 @@ class TwoRatePPO(PPO):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _improve_actor(self) -> bool:
-        """One pass over the rollout; False if it stopped because the policy had moved too far."""
+        """Improve the actor in one pass over the rollout; return True if the pass was completed.
+
+        It stops early if the policy has diverged too far from that of the rollout.
+        """
         clip_range = self.clip_range(self._current_progress_remaining)
         for rollout in self.rollout_buffer.get(self.batch_size):
             discrete = isinstance(self.action_space, spaces.Discrete)
@@ -162,9 +182,8 @@ class TwoRatePPO(PPO):
             log_probability = distribution.log_prob(actions)
             log_ratio = log_probability - rollout.old_log_prob
             ratio = log_ratio.exp()
-            divergence = (
-                (ratio - 1 - log_ratio).mean().item()
-            )  # of the old policy from the new, an unbiased estimate
+            # An unbiased estimate, with low variance, of the old policy's divergence from the new.
+            divergence = (ratio - 1 - log_ratio).mean().item()
             self.logger.record("train/approx_kl", divergence)
             if self.target_kl is not None and divergence > 1.5 * self.target_kl:
                 return False
@@ -182,7 +201,7 @@ class TwoRatePPO(PPO):
         return True
 
     def _improve_critic(self) -> None:
-        """One pass over the rollout."""
+        """Fit the critic in one pass over the rollout."""
         losses = []
         for rollout in self.rollout_buffer.get(self.batch_size):
             loss = functional.mse_loss(
@@ -193,17 +212,20 @@ class TwoRatePPO(PPO):
         self.logger.record("train/value_loss", np.mean(losses))
 
     def _descend(self, loss: torch.Tensor) -> None:
-        # to None: the optimiser then leaves the other network alone
+        # This sets gradients to None, so that the optimizer skips the other network.
         self.policy.optimizer.zero_grad()
         loss.backward()
         self.policy.optimizer.step()
 
 
-class _CriticRate:
-    """Gives the critic a learning rate of its own."""
+class _CriticLearningRate:
+    """Mixin that gives the critic a separate learning rate."""
 
     def __init__(self, *args: Any, critic_learning_rate: float, **kwargs: Any) -> None:
-        """Take what the Stable-Baselines3 model takes; its `learning_rate` is all others'."""
+        """Take the arguments of the Stable-Baselines3 model, and the critic's learning rate.
+
+        `learning_rate` is that of all other networks.
+        """
         self.critic_learning_rate = critic_learning_rate
         super().__init__(*args, **kwargs)
 
@@ -212,37 +234,40 @@ class _CriticRate:
         update_learning_rate(self.critic.optimizer, self.critic_learning_rate)  # type: ignore[attr-defined]
 
 
-class TwoRateDDPG(_CriticRate, DDPG):
-    """DDPG whose critic has a learning rate, and two streams, of its own."""
+class TwoRateDDPG(_CriticLearningRate, DDPG):
+    """DDPG with a separate learning rate of the critic, and with `TwoStreams` as its network."""
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TwoStreamPolicy}
 
 
-class TwoRateTD3(_CriticRate, TD3):
-    """TD3 whose critics have a learning rate of their own."""
+class TwoRateTD3(_CriticLearningRate, TD3):
+    """TD3 with a separate learning rate of the critics."""
 
 
-class TwoRateSAC(_CriticRate, SAC):
-    """SAC whose critics have a learning rate of their own."""
+class TwoRateSAC(_CriticLearningRate, SAC):
+    """SAC with a separate learning rate of the critics."""
 
 
 class EpisodicDQN(DQN):
-    """DQN whose exploration shrinks by a factor with every episode, unless that is None."""
+    """DQN whose exploration rate is multiplied by a factor, unless None, after every episode."""
 
     def __init__(self, *args: Any, exploration_decay: float | None, **kwargs: Any) -> None:
-        """Take what `DQN` takes, of which `exploration_fraction` has no effect beside a factor, and that factor."""
+        """Take the arguments of `DQN`, and the factor.
+
+        With a factor, `exploration_fraction` has no effect.
+        """
         self.exploration_decay = exploration_decay
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         super()._setup_model()
         if (decay := self.exploration_decay) is not None:
-            first, least = self.exploration_initial_eps, self.exploration_final_eps
-            self.exploration_schedule = lambda _: max(least, first * decay**self._episode_num)
+            initial, final = self.exploration_initial_eps, self.exploration_final_eps
+            self.exploration_schedule = lambda _: max(final, initial * decay**self._episode_num)
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> Any:
-        # DQN refreshes epsilon before it counts an episode as ended: the next would start with the
-        # last one's
+        # DQN updates epsilon before it counts an episode as ended, so that the next episode would
+        # begin with the epsilon of the last one.
         if self.exploration_decay is not None:
             self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
         return super()._sample_action(*args, **kwargs)

@@ -1,4 +1,4 @@
-"""The agents that learn from a replay buffer, on Stable-Baselines3: DDPG, TD3, SAC and DQN."""
+"""Agents that learn from a replay buffer, based on Stable-Baselines3: DDPG, TD3, SAC and DQN."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -14,14 +14,14 @@ class OffPolicyConfig(DeepAgentConfig):
     """Settings of an agent that learns from a replay buffer."""
 
     algorithm: ClassVar[str]
-    """Name of its class in `codrl_mj.agents.models`."""
+    """Name of the algorithm's class in `codrl_mj.agents.models`."""
 
     learning_rate: float = real(1e-3, above=0, most=1)
     """Adam's step size, in (0, 1]."""
     gamma: float = real(0.99, above=0, most=1)
     """Discount factor, in (0, 1]."""
     tau: float = real(5e-3, above=0, most=1)
-    """Share by which the target networks follow at each of their updates, in (0, 1]."""
+    """Fraction by which each update moves the target networks, in (0, 1]."""
     buffer_size: int = integer(100_000, least=1)
     """Transitions in the replay buffer, >= 1."""
     batch_size: int = integer(64, least=1)
@@ -29,9 +29,9 @@ class OffPolicyConfig(DeepAgentConfig):
     learning_starts: int = integer(1000, least=0)
     """Environment steps of uniformly random actions before learning, >= 0."""
     train_every: int | None = integer(1, least=1, optional=True)
-    """Steps of every environment between two trainings, >= 1; None: an episode, which needs a single environment."""
+    """Steps of each environment between trainings, >= 1; None: an episode, with `num_envs` = 1."""
     gradient_steps: int | None = integer(None, least=1)
-    """Gradient steps of a training, >= 1; None: one for each environment step since the last training."""
+    """Gradient steps of a training, >= 1; None: one for each environment step since the last."""
 
     def make_model(self, env: Any, seed: int) -> Any:
         """See `AgentConfig.make_model`."""
@@ -61,7 +61,7 @@ class OffPolicyConfig(DeepAgentConfig):
         )
 
     def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
-        """Keyword arguments of the algorithm that not all of these agents have."""
+        """Return keyword arguments that are specific to the algorithm."""
         raise NotImplementedError
 
     def _policy_class(self) -> Any:
@@ -70,7 +70,8 @@ class OffPolicyConfig(DeepAgentConfig):
         return getattr(models, self.algorithm).policy_aliases["MlpPolicy"]
 
     def _policy_arguments(self) -> dict[str, Any]:
-        # one call for all tensors of a network: a tenth more steps per second
+        # A fused Adam updates all tensors of a network in one call, with a tenth more steps per
+        # second.
         return {"optimizer_kwargs": {"fused": True}, **super()._policy_arguments()}
 
 
@@ -79,8 +80,8 @@ class ActorCriticConfig(OffPolicyConfig):
     """Settings of an agent for continuous actions that learns from a replay buffer.
 
     It explores by Ornstein-Uhlenbeck noise on the action, x' = x - theta * x * dt + sigma *
-    sqrt(dt) * N(0, 1), which starts at 0 in every episode. `noise_theta = noise_dt = 1` is
-    independent noise of standard deviation sigma.
+    sqrt(dt) * N(0, 1), which starts at 0 in every episode. With `noise_theta = noise_dt = 1` the
+    noise is independent, with standard deviation sigma.
     """
 
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box,)
@@ -88,11 +89,11 @@ class ActorCriticConfig(OffPolicyConfig):
     critic_learning_rate: float | None = real(None, above=0, most=1)
     """Adam's step size for the critic, in (0, 1]; None: `learning_rate`."""
     noise_sigma: float = real(0.0, least=0)
-    """Scale sigma of the exploration noise, >= 0, in shares of half the action's range; 0: none."""
+    """Scale sigma of the noise, >= 0, as a fraction of half the action's range; 0: no noise."""
     noise_theta: float = real(0.15, least=0)
     """Rate theta at which the exploration noise returns to 0, >= 0."""
     noise_dt: float = real(1e-2, above=0)
-    """Time step dt of the exploration noise, > 0; `noise_theta * noise_dt` must be below 2, where it turns unstable."""
+    """Time step dt of the noise, > 0; it is stable if `noise_theta * noise_dt` is below 2."""
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -117,25 +118,29 @@ class ActorCriticConfig(OffPolicyConfig):
 
 @dataclasses.dataclass(frozen=True)
 class DDPGConfig(ActorCriticConfig):
-    """Deep deterministic policy gradient, on Stable-Baselines3, with the paper's critic.
+    """Deep deterministic policy gradient, based on Stable-Baselines3, with the paper's critic.
 
-    State and action each pass through layers of their own; then they are joined. Every hidden layer
-    has a ReLU; the actor ends in tanh, times half the action's range.
+    The critic has separate layers for state and action, then joint layers. Every hidden layer has a
+    ReLU; the actor ends in tanh, times half the action's range.
     """
 
     name: ClassVar[str] = "ddpg"
     algorithm: ClassVar[str] = "TwoRateDDPG"
 
     noise_sigma: float = real(0.2, least=0)
-    """Scale sigma of the exploration noise, >= 0, in shares of half the action's range; 0: none."""
+    """Scale sigma of the noise, >= 0, as a fraction of half the action's range; 0: no noise."""
     actor_units: tuple[int, ...] = units((64, 64))
     """Units of the actor's hidden layers. The paper: 64-64."""
     state_units: tuple[int, ...] = units((16, 32))
-    """Units of the critic's layers for the state alone; () lets it through. The paper: 1 (pendulum), 64 (car)."""
+    """Units of the critic's layers for the state only; () passes the state on. The paper: 1
+    (pendulum), 64 (car).
+    """
     action_units: tuple[int, ...] = units((32,))
-    """Units of the critic's layers for the action alone; () lets it through. The paper: 32 (pendulum), () (car)."""
+    """Units of the critic's layers for the action only; () passes the action on. The paper: 32
+    (pendulum), () (car).
+    """
     joint_units: tuple[int, ...] = units((256, 256))
-    """Units of the critic's hidden layers after both are joined. The paper: 256-256 (pendulum), 64 (car)."""
+    """Units of the critic's joint hidden layers. The paper: 256-256 (pendulum), 64 (car)."""
 
     def _policy_arguments(self) -> dict[str, Any]:
         streams = {
@@ -151,13 +156,13 @@ class DDPGConfig(ActorCriticConfig):
 
 @dataclasses.dataclass(frozen=True)
 class TD3Config(ActorCriticConfig):
-    """Twin delayed DDPG (Fujimoto et al., 2018), on Stable-Baselines3. The paper does not use it."""
+    """Twin delayed DDPG (Fujimoto et al., 2018), based on Stable-Baselines3; not in the paper."""
 
     name: ClassVar[str] = "td3"
     algorithm: ClassVar[str] = "TwoRateTD3"
 
     noise_sigma: float = real(0.1, least=0)
-    """Scale sigma of the exploration noise, >= 0, in shares of half the action's range; 0: none."""
+    """Scale sigma of the noise, >= 0, as a fraction of half the action's range; 0: no noise."""
     hidden: tuple[int, ...] = units((64, 64))
     """Units of the hidden layers of the actor and of each critic (ReLU)."""
     policy_delay: int = integer(2, least=1)
@@ -181,7 +186,7 @@ class TD3Config(ActorCriticConfig):
 
 @dataclasses.dataclass(frozen=True)
 class SACConfig(ActorCriticConfig):
-    """Soft actor-critic (Haarnoja et al., 2018), on Stable-Baselines3. The paper does not use it."""
+    """Soft actor-critic (Haarnoja et al., 2018), based on Stable-Baselines3; not in the paper."""
 
     name: ClassVar[str] = "sac"
     algorithm: ClassVar[str] = "TwoRateSAC"
@@ -189,11 +194,13 @@ class SACConfig(ActorCriticConfig):
     hidden: tuple[int, ...] = units((64, 64))
     """Units of the hidden layers of the actor and of each critic (ReLU)."""
     entropy_coefficient: float | None = real(None, least=0)
-    """Weight of the entropy, >= 0; None: learned, so that the entropy per action entry is -1 nat."""
+    """Weight of the entropy, >= 0; None: learned, for an entropy of -1 nat per action entry."""
     state_dependent_noise: bool = flag(False)
-    """Explore by noise that is a function of the state, drawn anew at every training (Raffin et al., 2021)."""
+    """Explore by noise that is a function of the state, which is drawn at every training (Raffin et
+    al., 2021).
+    """
     log_std_init: float = real(-3.0)
-    """State-dependent noise: natural logarithm of its standard deviation at the start."""
+    """Natural logarithm of the initial standard deviation of the state-dependent noise."""
 
     def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
         return {
@@ -213,7 +220,10 @@ class SACConfig(ActorCriticConfig):
 
 @dataclasses.dataclass(frozen=True)
 class DQNConfig(OffPolicyConfig):
-    """Deep Q-learning with a target network, on Stable-Baselines3 (Huber loss, gradients clipped to norm 10)."""
+    """Deep Q-learning with a target network, based on Stable-Baselines3.
+
+    The loss is Huber's, and gradients are clipped to the norm 10.
+    """
 
     name: ClassVar[str] = "dqn"
     algorithm: ClassVar[str] = "EpisodicDQN"
@@ -228,9 +238,11 @@ class DQNConfig(OffPolicyConfig):
     exploration_end: float = real(0.01, least=0, most=1)
     """Smallest epsilon, in [0, 1]."""
     exploration_decay: float | None = real(0.99, above=0, most=1, optional=True)
-    """Factor on epsilon with every episode, in (0, 1]; None: it falls linearly over `exploration_fraction`."""
+    """Factor that multiplies epsilon after every episode, in (0, 1]; None: epsilon falls linearly
+    over `exploration_fraction`.
+    """
     exploration_fraction: float = real(0.2, above=0, most=1)
-    """Share of all steps over which epsilon falls linearly, in (0, 1], if `exploration_decay` is None."""
+    """Share of all steps, in (0, 1], over which epsilon falls if `exploration_decay` is None."""
 
     def _algorithm_arguments(self, action_space: Any) -> dict[str, Any]:
         del action_space

@@ -1,4 +1,4 @@
-"""PPO: proximal policy optimisation with clipping, on Stable-Baselines3."""
+"""PPO: proximal policy optimization with clipping, based on Stable-Baselines3."""
 
 import dataclasses
 from typing import Any, ClassVar, Literal
@@ -11,56 +11,58 @@ from codrl_mj.fields import choice, flag, integer, real, units
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig(DeepAgentConfig):
-    """Proximal policy optimisation with clipping, on Stable-Baselines3.
+    """Proximal policy optimization with clipping, based on Stable-Baselines3.
 
-    Discount, clip range and network are the paper's; the remaining defaults were chosen so that a
-    run takes a minute on two cores. With `critic_learning_rate`, actor and critic learn apart, as
-    the paper's do.
+    Discount, clip range and network are the paper's; the other defaults were chosen so that a run
+    takes a minute on two cores. With `critic_learning_rate`, actor and critic learn separately, as
+    in the paper.
     """
 
     name: ClassVar[str] = "ppo"
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box, spaces.Discrete)
 
     learning_rate: float = real(1e-3, above=0, most=1)
-    """Adam's step size, in (0, 1]: the actor's, and the critic's too unless it has its own. The paper: 3e-4."""
+    """Adam's step size for the actor, in (0, 1], and for the critic if `critic_learning_rate` is
+    None. The paper: 3e-4.
+    """
     critic_learning_rate: float | None = real(None, above=0, most=1)
     """Adam's step size for the critic, in (0, 1]: actor and critic then take separate passes over a
-    rollout, and `target_kl` stops the actor's alone. None: one optimiser and one loss for both. The
+    rollout, and `target_kl` stops only the actor's. None: one optimizer and one loss for both. The
     paper: 1e-3.
     """
     rollout_steps: int = integer(2048, least=2)
-    """Environment steps, over all environments, between two updates, >= 2; a multiple of the environments."""
+    """Steps of all environments together between two updates, >= 2; a multiple of `num_envs`."""
     batch_size: int | None = integer(256, least=2, optional=True)
-    """Minibatch size, >= 2, that divides the rollout. None: the whole rollout, the paper's 4000 steps."""
+    """Minibatch size, >= 2, a divisor of `rollout_steps`. None: all of it. The paper: 4000, all."""
     epochs: int = integer(10, least=1)
     """Passes over each rollout, >= 1, unless `target_kl` stops them."""
     critic_epochs: int | None = integer(None, least=1)
-    """Passes over each rollout for a critic with its own learning rate, >= 1; None: `epochs`."""
+    """Passes over each rollout for the critic with `critic_learning_rate`, >= 1; None: `epochs`."""
     gamma: float = real(0.99, above=0, most=1)
     """Discount factor, in (0, 1]. The paper: 0.99."""
     gae_lambda: float = real(0.97, least=0, most=1)
-    """Generalised advantage estimation's lambda, in [0, 1]. The paper: 0.97."""
+    """Lambda of generalized advantage estimation, in [0, 1]. The paper: 0.97."""
     clip_range: float = real(0.2, above=0)
     """Clip range of the probability ratio, > 0. The paper: 0.2."""
     entropy_coefficient: float = real(0.0, least=0)
     """Weight of the entropy bonus, >= 0."""
     target_kl: float | None = real(0.03, above=0, optional=True)
-    """Passes over a rollout stop when the policy has moved 1.5 times this far [nat], > 0; None:
-    never. The paper: 0.01.
+    """Divergence of the policy [nat], > 0; passes over a rollout stop at 1.5 times this. None: they
+    never stop. The paper: 0.01.
     """
     hidden: tuple[int, ...] = units((64, 64))
-    """Units of the hidden layers of actor and critic, each. The paper: 64-64."""
+    """Units of the hidden layers of the actor, and of the critic. The paper: 64-64."""
     activation: Literal["tanh", "relu"] = choice("tanh", "tanh", "relu")
     """Activation of the hidden layers. The paper: tanh."""
     log_std_init: float = real(0.0, least=-20, most=10)
-    """Continuous actions: natural logarithm of the standard deviation at the start, in [-20, 10]."""
+    """Continuous actions: natural logarithm of the initial standard deviation, in [-20, 10]."""
     state_dependent_noise: bool = flag(False)
-    """Continuous actions: explore by noise that is a function of the state, drawn anew every
-    `noise_steps` (Raffin et al., 2021), which moves a system more than independent noise at every
-    step does.
+    """Continuous actions: explore by noise that is a function of the state, which is drawn every
+    `noise_steps` (Raffin et al., 2021). It moves a system more than independent noise at every
+    step.
     """
     noise_steps: int | None = integer(None, least=1)
-    """Steps between two draws of that noise, >= 1; None: one draw a rollout."""
+    """Steps between two draws of the state-dependent noise, >= 1; None: one draw a rollout."""
 
     unit_actions: bool = flag(False)
     """Continuous actions: the actor's mean and noise are in units of the largest action, so that
@@ -73,7 +75,7 @@ class PPOConfig(DeepAgentConfig):
         if self.unit_actions and self.state_dependent_noise:
             raise ValueError(
                 "PPOConfig.unit_actions = True: must be False with state_dependent_noise, which has"
-                " a scale of its own: set one of them"
+                " another scale; set one of them"
             )
 
     def make_model(self, env: Any, seed: int) -> Any:
@@ -112,8 +114,10 @@ class PPOConfig(DeepAgentConfig):
             "device": "cpu",
         }
         if self.critic_learning_rate is None:
-            kind = FastPPO if isinstance(env.action_space, spaces.Box | spaces.Discrete) else PPO
-            return kind(self._policy_class(), env, **arguments)
+            algorithm = (
+                FastPPO if isinstance(env.action_space, spaces.Box | spaces.Discrete) else PPO
+            )
+            return algorithm(self._policy_class(), env, **arguments)
         return TwoRatePPO(
             self._policy_class(),
             env,

@@ -11,40 +11,43 @@ from codrl_mj.fields import integer, real, reals, units
 
 @dataclasses.dataclass(frozen=True)
 class SARSAConfig(AgentConfig):
-    """Episodic semi-gradient SARSA with tile coding, after Sutton and Barto (2018), sections 9.5.4 and 10.1.
+    """Episodic semi-gradient SARSA with tile coding (Sutton and Barto, 2018, sections 9.5.4, 10.1).
 
-    The defaults are the paper's: 8 tilings of 9 x 9 tiles for 3 actions, 1944 weights. Tiles cover
-    as many leading entries of the observation as there are `intervals`, where an angle counts as
-    one; the entries behind, such as those that `observe_actuator` appends, are ignored unless
-    `intervals`, `low` and `high` are given for them as well. Entries outside their bounds lie in
-    the outer tiles.
+    The defaults are the paper's: 8 tilings of 9 x 9 tiles for 3 actions, 1944 weights. Each of the
+    `intervals` covers one leading entry of the observation, or one angle. Further entries, such as
+    those that `observe_actuator` appends, are ignored unless `intervals`, `low` and `high` include
+    them. Entries outside their bounds are in the outer tiles.
     """
 
     name: ClassVar[str] = "sarsa"
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Discrete,)
 
     step_size: float = real(0.0375, above=0)
-    """alpha of each weight, > 0; 1/tilings would set an estimate to its target at once. The paper: 0.0375."""
+    """Step size alpha of each weight, > 0; 1/tilings would set an estimate to its target in one
+    step. The paper: 0.0375.
+    """
     gamma: float = real(1.0, above=0, most=1)
     """Discount factor, in (0, 1]. The paper: 1."""
     epsilon: float = real(0.001, least=0, most=1)
     """Probability of a random action in the first episode, in [0, 1]. The paper: 0.001."""
     epsilon_decay: float = real(1.0, above=0, most=1)
-    """Factor on epsilon from one episode to the next, in (0, 1]. The paper: 1."""
+    """Factor that multiplies epsilon after every episode, in (0, 1]. The paper: 1."""
     trace_decay: float = real(0.0, least=0, most=1)
-    """lambda of replacing traces, in [0, 1]. The paper: 0, no traces."""
+    """Decay lambda of replacing traces, in [0, 1]. The paper: 0, no traces."""
     tilings: int = integer(8, least=1)
-    """Grids of tiles, a power of 2. The paper: 8."""
+    """Number of grids of tiles, a power of 2. The paper: 8."""
     intervals: tuple[int, ...] = units((8, 8))
-    """Tiles from bound to bound, >= 1, of each angle and then of each further entry that is tiled. The paper: 8, 8."""
+    """Tiles between the bounds, >= 1, of each angle, then of other entries. The paper: 8, 8."""
     angles: int = integer(0, least=0)
-    """Pairs of cosine and sine with which the observation begins, each tiled as the angle that it is (Acrobot: 2)."""
+    """Number of pairs of cosine and sine at the beginning of the observation, each of which is
+    tiled as an angle (Acrobot: 2).
+    """
     low: tuple[float, ...] | None = reals()
-    """Lower bounds of the tiled entries that are no angles; none: the observation space's."""
+    """Lower bounds of the tiled entries that are not angles; none: the observation space's."""
     high: tuple[float, ...] | None = reals()
-    """Their upper bounds."""
+    """Upper bounds of these entries; none: the observation space's."""
     initial_value: float = real(0.0)
-    """Return expected of every action before it was tried; optimistic, it makes the agent try all.
+    """Initial estimate of every action's return; an optimistic one makes the agent try all actions.
     The paper: 0, with rewards of -1.
     """
 
@@ -52,8 +55,8 @@ class SARSAConfig(AgentConfig):
         """See `AgentConfig.make_model`.
 
         Raises:
-            ValueError: there is more than one environment, or its observations or actions do not go
-                with the tiles.
+            ValueError: there is more than one environment, or its observations or actions do not
+                fit the tiles.
         """
         from codrl_mj.agents.sarsa_algorithm import SARSA, TileCodingPolicy
 

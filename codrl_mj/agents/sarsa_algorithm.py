@@ -1,4 +1,4 @@
-"""Episodic semi-gradient SARSA with tile coding: learning from a step and from an episode, compiled, and the algorithm.
+"""Episodic semi-gradient SARSA with tile coding: compiled learning, and the algorithm.
 
 Sutton and Barto, *Reinforcement Learning: An Introduction* (2018), section 10.1; with traces,
 section 12.7.
@@ -31,57 +31,58 @@ from codrl_mj.envs.compiled import bound, compiled_kernels
 from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.physics.streams import set_words, words_of
 
-FORGOTTEN = 1e-3
-"""Eligibility below which a trace is dropped."""
+MIN_ELIGIBILITY = 1e-3
+"""Eligibility below which a trace is removed."""
 
 
 class Traces(NamedTuple):
-    """What the weights that were used lately are answerable for; made by `no_traces`."""
+    """Eligibility traces of the weights; created by `empty_traces`."""
 
     eligibility: np.ndarray
-    """Of every weight, by its flat index; 0 for most."""
+    """Eligibility of each weight, by its flat index; mostly 0."""
     eligible: np.ndarray
-    """Flat indices of the weights whose eligibility is not 0, of which only the first `used[0]` are meant."""
+    """Flat indices of the weights with an eligibility > 0; only the first `used[0]` are valid."""
     used: np.ndarray
-    """Their number, shape (1,)."""
+    """Number of valid entries of `eligible`, shape (1,)."""
 
 
 class Learner(NamedTuple):
-    """An agent in an episode: what it knows, where it is, and how it learns. Its arrays change.
+    """State and settings of an agent in an episode; its arrays change.
 
-    Its generator is no part of it: with one in a tuple, numba takes 0.1 ms to find out what a
-    call's arguments are.
+    The random generator is a separate argument: with a generator in a tuple, numba needs 0.1 ms to
+    determine the types of a call's arguments.
     """
 
     coder: TileCoder
-    """Finds tiles."""
+    """Tile coder of the observations."""
     weights: np.ndarray
-    """Shape (tiles, actions)."""
+    """Weights of the action values, shape (tiles, actions)."""
     traces: Traces
-    """Of the weights."""
+    """Eligibility traces of the weights."""
     tiles: np.ndarray
-    """Indices of the active ones, in which the present observation lies, shape (n,)."""
+    """Indices of the active tiles, which contain the present observation, shape (n,)."""
     step_size: float
-    """Of each weight."""
+    """Step size of each weight."""
     gamma: float
     """Discount factor."""
     trace_decay: float
-    """lambda."""
+    """Decay lambda of the traces."""
     epsilon: float
     """Probability of a random action."""
 
 
-def no_traces(size: int) -> Traces:
-    """Empty traces, with room for `size` weights."""
+def empty_traces(size: int) -> Traces:
+    """Return empty traces for `size` weights."""
     return Traces(np.zeros(size), np.zeros(size, dtype=np.int64), np.zeros(1, dtype=np.int64))
 
 
 @njit(nogil=True, error_model="numpy")
-def begin(learner: Learner, generator: np.random.Generator, observation: np.ndarray) -> int:
-    """Begin an episode with its first observation (k,): no traces are left. The first action."""
+def begin_episode(learner: Learner, generator: np.random.Generator, observation: np.ndarray) -> int:
+    """Clear the traces, and return the first action for an episode's first observation (k,)."""
     traces = learner.traces
-    for kept in range(traces.used[0]):  # loops over slices take numba longer to compile
-        traces.eligibility[traces.eligible[kept]] = 0.0
+    # A loop over a slice would take numba longer to compile.
+    for position in range(traces.used[0]):
+        traces.eligibility[traces.eligible[position]] = 0.0
     traces.used[0] = 0
     find_tiles(observation, learner.coder, learner.tiles)
     return choose_action(learner.weights, learner.tiles, learner.epsilon, generator)
@@ -96,10 +97,10 @@ def learn(
     observation: np.ndarray,
     terminated: bool,
 ) -> int:
-    """Learn from a step that led to an observation (k,), and choose the next action, without meaning at the end.
+    """Learn from a step that led to an observation (k,), and return the next action.
 
-    The target is r + gamma q(s', a'), also where a time limit cuts the episode off; and r where the
-    task ends it.
+    The target is r + gamma q(s', a'), also if a time limit ends the episode, and r if the task
+    terminates it. After a termination the returned action has no meaning.
     """
     weights, traces, tiles = learner.weights, learner.traces, learner.tiles
     error = reward - action_value(weights, tiles, action)
@@ -110,9 +111,9 @@ def learn(
         error += learner.gamma * action_value(weights, next_tiles, next_action)
     change = learner.step_size * error
     if learner.trace_decay > 0.0:
-        _mark(traces, tiles, action, weights.shape[1], learner.gamma * learner.trace_decay)
-        for kept in range(traces.used[0]):
-            index = traces.eligible[kept]
+        _update_traces(traces, tiles, action, weights.shape[1], learner.gamma * learner.trace_decay)
+        for position in range(traces.used[0]):
+            index = traces.eligible[position]
             weights[index // weights.shape[1], index % weights.shape[1]] += (
                 change * traces.eligibility[index]
             )
@@ -125,25 +126,28 @@ def learn(
 
 
 @njit(nogil=True, error_model="numpy")
-def _mark(traces: Traces, tiles: np.ndarray, action: int, actions: int, decay: float) -> None:
-    """Fade the traces, drop the faintest, and set those of the weights in use to 1 (replacing traces)."""
-    kept = 0
+def _update_traces(
+    traces: Traces, tiles: np.ndarray, action: int, actions: int, decay: float
+) -> None:
+    """Decay the traces, remove the smallest, and set those of the active tiles to 1."""
+    # These are replacing traces; the valid entries of `eligible` are compacted in place.
+    num_eligible = 0
     for position in range(traces.used[0]):
         index = traces.eligible[position]
         faded = traces.eligibility[index] * decay
-        if faded < FORGOTTEN:
+        if faded < MIN_ELIGIBILITY:
             traces.eligibility[index] = 0.0
         else:
             traces.eligibility[index] = faded
-            traces.eligible[kept] = index
-            kept += 1
+            traces.eligible[num_eligible] = index
+            num_eligible += 1
     for tile in tiles:
         index = tile * actions + action
         if traces.eligibility[index] == 0.0:
-            traces.eligible[kept] = index
-            kept += 1
+            traces.eligible[num_eligible] = index
+            num_eligible += 1
         traces.eligibility[index] = 1.0
-    traces.used[0] = kept
+    traces.used[0] = num_eligible
 
 
 @njit(nogil=True, error_model="numpy")
@@ -155,58 +159,70 @@ def run_episode(
     observation: np.ndarray,
     record: np.ndarray,
     row: np.ndarray,
-    where: int,
+    pointers: int,
 ) -> tuple[float, int, bool, bool]:
-    """Learn from an episode of an environment's compiled `step`, from its first observation (k,), which gets the last.
+    """Learn from an episode of an environment's compiled `step`.
 
-    `record`, as long as the time limit, gets the trace's last `row` of each step. Sum of the
-    rewards, steps, whether the task ended the episode, and whether the simulation was fine
-    throughout.
+    Args:
+        learner: the agent.
+        generator: source of random numbers.
+        step: the compiled step.
+        forces: desired forces of the actions.
+        observation: first observation, shape (k,); it is overwritten by each step.
+        record: array with as many rows as the time limit; each step's row is written to it.
+        row: the trace's last row in each step.
+        pointers: addresses that `step` takes.
+
+    Returns:
+        The sum of the rewards, the number of steps, True if the task terminated the episode, and
+        True if all numbers of the simulation stayed finite.
     """
-    action = begin(learner, generator, observation)
+    action = begin_episode(learner, generator, observation)
     total, length, terminated = 0.0, 0, False
     while not terminated and length < len(record):
         force = forces[action]
-        reward, terminated, fine = step(force, where)
-        if not fine:
+        reward, terminated, is_finite = step(force, pointers)
+        if not is_finite:
             return total, length, False, False
         record[length] = row
-        record[length, 0] = force  # as it was asked for, before anything disturbed it
+        # The desired force before any disturbance.
+        record[length, 0] = force
         total, length = total + reward, length + 1
-        seen_reward = float(np.float32(reward))  # what Stable-Baselines3's environments hand out
-        action = learn(learner, generator, action, seen_reward, observation, terminated)
+        # Stable-Baselines3's environments return rewards in float32, and results must be the same.
+        rounded_reward = float(np.float32(reward))
+        action = learn(learner, generator, action, rounded_reward, observation, terminated)
     return total, length, terminated, True
 
 
 class TileCodingPolicy(BasePolicy):
-    """Acts by action values that are linear in the active tiles: greedily, or epsilon-greedily.
+    """Greedy or epsilon-greedy policy by action values that are linear in the active tiles.
 
-    Of equally good actions a greedy one (`deterministic=True`) is the first. `predict(...,
-    deterministic=False)` draws from the policy's `generator`; training draws from the algorithm's
-    own generator, so that no evaluation changes it.
+    With `deterministic=True` the first of equally good actions is chosen. `predict(...,
+    deterministic=False)` draws from the policy's `generator`. Training draws from the generator of
+    the algorithm, so that evaluations do not change it.
     """
 
     def __init__(
         self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], config: Any
     ) -> None:
-        """Make a policy that knows nothing yet."""
+        """Create a policy with initial weights."""
         if not isinstance(action_space, spaces.Discrete) or action_space.start != 0:
             raise ValueError(
-                f"action_space = {action_space}: SARSA has a weight for every action: must be"
-                " Discrete, from 0"
+                f"action_space = {action_space}: must be Discrete, from 0, because SARSA has a"
+                " weight for every action"
             )
         if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
             raise ValueError(
-                f"observation_space = {observation_space}: must be a Box with one axis, to be"
-                " covered by tiles"
+                f"observation_space = {observation_space}: must be a Box with one axis, which tiles"
+                " can cover"
             )
         tilings, intervals, angles = config.tilings, config.intervals, config.angles
         used = slice(2 * angles, len(intervals) + angles)
         if used.stop > observation_space.shape[0]:
             raise ValueError(
-                f"intervals = {intervals}, angles = {angles}: are of {used.stop} observation"
-                f" entries, but there are {observation_space.shape[0]}; give one interval for an"
-                " angle or any other entry"
+                f"intervals = {intervals}, angles = {angles}: need {used.stop} observation entries,"
+                f" but there are {observation_space.shape[0]}; give one interval for each angle and"
+                " for each other entry"
             )
         super().__init__(observation_space, action_space)
         low = observation_space.low[used].tolist() if config.low is None else config.low
@@ -219,7 +235,7 @@ class TileCodingPolicy(BasePolicy):
 
     @property
     def table(self) -> np.ndarray:
-        """The weights, shape (tiles, actions), float64; what is written to it is written to the policy."""
+        """Weights of the policy as a writable array, shape (tiles, actions), float64."""
         return self.weights.numpy()
 
     def _predict(self, observation: Any, deterministic: bool = False) -> torch.Tensor:
@@ -239,25 +255,29 @@ class TileCodingPolicy(BasePolicy):
 
 
 class CompiledEpisodes:
-    """Runs the episodes of an `ActuatedVecEnv` of one environment on a simulation of its own, bit for bit the same.
+    """Runner of whole episodes of an `ActuatedVecEnv` with one environment, in compiled code.
 
-    At the end of each the environment is where its own steps would have brought it: at the start of
-    the next one.
+    It has a separate simulation, with bit-identical results. After an episode the environment is in
+    the state to which its own steps would have led: at the start of the next episode.
     """
 
     def __init__(self, env: ActuatedVecEnv) -> None:
-        """Make the simulation for one that `can_run` says it can."""
+        """Create the simulation of an environment for which `can_run` is True."""
         self.env = env
         vector: Any = env.env
         self._physics: Any = vector.setup.simulate()
         self._step = compiled_kernels(vector.setup, self._physics).step
-        self._where, self._observation = bound(vector.setup, self._physics)
+        self._pointers, self._observation = bound(vector.setup, self._physics)
         self._forces = vector.setup.commands.action_forces
         self._record = np.empty((vector.max_episode_steps, self._physics.trace.shape[2]))
 
     @staticmethod
     def can_run(env: Any) -> bool:
-        """Whether the environment is ours, in MuJoCo, of one motor, as it was configured, and has a time limit."""
+        """Return True if whole episodes of an environment can run in compiled code.
+
+        It must be a single one of our environments in MuJoCo, with one motor and a time limit, and
+        without randomization or changed attributes.
+        """
         return (
             type(env) is ActuatedVecEnv
             and isinstance(env.env, ActuatedVectorEnv)
@@ -269,26 +289,28 @@ class CompiledEpisodes:
         )
 
     def run(self, learner: Learner, generator: np.random.Generator) -> tuple[Any, ...] | None:
-        """Learn from an episode; None, with nothing done, if the environment stands in the middle of one.
+        """Learn from an episode; return None, without effect, if one has started already.
 
-        What `SARSA._count` takes: steps, first observation (1, k) of the next episode, sum of the
-        rewards (1,), that the episode ended (1,), infos of its last step, and the actuator's
-        signals, each of shape (steps,).
+        Returns:
+            The arguments of `SARSA._count`: number of steps, first observation (1, k) of the next
+            episode, sum of the rewards (1,), True (1,) because the episode ended, infos of the last
+            step, and the actuator's signals, each of shape (steps,).
         """
         vector: Any = self.env.env
-        setup, start = vector.setup, vector.snapshot()
-        if start["elapsed"][0] != 0:
+        setup, snapshot = vector.setup, vector.snapshot()
+        if snapshot["elapsed"][0] != 0:
             return None
-        self._physics.reset(np.zeros(len(setup.task.state_names)))  # sees to the callbacks
-        self._physics.restore(start["physics"][0])
-        self._physics.memory[:] = start.get("disturbances", np.zeros((1, 0)))[0]
-        self._observation[:] = start["observations"][0]
-        total, length, terminated, fine = run_episode(
+        # A reset installs MuJoCo's callbacks, which `restore` does not.
+        self._physics.reset(np.zeros(len(setup.task.state_names)))
+        self._physics.restore(snapshot["physics"][0])
+        self._physics.memory[:] = snapshot.get("disturbances", np.zeros((1, 0)))[0]
+        self._observation[:] = snapshot["observations"][0]
+        total, length, terminated, is_finite = run_episode(
             *(learner, generator, self._step, self._forces, self._observation, self._record),
             self._physics.trace[-1, 0],
-            self._where,
+            self._pointers,
         )
-        if not fine:
+        if not is_finite:
             self._physics.check_finite()
         columns = self._record[:length].T.copy()
         signals = setup.signals(columns, columns[0])
@@ -306,46 +328,51 @@ class CompiledEpisodes:
 
 
 class SARSA(BaseAlgorithm):
-    """Episodic semi-gradient SARSA, Sutton and Barto (2018), section 10.1; with `trace_decay`, SARSA(lambda).
+    """Episodic semi-gradient SARSA (Sutton and Barto, 2018, section 10.1) or SARSA(lambda).
 
-    A rollout is an episode: `on_rollout_start` and `on_rollout_end` of callbacks are called once
-    for each, and `learn` finishes the one in which it reaches `total_timesteps`. A callback that
-    stops it in mid-episode gives up the traces: what is learned next begins with the observation
-    that was reached.
+    `trace_decay` selects SARSA(lambda). A rollout is an episode: `on_rollout_start` and
+    `on_rollout_end` of callbacks are called once for each, and `learn` finishes the episode in
+    which it reaches `total_timesteps`. If a callback stops an episode, its traces are lost:
+    learning continues from the observation that was reached.
 
-    In training, of equally good actions one is drawn at random, as in the program that the paper's
-    agent comes from (marcinbogdanski/rl-sketchpad, 1001_Episodic_Semi_Gradient_Sarsa). Unlike
-    there, an episode that a time limit cut off does not end: its last update is made with the value
-    of what would have come next.
+    In training, one of equally good actions is drawn at random, as in the program of the paper's
+    agent (marcinbogdanski/rl-sketchpad, 1001_Episodic_Semi_Gradient_Sarsa). Unlike in that program,
+    a time limit does not terminate an episode: the last update uses the value of the next action.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TileCodingPolicy": TileCodingPolicy}
     policy: TileCodingPolicy
     compiled = True
-    """Whether to run whole episodes in compiled code where the environment can; the results are the same."""
+    """Run whole episodes in compiled code if the environment allows it; results are the same."""
     _last_obs: Any
 
     def __init__(
         self, policy: str | type[TileCodingPolicy], env: Any, config: Any = None, **settings: Any
     ) -> None:
-        """Take what `BaseAlgorithm` takes, for one environment, and a `SARSAConfig`: a saved model brings its own."""
+        """Take the arguments of `BaseAlgorithm`, for one environment, and a `SARSAConfig`.
+
+        A saved model contains its config, so it is loaded without one.
+        """
         self.config = config
         self._episodes: CompiledEpisodes | None = None
-        self.exploration_rate = getattr(config, "epsilon", 0.0)  # in the present episode
+        # The probability of a random action in the present episode.
+        self.exploration_rate = getattr(config, "epsilon", 0.0)
         if getattr(env, "num_envs", 1) != 1:
             raise ValueError(
                 f"num_envs = {env.num_envs}: SARSA learns from one environment: must be 1"
             )
-        set_up = settings.pop("_init_setup_model", True)
-        given = settings | {"policy_kwargs": {"config": self.config}, "device": "cpu"}
-        super().__init__(policy, env, learning_rate=getattr(config, "step_size", 0.0), **given)
-        if set_up:
+        should_set_up = settings.pop("_init_setup_model", True)
+        arguments = settings | {"policy_kwargs": {"config": self.config}, "device": "cpu"}
+        super().__init__(policy, env, learning_rate=getattr(config, "step_size", 0.0), **arguments)
+        if should_set_up:
             self._setup_model()
 
     def _setup_model(self) -> None:
         self.set_random_seed(self.seed)
-        if "_generator" not in self.__dict__:  # a loaded model has the one that was saved
-            # A child's seed: seeded alike, the environment's generator would draw the same numbers.
+        # A loaded model has the saved generator.
+        if "_generator" not in self.__dict__:
+            # The seed is a child of the given one. With the same seed, the generators of agent and
+            # environment would draw the same numbers.
             self._generator = np.random.default_rng(np.random.SeedSequence(self.seed).spawn(1)[0])
         self.policy = self.policy_class(
             self.observation_space, self.action_space, **self.policy_kwargs
@@ -354,7 +381,7 @@ class SARSA(BaseAlgorithm):
         self._learner = Learner(
             coder,
             table,
-            no_traces(table.size if self.config.trace_decay else 0),
+            empty_traces(table.size if self.config.trace_decay else 0),
             np.empty(len(coder.displacements), dtype=np.int64),
             self.config.step_size,
             self.config.gamma,
@@ -363,11 +390,14 @@ class SARSA(BaseAlgorithm):
         )
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """What training depends on between episodes, besides the policy and Stable-Baselines3's own attributes."""
+        """Return the state of training between episodes.
+
+        The policy and the attributes of Stable-Baselines3 are not part of it.
+        """
         return {"generator": words_of(self._generator)}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
-        """Continue from what `snapshot` returned, bit for bit."""
+        """Restore the result of `snapshot`; training then continues bit-identically."""
         set_words(self._generator, snapshot["generator"])
 
     def learn(  # type: ignore[override]
@@ -379,7 +409,7 @@ class SARSA(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> "SARSA":
-        """Learn, whole episodes until there were `total_timesteps` steps or the callback stops it."""
+        """Learn from whole episodes until `total_timesteps` or until the callback stops it."""
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -399,7 +429,7 @@ class SARSA(BaseAlgorithm):
         return self
 
     def _run_episode(self, callback: BaseCallback) -> bool:
-        """Learn from the rest of an episode; whether the callback lets it go on."""
+        """Learn from the rest of an episode; return True unless the callback stops learning."""
         learner = self._learner._replace(epsilon=self.exploration_rate)
         if self.compiled and CompiledEpisodes.can_run(self.env):
             if self._episodes is None or self._episodes.env is not self.env:
@@ -409,16 +439,18 @@ class SARSA(BaseAlgorithm):
         return self._run_steps(callback, learner)
 
     def _run_steps(self, callback: BaseCallback, learner: Learner) -> bool:
-        """The same, step by step."""
+        """Learn from the rest of an episode step by step; see `_run_episode`."""
         assert self.env is not None
-        action = begin(learner, self._generator, self._last_obs[0])
+        action = begin_episode(learner, self._generator, self._last_obs[0])
         dones = np.array([False])
         while not dones[0]:
             new_obs, rewards, dones, infos = self.env.step(np.array([action]))
             info = infos[0]
             terminated = bool(dones[0]) and not info.get("TimeLimit.truncated", False)
-            seen = info["terminal_observation"] if dones[0] else new_obs[0]  # type: ignore[index]
-            action = learn(learner, self._generator, action, float(rewards[0]), seen, terminated)
+            observation = info["terminal_observation"] if dones[0] else new_obs[0]  # type: ignore[index]
+            action = learn(
+                learner, self._generator, action, float(rewards[0]), observation, terminated
+            )
             if not self._count(
                 callback, 1, new_obs, rewards, dones, infos, getattr(self.env, "signals", None)
             ):
@@ -435,7 +467,9 @@ class SARSA(BaseAlgorithm):
         infos: list[dict[str, Any]],
         signals: Any,
     ) -> bool:
-        """Count steps that were taken, and show the callback what they were: its `locals` are the arguments."""
+        """Count steps, and call the callback."""
+        # The callback reads the arguments from these locals, by the names that Stable-Baselines3
+        # uses.
         self.num_timesteps += steps
         self._last_obs, self._last_episode_starts = new_obs, dones
         self._episode_num += int(dones[0])
@@ -444,7 +478,7 @@ class SARSA(BaseAlgorithm):
         return callback.on_step()
 
     def dump_logs(self) -> None:
-        """Write to the log how training goes."""
+        """Write statistics of the training to the log."""
         elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
         if self.ep_info_buffer:
             for name, key in (("ep_rew_mean", "r"), ("ep_len_mean", "l")):

@@ -1,8 +1,8 @@
-"""Tile coding: a point in space as the tiles that it lies in, one in each of several displaced grids; actions by tiles.
+"""Tile coding: a point as the tiles that contain it, one in each of several displaced grids.
 
 Sutton and Barto, *Reinforcement Learning: An Introduction* (2018), section 9.5.4, with the
 displacements of Sutton's tiles3: along axis j (from 0), tiling t is displaced by (2 j + 1) t n-ths
-of a tile, where n is the number of tilings. Without hashing: every tile has an index of its own.
+of a tile, where n is the number of tilings. There is no hashing: every tile has a separate index.
 """
 
 import math
@@ -13,31 +13,33 @@ import numpy as np
 
 from codrl_mj.compile_cache import njit
 
-LARGEST_TABLE = 2**24
-"""Most tiles in all: 128 MiB of weights for every action."""
+MAX_TILES = 2**24
+"""Largest total number of tiles: 128 MiB of weights for every action."""
 
 
 class TileCoder(NamedTuple):
-    """How observations become tiles, with d axes and n tilings; made by `make_coder`, for compiled functions."""
+    """Tile coder with d axes and n tilings, for compiled functions; created by `make_coder`."""
 
     entries: np.ndarray
-    """Observation entry of each axis, and -1; or the entries of an angle's cosine and sine; shape (d, 2)."""
+    """Observation entry of each axis and -1, or entries of an angle's cosine and sine, (d, 2)."""
     low: np.ndarray
     """Lower end of each axis, shape (d,)."""
     quanta: np.ndarray
-    """n-ths of a tile in one unit of each axis, shape (d,)."""
+    """Number of n-ths of a tile in a unit of each axis, shape (d,)."""
     last: np.ndarray
-    """n-ths of a tile from lower to upper end of each axis, shape (d,)."""
+    """Number of n-ths of a tile from lower to upper end of each axis, shape (d,)."""
     cells: np.ndarray
-    """Tiles of one tiling along each axis, shape (d,): the intervals, and one more where the axis does not wrap."""
+    """Number of tiles of a tiling along each axis, shape (d,): the intervals, and 1 more unless the
+    axis wraps.
+    """
     strides: np.ndarray
-    """By how much the tile's index grows from one tile to the next along each axis, shape (d,)."""
+    """Difference of the indices of neighboring tiles along each axis, shape (d,)."""
     displacements: np.ndarray
     """Displacement of each tiling along each axis [n-ths of a tile], shape (n, d)."""
     shift: int
-    """log2(n)."""
+    """Binary logarithm of the number of tilings, log2(n)."""
     size: int
-    """Tiles in all."""
+    """Total number of tiles."""
 
 
 def make_coder(
@@ -47,16 +49,26 @@ def make_coder(
     intervals: Sequence[int],
     angles: int = 0,
 ) -> TileCoder:
-    """A tile coder, with so many intervals between lower and upper end of every axis, and n tilings, a power of 2.
+    """Create a tile coder.
 
-    The first `angles` axes are angles, each of which the observation has as its cosine and sine;
-    these axes wrap, and have no ends to be given. The other axes are the observation's further
-    entries in their order; entries beyond the last axis are ignored.
+    The first `angles` axes are angles, each of which is a pair of cosine and sine in the
+    observation; these axes wrap, and have no ends. The other axes are the following entries of the
+    observation, in order; entries after the last axis are ignored.
+
+    Args:
+        low: lower ends of the axes that are not angles.
+        high: upper ends of the axes that are not angles.
+        tilings: number of tilings n, a power of 2.
+        intervals: number of tiles between the ends of each axis.
+        angles: number of angles.
+
+    Raises:
+        ValueError: a number or a length is out of bounds.
     """
     axes = len(intervals)
     if tilings < 1 or tilings & (tilings - 1):
         raise ValueError(
-            f"tilings = {tilings}: must be a power of 2, for the displacements of the tilings to"
+            f"tilings = {tilings}: must be a power of 2, so that the displacements of the tilings"
             " differ"
         )
     if not 0 <= angles <= axes:
@@ -65,24 +77,24 @@ def make_coder(
         if len(ends) != axes - angles:
             raise ValueError(
                 f"{name} = {tuple(ends)}: must have {axes - angles} numbers, one for each interval"
-                " but the angles'"
+                " except those of angles"
             )
     lower, upper = (
         np.append(np.full(angles, end), ends) for end, ends in ((-math.pi, low), (math.pi, high))
     )
-    for axis, (least, most) in enumerate(zip(lower, upper, strict=True)):
-        if not (np.isfinite(least) and np.isfinite(most) and least < most):
+    for axis, (lower_end, upper_end) in enumerate(zip(lower, upper, strict=True)):
+        if not (np.isfinite(lower_end) and np.isfinite(upper_end) and lower_end < upper_end):
             raise ValueError(
-                f"axis {axis} from {least:g} to {most:g}: must be finite, low < high; where the"
-                " observation is not bounded, set low and high"
+                f"axis {axis} from {lower_end:g} to {upper_end:g}: must be finite, low < high; if"
+                " the observation is not bounded, set low and high"
             )
     counts = np.array(intervals, dtype=np.int64)
     cells = counts + (np.arange(axes) >= angles)
     size = tilings * math.prod(cells.tolist())
-    if size > LARGEST_TABLE:
+    if size > MAX_TILES:
         raise ValueError(
             f"tilings = {tilings}, intervals = {tuple(intervals)}: {size} tiles: must be at most"
-            f" {LARGEST_TABLE}; take fewer"
+            f" {MAX_TILES}; take fewer"
         )
     entries = np.full((axes, 2), -1, dtype=np.int64)
     entries[:angles] = np.arange(2 * angles).reshape(angles, 2)
@@ -105,10 +117,10 @@ def make_coder(
 
 @njit(nogil=True, error_model="numpy")
 def find_tiles(observation: np.ndarray, coder: TileCoder, tiles: np.ndarray) -> None:
-    """Find the tiles (n,) of an observation (k,), one of each tiling: that of tiling t is in [t, t + 1) * size / n.
+    """Write the indices of the tiles that contain an observation (k,) to `tiles` (n,).
 
-    Entries outside the ends of their axis count as at the nearer end, and so lie in the outer
-    tiles; NaN counts as at the lower end.
+    The index for tiling t is in [t, t + 1) * size / n. Entries beyond the ends of their axis are in
+    the outer tiles; NaN counts as the lower end.
     """
     per_tiling = coder.size >> coder.shift
     for tiling in range(len(tiles)):
@@ -126,13 +138,14 @@ def find_tiles(observation: np.ndarray, coder: TileCoder, tiles: np.ndarray) -> 
             quantum = int(position)
         for tiling in range(len(tiles)):
             cell = (quantum + coder.displacements[tiling, axis]) >> coder.shift
-            if cell < coder.cells[axis]:  # beyond is the first tile again, of an axis that wraps
+            # On an axis that wraps, the cell after the last one is the first, with the index 0.
+            if cell < coder.cells[axis]:
                 tiles[tiling] += cell * coder.strides[axis]
 
 
 @njit(nogil=True, error_model="numpy")
 def action_value(weights: np.ndarray, tiles: np.ndarray, action: int) -> float:
-    """Estimated return of an action: the sum of its weights over the active tiles."""
+    """Return the estimated return of an action: the sum of its weights over the active tiles."""
     value = 0.0
     for tile in tiles:
         value += weights[tile, action]
@@ -143,18 +156,23 @@ def action_value(weights: np.ndarray, tiles: np.ndarray, action: int) -> float:
 def choose_action(
     weights: np.ndarray, tiles: np.ndarray, epsilon: float, generator: np.random.Generator
 ) -> int:
-    """An action at random with probability `epsilon`, else the best; of equally good ones one at random."""
+    """Choose a random action with probability `epsilon`, otherwise the best action.
+
+    One of equally good actions is chosen at random.
+    """
     actions = weights.shape[1]
     if generator.random() < epsilon:
         return int(generator.random() * actions)
-    best, best_value, equals = 0, action_value(weights, tiles, 0), 1
+    best, best_value, num_best = 0, action_value(weights, tiles, 0), 1
     for action in range(1, actions):
         value = action_value(weights, tiles, action)
         if value > best_value:
-            best, best_value, equals = action, value, 1
+            best, best_value, num_best = action, value, 1
         elif value == best_value:
-            equals += 1
-            if generator.random() * equals < 1.0:
+            num_best += 1
+            # The k-th of equally good actions replaces the earlier ones with the probability 1/k,
+            # so that each is chosen with the same probability.
+            if generator.random() * num_best < 1.0:
                 best = action
     return best
 
@@ -168,7 +186,10 @@ def choose_actions(
     epsilon: float,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Actions (N,) for observations (N, k): the best, of equally good ones the first; or as `choose_action` does."""
+    """Choose actions (N,) for observations (N, k).
+
+    With `deterministic` each is the first of the best actions; otherwise see `choose_action`.
+    """
     tiles = np.empty(len(coder.displacements), dtype=np.int64)
     actions = np.empty(len(observations), dtype=np.int64)
     for row in range(len(observations)):

@@ -165,7 +165,7 @@ class LiveView(OfEpisodes):
 
     def run(self: Any) -> int:
         """Serve until Ctrl-C."""
-        from codrl_mj.training.run import stopping
+        from codrl_mj.training.run import collecting_signals
         from codrl_mj.viz.view.session import Session, run_native
 
         if not 1 <= self.port <= 65535:
@@ -197,7 +197,7 @@ class LiveView(OfEpisodes):
         shown = Browser(session, self.port, title)
         print(f"{shown.url} (on this machine alone; Ctrl-C ends it)", flush=True)
         with (
-            stopping(signal.SIGINT) as asked,
+            collecting_signals(signal.SIGINT) as asked,
             contextlib.closing(shown),
         ):  # not amidst what libraries have locked
             shown.run(lambda: bool(asked))

@@ -92,7 +92,7 @@ class Source:
     def load(self, path: Path) -> Subject:
         """The policy at a path: a run folder, a folder with a policy alone, or a Stable-Baselines3 zip."""
         from codrl_mj.runs.policies import load_policy, load_sb3_zip
-        from codrl_mj.training.folder import BEST, load_config, resuming
+        from codrl_mj.training.folder import BEST, load_config, resume_command
 
         if self.normalize is not None and path.suffix != ".zip":
             raise ValueError(
@@ -107,7 +107,7 @@ class Source:
                 raise ValueError(
                     f"--task {self.task}: {path} was trained for {config.task}: leave --task out"
                 )
-            if self.agent not in (None, config.agent.name, config.agent.known_as()):
+            if self.agent not in (None, config.agent.name, config.agent.registry_name()):
                 raise ValueError(
                     f"--agent {self.agent}: {path} was trained by {config.agent.name}: leave"
                     " --agent out"
@@ -115,10 +115,10 @@ class Source:
             if self.which == "last" and not finished(path):
                 raise FileNotFoundError(
                     f"{path} is not finished and has no last policy yet: continue it with"
-                    f" {resuming(path)}, or take its best one so far with --which best"
+                    f" {resume_command(path)}, or take its best one so far with --which best"
                 )
             policy = load_policy(path / BEST if self.which == "best" else path, self.trust)
-            return Subject(policy, config.env, config.agent.known_as(), path)
+            return Subject(policy, config.env, config.agent.registry_name(), path)
         if self.which == "best":
             raise ValueError(
                 f"--which best: {path} is no run folder and holds one policy alone: leave"

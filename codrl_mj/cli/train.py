@@ -33,7 +33,7 @@ from codrl_mj.runs.files import read_json
 from codrl_mj.runs.summaries import read_reports
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
-from codrl_mj.training.folder import admit, load_config, needs_trust
+from codrl_mj.training.folder import prepare_run, load_config, needs_trust
 from codrl_mj.training.history import REPORT_COLUMNS
 
 _OWN_FLAGS = ("agent", "env")  # of the configuration: not made from its fields' types
@@ -55,7 +55,7 @@ def train_verb(arguments: list[str]) -> Any:
     rest = flags(TrainConfig, base, _OWN_FLAGS)
     task_known = configured or chosen.task is not None
     tasks: Any = Literal[tuple(dict.fromkeys([*TASKS, base.task, chosen.task or base.task]))]
-    agents: Any = Literal[tuple(dict.fromkeys([*AGENTS, base.agent.known_as()]))]
+    agents: Any = Literal[tuple(dict.fromkeys([*AGENTS, base.agent.registry_name()]))]
     positional: Any = tyro.conf.Positional
     task = "task", Annotated[positional[tasks], tyro.conf.arg(help="What to learn.")]
     fields: list[Any] = [
@@ -72,7 +72,7 @@ def train_verb(arguments: list[str]) -> Any:
                     ),
                 ),
             ],
-            base.agent.known_as(),
+            base.agent.registry_name(),
         ),
         (
             "settings",
@@ -189,7 +189,7 @@ class Train:
             return 0, _came_to(self.resume) if self.as_json else None
         name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
         out = self.resume or self.out or Path("runs") / name
-        admit(out, config, self.resume is not None, self.accept_changes)
+        prepare_run(out, config, self.resume is not None, self.accept_changes)
         config.env.make().close()  # what is wrong with it is said before there is a bar
         say(*dict.fromkeys(one.assumed for one in config.env.actuators))
         with training_bars({f"{config.agent.name.upper()} on {config.task}": (config, out)}):
@@ -273,7 +273,7 @@ def _base(chosen: argparse.Namespace) -> TrainConfig:
     """The configuration whose values are the flags' defaults."""
     if chosen.resume is not None and chosen.config is None:
         begun = load_config(Path(chosen.resume), chosen.trust)
-        if chosen.settings is not None or chosen.agent not in (None, begun.agent.known_as()):
+        if chosen.settings is not None or chosen.agent not in (None, begun.agent.registry_name()):
             raise ValueError(
                 f"{chosen.resume} is a training of {begun.agent.name} and continues as it began:"
                 " leave --agent and --settings out"

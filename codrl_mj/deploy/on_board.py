@@ -20,8 +20,8 @@ from codrl_mj.actuators import DCMotorActuator, Drive, Servo, current_loop, driv
 from codrl_mj.actuators.model import Family
 from codrl_mj.actuators.shaft import Winding
 from codrl_mj.compile_cache import external
-from codrl_mj.engine.families import replaced
-from codrl_mj.engine.memory import at, f64, symbol, u64
+from codrl_mj.engine.families import family_replaced
+from codrl_mj.engine.memory import entry_address, f64, named_address, u64
 
 WITHIN = 5000
 """Milliseconds after which a sample counts as not answered."""
@@ -29,7 +29,7 @@ _POLL_IN = 1 << 32
 _TABLE = np.zeros(
     32
 )  # these, and 1: what `poll` is told; from 8 on a sample, from 16 on its answer
-_table_at = symbol("codrl_mj_board", _TABLE.ctypes.data)
+_table_at = named_address("codrl_mj_board", _TABLE.ctypes.data)
 _TO, _AMPERES, _CURRENT, _VOLTAGE, _SAMPLES, _LOST = 0, 2, 3, 4, 5, 6
 _C: Any = ctypes.CDLL(None)
 _size = types.uintp
@@ -56,9 +56,9 @@ def asked_of_board(
     table[11], table[12] = integral, kept
     table[_SAMPLES] += 1.0
     got = 0
-    if table[_LOST] == 0.0 and _write(int(table[_TO]), at(table, 8), 40) == 40:
-        while got < 24 and _poll(at(table, 1), 1, WITHIN) > 0:
-            count = _read(u64(_table_at())[1] & 0xFFFFFFFF, at(table, 16) + got, 24 - got)
+    if table[_LOST] == 0.0 and _write(int(table[_TO]), entry_address(table, 8), 40) == 40:
+        while got < 24 and _poll(entry_address(table, 1), 1, WITHIN) > 0:
+            count = _read(u64(_table_at())[1] & 0xFFFFFFFF, entry_address(table, 16) + got, 24 - got)
             if count <= 0:
                 break
             got += count
@@ -184,5 +184,5 @@ def loop_on_board(
         voltage_step,
     )
     _TABLE[1:2].view(np.uint64)[0] = process.stdout.fileno() | _POLL_IN
-    with replaced(family, one):
+    with family_replaced(family, one):
         yield _TABLE[_SAMPLES : _LOST + 1]

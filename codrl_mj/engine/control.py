@@ -1,8 +1,9 @@
-"""MuJoCo's control and bias callbacks for our actuators, compiled to C functions by numba: the door of tasks.
+"""The callback backend: MuJoCo's control and bias callbacks that run our actuators in our tasks.
 
-They are pure functions of (mjModel, mjData): which actuators are ours, and their parameters, is
-read from the model; all state is in `data.act`. The structures' offsets are compiled in: code kept
-on disk has them in its key.
+numba compiles them to C functions. They are pure functions of (mjModel, mjData): they recognize our
+actuators and read their parameters from the model's user data, and keep all state in `data.act`.
+The offsets of the structures' fields are compiled in, so they are part of the key under which
+compiled code is cached on disk.
 """
 
 import ctypes
@@ -15,21 +16,21 @@ import mujoco
 from numba import types
 
 from codrl_mj.compile_cache import cfunc
-from codrl_mj.engine.doors import command, inertia_at, is_disabled, user_of
 from codrl_mj.engine.families import (
-    HEAD,
     INERTIA,
     PARAMETERS,
     SIGNATURE,
-    WHOLE,
+    SLOT_SIZE,
+    USER_HEADER_SIZE,
     advance_slot,
     commit_slot,
+    family_size,
     is_compiled,
-    size_of,
 )
 from codrl_mj.engine.hill import compiled_hill
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import at, callback, f64, internal
+from codrl_mj.engine.memory import callback, entry_address, f64, internal
+from codrl_mj.engine.model_access import command, is_disabled, output_inertia, user_address
 
 _USER_DYNAMICS, _USER_BIAS = int(mujoco.mjtDyn.mjDYN_USER), int(mujoco.mjtBias.mjBIAS_USER)
 _FIRST, _SECOND = SIGNATURE
@@ -37,65 +38,73 @@ _FIRST, _SECOND = SIGNATURE
 
 @internal(inline="always")
 def _slot_of(model: int, data: int, actuator: int) -> int:
-    return at(DATA.act(data), MODEL.actuator_actadr(model)[actuator])
+    return entry_address(DATA.act(data), MODEL.actuator_actadr(model)[actuator])
 
 
 @internal(inline="always")
 def _is_ours(model: int, actuator: int) -> bool:
     if (
         MODEL.actuator_dyntype(model)[actuator] != _USER_DYNAMICS
-        or MODEL.nuser_actuator(model) < HEAD
+        or MODEL.nuser_actuator(model) < USER_HEADER_SIZE
     ):
         return False
-    user = f64(user_of(model, actuator))
+    user = f64(user_address(model, actuator))
     return (
         user[0] == _FIRST
         and user[1] == _SECOND
         and is_compiled(user[2])
-        and MODEL.nuser_actuator(model) >= HEAD + size_of(int(user[2]), PARAMETERS)
+        and MODEL.nuser_actuator(model) >= USER_HEADER_SIZE + family_size(int(user[2]), PARAMETERS)
         and MODEL.actuator_biastype(model)[actuator] == _USER_BIAS
-        and MODEL.actuator_actnum(model)[actuator] == size_of(int(user[2]), WHOLE)
+        and MODEL.actuator_actnum(model)[actuator] == family_size(int(user[2]), SLOT_SIZE)
     )
 
 
 @functools.cache
 def compiled_motors() -> dict[str, Any]:
-    """MuJoCo's names of the callbacks -> what its setters take; compiled on first use, kept for the process's life.
+    """Return the motors' callbacks by MuJoCo's names for them, as its setters take them.
 
-    `control` advances the actuators, `act_bias` is the torque that they deliver.
+    `control` advances the actuators; `act_bias` returns the torque that they deliver. They are
+    compiled on first use. The cache keeps them alive for as long as the process runs, because
+    MuJoCo holds only their addresses.
     """
 
     @cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def control(model: int, data: int) -> None:
-        if MODEL.nuser_actuator(model) < HEAD:
-            return  # no actuator of this model can be ours
+        if MODEL.nuser_actuator(model) < USER_HEADER_SIZE:
+            # Without room for our signature no actuator of this model can be ours.
+            return
         if DATA.pbase(data) != 0:
-            return  # stages 2 to 4 of RK4: the force is held over the step
+            # The engine calls this with an open stack frame only in stages 2 to 4 of RK4. A drive
+            # is sampled once a step, so its force is held in these stages.
+            return
         time, timestep = DATA.time(data), MODEL.opt.timestep(model)
         for actuator in range(MODEL.nactuator(model)):
             if not _is_ours(model, actuator) or is_disabled(model, actuator):
                 continue
-            user, slot = user_of(model, actuator), _slot_of(model, data, actuator)
+            user, slot = user_address(model, actuator), _slot_of(model, data, actuator)
             number = int(f64(user)[2])
+            # The engine may call this several times at one time (mj_forward, then mj_step). The
+            # candidate state becomes the state only after time has advanced.
             if time != f64(slot)[0]:
                 commit_slot(number, slot, time)
             out = MODEL.actuator_outadr(model)[actuator]
             advance_slot(
                 number,
-                user + 8 * HEAD,
+                user + 8 * USER_HEADER_SIZE,
                 timestep,
                 slot,
                 command(model, data, actuator),
                 DATA.actuator_length(data)[out],
                 DATA.actuator_velocity(data)[out],
                 time,
-                inertia_at(model, data, out, 1.0) if size_of(number, INERTIA) else math.inf,
+                output_inertia(model, data, out, 1.0) if family_size(number, INERTIA) else math.inf,
             )
 
     @cfunc(types.float64(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
     def act_bias(model: int, data: int, actuator: int) -> float:
         if not _is_ours(model, actuator):
-            return 0.0  # as the engine does when there is no callback
+            # The engine's own value for a user bias without a callback.
+            return 0.0
         return f64(_slot_of(model, data, actuator))[2]
 
     return {
@@ -104,14 +113,14 @@ def compiled_motors() -> dict[str, Any]:
     }
 
 
-# -- installing them, and that of hills, without trampling on anybody else's -----------------------------------
+# -- installation of the callbacks, which never replaces those of other libraries --
 
-_PARTS: dict[str, tuple[tuple[str, ...], Callable[[], dict[str, Any]], str]] = {
+_GROUPS: dict[str, tuple[tuple[str, ...], Callable[[], dict[str, Any]], str]] = {
     "motor": (("control", "act_bias"), compiled_motors, "actuator='ideal' or physics='analytic'"),
     "hill": (("passive",), compiled_hill, "physics='analytic'"),
 }
-"""Callbacks that are installed together: MuJoCo's names, as in `mujoco.set_mjcb_...`; what compiles
-them, by these names; and what else a user could do than to install them.
+"""Group -> MuJoCo's names of its callbacks, as in `mujoco.set_mjcb_...`; the function that compiles
+them, by these names; and settings of an environment that needs no such callback.
 """
 
 
@@ -120,68 +129,70 @@ class CallbackInUseError(RuntimeError):
 
 
 _INSTALLED: dict[str, Any] = {}
-"""What each of MuJoCo's callbacks was last set to."""
+"""The pointer that `install` last set for each of MuJoCo's callbacks, by name."""
 
 
-def _whose(name: str) -> tuple[bool, Any]:
-    """Whether the callback of that name is ours, and what it is, if any; nothing is compiled to find out."""
+def _read_callback(name: str) -> tuple[bool, Any]:
+    """Return True if MuJoCo's callback of a name is ours, and the callback or None."""
+    # Comparison with the pointers that we set needs no compilation of ours.
     present = getattr(mujoco, f"get_mjcb_{name}")()
     return present is not None and present is _INSTALLED.get(name), present
 
 
-def installed(*parts: str) -> bool:
-    """Whether MuJoCo runs our callbacks at present.
+def installed(*groups: str) -> bool:
+    """Return True if MuJoCo runs our callbacks at present.
 
     Args:
-        *parts: as for `install`.
+        *groups: as for `install`.
     """
-    return all(_whose(name)[0] for _, name in _callbacks(parts))
+    return all(_read_callback(name)[0] for _, name in _callbacks(groups))
 
 
-def install(*parts: str) -> None:
-    """Install the callbacks that run our motors, or our hills; harmless when they are installed already.
+def install(*groups: str) -> None:
+    """Install the callbacks that run our motors or hills; a repeated call does nothing.
 
-    The callbacks are process-wide, as all of MuJoCo's are. They act on actuators and joints that
-    carry our signature in their user data and on nothing else: other models, and foreign actuators
-    and joints of the same model, behave as without them. A process in which no model has a hill
-    need not pay for the hill's callback.
+    MuJoCo's callbacks are process-wide. Ours act only on actuators and joints that carry our
+    signature in their user data: other models, and other actuators and joints of the same model,
+    behave as they do without the callbacks. The hill's callback is a group of its own, so that
+    processes without hills do not pay for it.
 
     Args:
-        *parts: `motor` (`mjcb_control` and `mjcb_act_bias`), `hill` (`mjcb_passive`), or both; none
-            means `motor`.
+        *groups: `motor` (`mjcb_control` and `mjcb_act_bias`), `hill` (`mjcb_passive`), or both.
+            `motor` if none is given.
 
     Raises:
-        ValueError: no such part.
-        CallbackInUseError: one of the callbacks is somebody else's; nothing was changed.
-        LayoutError: the installed MuJoCo's memory is not laid out as its introspection says.
+        ValueError: unknown group.
+        CallbackInUseError: another library has set one of the callbacks; nothing was changed.
+        LayoutError: the memory of the installed MuJoCo differs from its introspection.
     """
+    # All checks come before the first change, so that an error leaves MuJoCo as it was.
     missing = []
-    for part, name in _callbacks(parts):
-        ours, present = _whose(name)
-        if present is not None and not ours:
+    for group, name in _callbacks(groups):
+        is_ours, present = _read_callback(name)
+        if present is not None and not is_ours:
             raise CallbackInUseError(
                 f"mujoco.mjcb_{name} is already set, to {present!r}: refusing to replace it. Remove"
                 f" it with mujoco.set_mjcb_{name}(None) first, or build the environment with"
-                f" {_PARTS[part][2]}, which needs no such callback"
+                f" {_GROUPS[group][2]}, which needs no such callback"
             )
-        if not ours:
-            missing.append((part, name))
-    pointers = [(name, _PARTS[part][1]()[name]) for part, name in missing]
+        if not is_ours:
+            missing.append((group, name))
+    pointers = [(name, _GROUPS[group][1]()[name]) for group, name in missing]
     for name, pointer in pointers:
         getattr(mujoco, f"set_mjcb_{name}")(pointer)
         _INSTALLED[name] = pointer
 
 
 def uninstall() -> None:
-    """Remove all our callbacks; anybody else's stay where they are."""
-    for _, name in _callbacks(tuple(_PARTS)):
-        if _whose(name)[0]:
+    """Remove all our callbacks, and leave those of other libraries."""
+    for _, name in _callbacks(tuple(_GROUPS)):
+        if _read_callback(name)[0]:
             getattr(mujoco, f"set_mjcb_{name}")(None)
 
 
-def _callbacks(parts: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Part and name of each of MuJoCo's callbacks that are of some parts, those of motors if none is named."""
-    for part in parts:
-        if part not in _PARTS:
-            raise ValueError(f"callbacks {part!r}: must be one of {', '.join(_PARTS)}")
-    return [(part, name) for part in parts or ("motor",) for name in _PARTS[part][0]]
+def _callbacks(groups: tuple[str, ...]) -> list[tuple[str, str]]:
+    """Return (group, MuJoCo's name) for each callback of some groups, or of `motor` if empty."""
+    for group in groups:
+        if group not in _GROUPS:
+            raise ValueError(f"callbacks {group!r}: must be one of {', '.join(_GROUPS)}")
+    return [(group, name) for group in groups or ("motor",) for name in _GROUPS[group][0]]

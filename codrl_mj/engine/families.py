@@ -1,7 +1,8 @@
-"""Families of actuators, compiled: one table of C functions that both doors into MuJoCo call by a family's number.
+"""Compiled actuator families: a table of C functions that both backends call by family number.
 
-A family's number is in the model's `user` data, so a callback or plugin that was compiled once runs
-families that were written later. Compiling one takes a fraction of a second, once a process.
+A family's number is in the model's `user` data, so a callback or plugin that was compiled once also
+runs families that were written later. The compilation of a family takes a fraction of a second,
+once a process.
 """
 
 import contextlib
@@ -19,22 +20,34 @@ from numba.extending import register_jitable
 from codrl_mj.actuators import Family, Inputs, family_number, parameters_type, reference
 from codrl_mj.actuators.model import advance_form, check_family
 from codrl_mj.compile_cache import Note, cfunc
-from codrl_mj.engine.doors import load_inertia
-from codrl_mj.engine.memory import call, f64, i32, internal, read, symbol, tuple_of, u8, u64, write
+from codrl_mj.engine.memory import (
+    call,
+    f64,
+    i32,
+    internal,
+    named_address,
+    named_tuple_type,
+    read,
+    u8,
+    u64,
+    write,
+)
+from codrl_mj.engine.model_access import load_inertia
 from codrl_mj.user_code import Form, check_form, not_compiled
 
 SIGNATURE = (250700.0, 268401.0)
-"""First two numbers of the `user` data of every actuator and joint that is ours: the paper's arXiv
-identifier, in two, because a number keeps six digits in an XML file.
+"""First two numbers of the `user` data of our actuators and joints: the paper's arXiv identifier.
+
+It is split in two because XML files keep only six digits of a number.
 """
 
 
-class Slot(NamedTuple):
-    """What the state of an actuator of ours begins with, in `data.act` or `data.plugin_state`.
+class SlotHeader(NamedTuple):
+    """Header of an actuator's slot, its state in `data.act` or `data.plugin_state`.
 
-    The family's committed state follows (at time `tick`), then its candidate one step later, then
-    its signals, then a 0: the engine multiplies the last activation by the actuator's gain, 0,
-    which makes NaN of infinity.
+    The header is followed by the family's committed state (at time `tick`), the candidate state
+    one step later, the signals, and a 0. The engine multiplies the last activation by the
+    actuator's gain, which is 0; an infinite signal in its place would give NaN.
     """
 
     tick: float
@@ -45,153 +58,171 @@ class Slot(NamedTuple):
     """Torque delivered at the shaft [N*m]."""
 
 
-HEAD, SLOT = 3, len(Slot._fields)
-"""Numbers of what an actuator's `user` data, and its state, begin with."""
+USER_HEADER_SIZE, SLOT_HEADER_SIZE = 3, len(SlotHeader._fields)
+"""Lengths of the headers of an actuator's `user` data and of its slot."""
 
 _ADDRESSES = np.zeros(10**6, dtype=np.uintp)
-"""Address of a family's compiled function by its number; 0 where it has not been compiled. 8 MB
-that the system hands out page by page.
+"""Addresses of the families' compiled functions by family number; 0 if not compiled.
+
+The operating system maps these 8 MB page by page, so unused entries take no memory.
 """
-STATES, SIGNALS, PARAMETERS, INERTIA, MOTION, WHOLE = range(6)
-"""Columns of the table of sizes: a family's numbers of states, signals and parameters, whether it
-asks for the inertia and is asked for motions, and its `slot_size`.
+STATES, SIGNALS, PARAMETERS, INERTIA, MOTION, SLOT_SIZE = range(6)
+"""Columns of the table of sizes: numbers of states, signals and parameters; 1 if the family needs
+the inertia; 1 if its command is a motion; and its `slot_size`.
 """
 _SIZES = np.zeros((10**6, 6), dtype=np.int32)
-"""The sizes of a family, by its number."""
+"""Sizes of the families, by family number."""
 _REFERENCES = np.zeros(10**6, dtype=np.uintp)
-"""Address of its `reference`, as C has strings, likewise."""
+"""Addresses of the families' `reference` as C strings, by family number."""
 _COMPILED: dict[int, tuple[Family, Any]] = {}
-"""Number -> (family, what owns the memory that the tables point to)."""
+"""Family number -> (family, owner of the memory that the tables point to)."""
 
-addresses_at = symbol("codrl_mj_families", _ADDRESSES.ctypes.data)
-sizes_at = symbol("codrl_mj_sizes", _SIZES.ctypes.data)
-references_at = symbol("codrl_mj_references", _REFERENCES.ctypes.data)
+addresses_pointer = named_address("codrl_mj_families", _ADDRESSES.ctypes.data)
+sizes_pointer = named_address("codrl_mj_sizes", _SIZES.ctypes.data)
+references_pointer = named_address("codrl_mj_references", _REFERENCES.ctypes.data)
 
-_F64, _AT = types.float64, types.uintp
-_FUNCTION = _F64(_AT, _F64, _AT, _AT, _AT, *(_F64,) * 6)
+_F64, _ADDRESS = types.float64, types.uintp
+_ADVANCE_TYPE = _F64(_ADDRESS, _F64, _ADDRESS, _ADDRESS, _ADDRESS, *(_F64,) * 6)
 
 
 def loaded_families() -> tuple[Family, ...]:
-    """The families that have been compiled in this process."""
+    """Return the families that have been compiled in this process."""
     return tuple(family for family, _ in _COMPILED.values())
 
 
 def slot_size(family: Family) -> int:
-    """Numbers of state that an actuator of a family has in MuJoCo."""
-    return signals_at(family) + len(family.Signals._fields) + 1
+    """Return the length of the slot of a family's actuators."""
+    return signals_offset(family) + len(family.Signals._fields) + 1
 
 
-def signals_at(family: Family) -> int:
-    """Where its signals begin in there."""
-    return SLOT + 2 * len(family.State._fields)
+def signals_offset(family: Family) -> int:
+    """Return the offset of the signals in a family's slot."""
+    return SLOT_HEADER_SIZE + 2 * len(family.State._fields)
 
 
-def user_head(family: Family) -> tuple[float, float, float]:
-    """What the `user` data of a family's actuators begin with, at either door; its parameters follow."""
+def user_header(family: Family) -> tuple[float, float, float]:
+    """Return the header of the `user` data of a family's actuators; the parameters follow it."""
     return *SIGNATURE, float(family_number(family))
 
 
 def load_family(family: Family) -> None:
-    """Compile a family, on first use, and put it into the table.
+    """Compile a family on first use, and put it into the table.
 
-    A class that was defined anew, as in a notebook, takes the place of the one before.
+    A class that is defined again under its name, as in a notebook, replaces the previous class.
 
     Raises:
-        ValueError: another family has the same number: rename one of the two. Or the one before had
-            other numbers of states, signals or parameters, which models that exist rely on. Or
-            `advance` is not what numba compiles, or does not return what the family declares.
+        ValueError: another family has the same number; or the previous class of this name had
+            other numbers of states, signals or parameters, on which existing models rely; or numba
+            cannot compile `advance`; or `advance` does not return what the family declares.
     """
     check_family(family)
     number, sizes = family_number(family), family_sizes(family)
-    other, _ = _COMPILED.get(number, (None, None))
-    if other is family:
+    loaded, _ = _COMPILED.get(number, (None, None))
+    if loaded is family:
         return
-    if other is not None and reference(other) != reference(family):
+    if loaded is not None and reference(loaded) != reference(family):
         raise ValueError(
-            f"families {reference(family)} and {reference(other)} have the same number {number}:"
+            f"families {reference(family)} and {reference(loaded)} have the same number {number}:"
             " rename one"
         )
-    if other is not None and family_sizes(other) != sizes:
+    if loaded is not None and family_sizes(loaded) != sizes:
         raise ValueError(
             f"family {reference(family)} has {sizes[:3]} states, signals and parameters, and"
-            f" {family_sizes(other)[:3]} when it was loaded before: give it another name, or start"
-            " Python anew"
+            f" {family_sizes(loaded)[:3]} when it was loaded before: give it another name, or"
+            " restart Python"
         )
     if family.INERTIA:
         load_inertia()
     function, text = _compile(family), ctypes.create_string_buffer(reference(family).encode())
     _SIZES[number], _REFERENCES[number] = (*sizes, slot_size(family)), ctypes.addressof(text)
+    # The function's address is set last: with it the family counts as compiled.
     _ADDRESSES[number] = function.address
+    # The previous entry is kept alive: another thread may still be running its function.
     _COMPILED[number] = family, (function, text, _COMPILED.get(number))
 
 
 def family_sizes(family: Family) -> tuple[int, ...]:
-    """Numbers of a family's states, signals and parameters, and its `INERTIA` and `MOTION`."""
+    """Return the numbers of states, signals and parameters of a family, `INERTIA` and `MOTION`."""
     counts = (len(kind._fields) for kind in (family.State, family.Signals, parameters_type(family)))
     return *counts, int(family.INERTIA), int(family.MOTION)
 
 
 @contextlib.contextmanager
-def replaced(family: Family, other: Family) -> Iterator[None]:
-    """Run another's `advance` in place of a family's in a `with` block; both have the same states and signals."""
+def family_replaced(family: Family, replacement: Family) -> Iterator[None]:
+    """Replace a family's `advance` by another family's in a `with` block.
+
+    Both families must have the same states and signals.
+    """
     load_family(family)
-    number, function = family_number(family), _compile(other)
-    right = _ADDRESSES[number]
+    number, function = family_number(family), _compile(replacement)
+    original = _ADDRESSES[number]
     _ADDRESSES[number] = function.address
     try:
         yield
     finally:
-        _ADDRESSES[number] = right
+        _ADDRESSES[number] = original
 
 
-_OTHERS = sys.stdlib_module_names | {"numba", "numpy", "scipy"}
-"""Packages whose functions numba knows, or does not, by itself."""
+_FOREIGN_PACKAGES = sys.stdlib_module_names | {"numba", "numpy", "scipy"}
+"""Packages whose functions numba supports by itself, or not at all."""
+
+_REGISTERED: set[FunctionType] = set()
+"""Plain functions that compiled code can call."""
 
 
-_KNOWN: set[FunctionType] = set()
+def _register_callees(function: Any) -> None:
+    """Register all plain functions that a function calls, directly or not, with numba.
 
-
-def _make_known(function: Any) -> None:
-    """Make the plain functions that a function calls, and these call, known to numba; they stay what they are."""
+    The functions themselves stay plain Python.
+    """
+    # Nested functions and comprehensions have code objects of their own, among the constants.
     codes, names = [function.__code__], set[str]()
     for code in codes:
         names |= {*code.co_names, *code.co_freevars}
-        codes += [one for one in code.co_consts if isinstance(one, CodeType)]
+        codes += [const for const in code.co_consts if isinstance(const, CodeType)]
     closed = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
     scope = function.__globals__ | {name: cell.cell_contents for name, cell in closed}
-    found = [scope[name] for name in names & scope.keys()]
-    for one in found:  # which grows by what modules have
-        if isinstance(one, ModuleType) and one.__name__.partition(".")[0] not in _OTHERS:
-            inner = [getattr(one, name) for name in names if hasattr(one, name)]
-            found += [new for new in inner if all(new is not other for other in found)]
-        ours = isinstance(one, FunctionType) and one.__module__.partition(".")[0] not in _OTHERS
-        if ours and one not in _KNOWN:
-            _KNOWN.add(one)
-            register_jitable(forceinline=True)(one)
-            _make_known(one)
+    values = [scope[name] for name in names & scope.keys()]
+    # The list grows in this loop by functions that are called through a module, as in
+    # `module.f(x)`.
+    for value in values:
+        if (
+            isinstance(value, ModuleType)
+            and value.__name__.partition(".")[0] not in _FOREIGN_PACKAGES
+        ):
+            inner = [getattr(value, name) for name in names if hasattr(value, name)]
+            values += [callee for callee in inner if all(callee is not known for known in values)]
+        is_user_function = (
+            isinstance(value, FunctionType)
+            and value.__module__.partition(".")[0] not in _FOREIGN_PACKAGES
+        )
+        if is_user_function and value not in _REGISTERED:
+            _REGISTERED.add(value)
+            register_jitable(forceinline=True)(value)
+            _register_callees(value)
 
 
 @functools.cache
 def compiled_function(function: Callable[..., Any], form: Form, declared: str, *kinds: Any) -> Any:
-    """A user's function for arguments of such types, whose result is of a form in numba's eyes too.
+    """Compile a user's function for argument types; check that numba gives its result a form.
 
-    It is compiled to find that out, unless a process before has, of the very same function.
+    The check needs a compilation. It is skipped if an earlier process has checked this function.
     """
-    compiled, noted = internal(function), Note("fits", function, form, kinds)
+    compiled, marker = internal(function), Note("fits", function, form, kinds)
     try:
-        _make_known(function)
-        if noted.is_there():
+        _register_callees(function)
+        if marker.is_there():
             return compiled
         compiled.compile(kinds)
     except Exception as error:
         raise ValueError(not_compiled(function, error)) from error
     check_form(function, _example(compiled.overloads[kinds].signature.return_type), form, declared)
-    noted.leave()
+    marker.leave()
     return compiled
 
 
 def _example(kind: Any) -> Any:
-    """A value of one of numba's types; of one that is neither a number nor a tuple of these, the type."""
+    """Return a value of a numba type; the type itself unless it is a number or a tuple of such."""
     if isinstance(kind, types.BaseTuple):
         return tuple(map(_example, kind))
     return 0.0 if isinstance(kind, types.Float | types.Integer | types.Boolean) else kind
@@ -200,16 +231,21 @@ def _example(kind: Any) -> Any:
 @functools.cache
 def _compile(family: Any) -> Any:
     parameters_of, state_of = parameters_type(family), family.State
-    kinds = tuple_of(parameters_of), _F64, tuple_of(state_of), tuple_of(Inputs)
+    kinds = (
+        named_tuple_type(parameters_of),
+        _F64,
+        named_tuple_type(state_of),
+        named_tuple_type(Inputs),
+    )
     advance = compiled_function(family.advance, *advance_form(family), *kinds)
 
-    @cfunc(_FUNCTION, nogil=True, error_model="numpy")
+    @cfunc(_ADVANCE_TYPE, nogil=True, error_model="numpy")
     def step(
-        parameters: int,
+        parameters_address: int,
         timestep: float,
-        before: int,
-        after: int,
-        seen: int,
+        state_address: int,
+        candidate_address: int,
+        signals_address: int,
         desired: float,
         position: float,
         speed: float,
@@ -217,92 +253,106 @@ def _compile(family: Any) -> Any:
         key: float,
         inertia: float,
     ) -> float:
-        state, torque, outcome = advance(
-            read(parameters, parameters_of),
+        state, torque, signals = advance(
+            read(parameters_address, parameters_of),
             timestep,
-            read(before, state_of),
+            read(state_address, state_of),
             Inputs(desired, position, speed, time, key, inertia),
         )
-        write(state, after)
-        write(outcome, seen)
+        write(state, candidate_address)
+        write(signals, signals_address)
         return torque
 
     return step
 
 
 def compiled_advance(family: Family) -> Callable[..., Any]:
-    """Return a family's `advance`, compiled, to be called from Python; states and signals are arrays."""
+    """Return a family's compiled `advance` for Python; its states and signals are arrays."""
     load_family(family)
     function, (states, signals, _) = _compile(family).ctypes, family_sizes(family)[:3]
 
     def advance(
         parameters: Any, timestep: float, state: Any, inputs: Inputs
     ) -> tuple[Any, float, Any]:
-        numbers, before, after, seen = (
+        parameter_array, before, after, signal_array = (
             np.array(parameters),
             np.array(state),
             np.empty(states),
             np.empty(signals),
         )
-        addresses = [one.ctypes.data for one in (numbers, before, after, seen)]
+        addresses = [array.ctypes.data for array in (parameter_array, before, after, signal_array)]
         torque = function(addresses[0], timestep, *addresses[1:], *inputs)
-        return after, torque, seen
+        return after, torque, signal_array
 
     return advance
 
 
 @functools.cache
 def compiled_observe(family: Family) -> Any:
-    """(parameters, signals, timestep, time, key, seen) -> nothing: writes what the sensors say.
+    """Return a compiled (parameters, signals, timestep, time, key, readings).
 
-    Vectors go by their addresses.
+    It writes the sensors' readings to `readings`. Parameters, signals and readings are passed by
+    address.
     """
-    kind, signals_of = parameters_type(family), family.Signals
-    kinds = tuple_of(kind), types.float64, tuple_of(signals_of), tuple_of(Inputs)
+    parameters_of, signals_of = parameters_type(family), family.Signals
+    kinds = (
+        named_tuple_type(parameters_of),
+        types.float64,
+        named_tuple_type(signals_of),
+        named_tuple_type(Inputs),
+    )
     observe = compiled_function(
         family.observe, family.OBSERVED, f"{family.__name__}.OBSERVED", *kinds
     )
 
     @internal
     def fill(
-        parameters: int, shown: int, timestep: float, time: float, key: float, seen: int
+        parameters: int,
+        signals: int,
+        timestep: float,
+        time: float,
+        key: float,
+        readings_address: int,
     ) -> None:
         inputs = Inputs(0.0, 0.0, 0.0, time, key)
-        write(observe(read(parameters, kind), timestep, read(shown, signals_of), inputs), seen)
+        write(
+            observe(read(parameters, parameters_of), timestep, read(signals, signals_of), inputs),
+            readings_address,
+        )
 
     return fill
 
 
 @internal
 def is_compiled(number: float) -> bool:
-    """Whether a family of that number is in the table; any float will do."""
-    return 0.0 <= number < 1e6 and u64(addresses_at())[int(number)] != 0
+    """Return True if the table has a family of this number; any float is allowed."""
+    return 0.0 <= number < 1e6 and u64(addresses_pointer())[int(number)] != 0
 
 
 @internal(inline="always")
-def size_of(number: int, column: int) -> int:
-    """A column of the table of sizes, such as `WHOLE`, by a family's number."""
-    return i32(sizes_at())[6 * number + column]
+def family_size(number: int, column: int) -> int:
+    """Return a column of the table of sizes, such as `SLOT_SIZE`, for a family's number."""
+    return i32(sizes_pointer())[6 * number + column]
 
 
 @internal(inline="always")
-def is_called(number: int, text: int) -> bool:
-    """Whether the C string at an address is a family's `reference`."""
-    name, place = u64(references_at())[number], 0
-    while u8(name)[place] == u8(text)[place]:
-        if u8(name)[place] == 0:
+def has_reference(number: int, text: int) -> bool:
+    """Return True if the C string at an address equals a family's `reference`."""
+    name, index = u64(references_pointer())[number], 0
+    while u8(name)[index] == u8(text)[index]:
+        if u8(name)[index] == 0:
             return True
-        place += 1
+        index += 1
     return False
 
 
 @internal
 def commit_slot(number: int, slot: int, time: float) -> None:
-    """A step was taken and it is `time` now: what was an actuator's candidate has happened."""
-    own, count = f64(slot), size_of(number, STATES)
-    own[0] = time
-    for entry in range(SLOT, SLOT + count):
-        own[entry] = own[entry + count]
+    """Make an actuator's candidate state the committed one, after a step to `time`."""
+    values, num_states = f64(slot), family_size(number, STATES)
+    values[0] = time
+    for entry in range(SLOT_HEADER_SIZE, SLOT_HEADER_SIZE + num_states):
+        values[entry] = values[entry + num_states]
 
 
 @internal
@@ -317,28 +367,30 @@ def advance_slot(
     time: float,
     inertia: float,
 ) -> float:
-    """Compute an actuator's candidate and signals from its committed state; the torque [N*m], which its slot keeps too.
+    """Compute an actuator's candidate state and signals; store and return its torque [N*m].
 
-    By address are the parameters and the slot; torque asked for [N*m], position [rad], speed
-    [rad/s] and inertia [kg*m^2] are the shaft's.
+    Parameters and slot are passed by address. The desired torque [N*m], position [rad], speed
+    [rad/s] and inertia [kg*m^2] are those of the shaft.
     """
-    own, size = f64(slot), 8 * size_of(number, STATES)
-    before = slot + 8 * SLOT
-    after = before + size
-    own[2] = call(
-        u64(addresses_at())[number],
+    # Repeated calls within a step start from the same committed state, and only overwrite the
+    # candidate.
+    values, state_bytes = f64(slot), 8 * family_size(number, STATES)
+    state = slot + 8 * SLOT_HEADER_SIZE
+    candidate = state + state_bytes
+    values[2] = call(
+        u64(addresses_pointer())[number],
         *(
             parameters,
             timestep,
-            before,
-            after,
-            after + size,
+            state,
+            candidate,
+            candidate + state_bytes,
             desired,
             position,
             speed,
             time,
-            own[1],
+            values[1],
             inertia,
         ),
     )
-    return own[2]
+    return values[2]

@@ -1,4 +1,4 @@
-"""MuJoCo's passive-force callback for joints that run over a hill, compiled to a C function by numba.
+"""MuJoCo's passive-force callback for joints that run over a hill, compiled to C by numba.
 
 A slide joint with our signature in its user data is the horizontal position x of a body on the hill
 
@@ -7,12 +7,13 @@ A slide joint with our signature in its user data is the horizontal position x o
 The callback does two things, both pure functions of (mjModel, mjData):
 
 - it adds the hill's force, -mass * gravity * cos(wavenumber * x), to the joint's `qfrc_passive`;
-- it moves the body's geoms, in `data.geom_xpos` and `data.geom_xmat`, up to the hill and tilts them along it. The
-  engine computes geom poses before the passive forces, so whatever draws after `mj_forward` or
-  `mj_step` (a viewer, a renderer) shows the body on the hill, while the dynamics keep the one
-  coordinate x that the task's equations have. The alternatives are worse: more joints need
-  constraints that only approximate the curve, mocap bodies need Python in every viewer. Poses are
-  computed from the body's, not from the geoms' last ones: a second call changes nothing.
+- it moves the body's geoms, in `data.geom_xpos` and `data.geom_xmat`, up to the hill and tilts
+  them along it. The engine computes geom poses before the passive forces, so a viewer or renderer
+  that draws after `mj_forward` or `mj_step` shows the body on the hill, while the dynamics have
+  only the coordinate x of the task's equations. The alternatives are worse: additional joints need
+  constraints that only approximate the curve, and mocap bodies need Python in every viewer. The
+  poses follow from the body's pose, not from the geoms' previous poses, so a second call changes
+  nothing.
 
 The body's frame has x along the joint and z up; bodies attached to it stay at the height of the
 joint.
@@ -28,12 +29,12 @@ from numba import types
 from codrl_mj.compile_cache import cfunc
 from codrl_mj.engine.families import SIGNATURE
 from codrl_mj.engine.layout import DATA, MODEL
-from codrl_mj.engine.memory import at, callback, f64, internal
+from codrl_mj.engine.memory import callback, entry_address, f64, internal
 
 HILL_NAMES = ("signature_1", "signature_2", "gravity", "wavenumber", "height")
-"""What the `user` entries of one of our slide joints hold, in order: the signature (two numbers),
-the largest acceleration along the hill [m/s^2], 1/(its length/2 pi) [1/m], and the height of crests
-over the middle [m], which is for the eye.
+"""Entries of a hill joint's `user` data, in order: the signature (two numbers), the largest
+acceleration along the hill [m/s^2], the wavenumber 2 pi/(length of a period) [1/m], and the height
+of the crests over the middle [m], which only the drawing uses.
 """
 _, _, GRAVITY, WAVENUMBER, HEIGHT = range(len(HILL_NAMES))
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -41,24 +42,25 @@ _FIRST, _SECOND = SIGNATURE
 
 
 @internal(inline="always")
-def _place(model: int, data: int, body: int, height: float, slope: float) -> None:
-    """Put the body's geoms at `height` over its frame, tilted by `slope` about its y axis."""
+def _move_geoms(model: int, data: int, body: int, height: float, slope: float) -> None:
+    """Move the body's geoms to `height` above its frame, tilted by `slope` about its y axis."""
+    # The tilt's axes in world coordinates: `along` the hill and `normal` to it.
     cosine = 1.0 / math.sqrt(1.0 + slope * slope)
     sine = slope * cosine
-    origin = f64(at(DATA.xpos(data), 3 * body))
-    frame = f64(at(DATA.xmat(data), 9 * body))
+    origin = f64(entry_address(DATA.xpos(data), 3 * body))
+    frame = f64(entry_address(DATA.xmat(data), 9 * body))
     first = MODEL.body_geomadr(model)[body]
     for geom in range(first, first + MODEL.body_geomnum(model)[body]):
-        local = f64(at(MODEL.geom_pos(model), 3 * geom))
-        quat = f64(at(MODEL.geom_quat(model), 4 * geom))
+        local = f64(entry_address(MODEL.geom_pos(model), 3 * geom))
+        quat = f64(entry_address(MODEL.geom_quat(model), 4 * geom))
         w, x, y, z = quat[0], quat[1], quat[2], quat[3]
         rotation = (
             (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
             (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
             (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
         )
-        position = f64(at(DATA.geom_xpos(data), 3 * geom))
-        matrix = f64(at(DATA.geom_xmat(data), 9 * geom))
+        position = f64(entry_address(DATA.geom_xpos(data), 3 * geom))
+        matrix = f64(entry_address(DATA.geom_xmat(data), 9 * geom))
         for row in range(3):
             ahead, left, up = frame[3 * row], frame[3 * row + 1], frame[3 * row + 2]
             along, normal = cosine * ahead + sine * up, cosine * up - sine * ahead
@@ -75,15 +77,16 @@ def _place(model: int, data: int, body: int, height: float, slope: float) -> Non
 
 @functools.cache
 def compiled_hill() -> dict[str, Any]:
-    """The callback by MuJoCo's name of it, as `codrl_mj.engine.control.compiled_motors` has those of motors."""
+    """Return the hill's callback by MuJoCo's name, as `compiled_motors` does for motors."""
 
     @cfunc(types.void(types.uintp, types.uintp), nogil=True, error_model="numpy")
     def passive(model: int, data: int) -> None:
         width = MODEL.nuser_jnt(model)
         if width < len(HILL_NAMES):
-            return  # no joint of this model can be ours
+            # Without room for our signature no joint of this model can be ours.
+            return
         for joint in range(MODEL.njnt(model)):
-            user = f64(at(MODEL.jnt_user(model), joint * width))
+            user = f64(entry_address(MODEL.jnt_user(model), joint * width))
             if user[0] != _FIRST or user[1] != _SECOND or MODEL.jnt_type(model)[joint] != _SLIDE:
                 continue
             phase = user[WAVENUMBER] * DATA.qpos(data)[MODEL.jnt_qposadr(model)[joint]]
@@ -91,6 +94,8 @@ def compiled_hill() -> dict[str, Any]:
             body = MODEL.jnt_bodyid(model)[joint]
             mass = MODEL.body_mass(model)[body]
             DATA.qfrc_passive(data)[MODEL.jnt_dofadr(model)[joint]] -= mass * user[GRAVITY] * cosine
-            _place(model, data, body, user[HEIGHT] * sine, user[HEIGHT] * user[WAVENUMBER] * cosine)
+            _move_geoms(
+                model, data, body, user[HEIGHT] * sine, user[HEIGHT] * user[WAVENUMBER] * cosine
+            )
 
     return {"passive": callback(passive)}

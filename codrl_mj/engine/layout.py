@@ -1,13 +1,15 @@
-"""MuJoCo's structures and functions in functions that numba compiles: `MODEL.actuator_user(model)`, `DATA.time(data)`.
+"""Access to MuJoCo's structures and functions in code that numba compiles.
 
-Compiled code knows a simulation by two integers, the addresses of its `mjModel` and `mjData`, which
-must outlive the call. A fault that the engine itself finds (an unknown integrator, memory run out)
-ends the process there, where `mujoco.mj_step` would raise `mujoco.FatalError`; our models cause
-none.
+For example `MODEL.actuator_user(model)` and `DATA.time(data)`.
 
-The offsets differ between MuJoCo versions, so none is written down: `mujoco.introspect` describes
-the structures as the C headers declare them, ctypes lays them out by the platform's ABI, and a
-field is compared with a live object before anything relies on it. Compiled code has the offsets as
+Compiled code identifies a simulation by two integers, the addresses of its `mjModel` and `mjData`,
+which must outlive the call. A fatal error in the engine (an unknown integrator, memory exhausted)
+ends the process in compiled code, while `mujoco.mj_step` would raise `mujoco.FatalError`; our
+models cause no such error.
+
+Offsets differ between MuJoCo versions, so none is hard-coded: `mujoco.introspect` describes the
+structures as the C headers declare them, ctypes lays them out by the platform's ABI, and each field
+is compared with a live object before its first use. Compiled code contains the offsets as
 constants.
 """
 
@@ -26,7 +28,7 @@ from numba.core.registry import cpu_target
 from numba.core.typing.ctypes_utils import from_ctypes
 
 from codrl_mj.compile_cache import external
-from codrl_mj.engine.memory import emitted, pointed
+from codrl_mj.engine.memory import llvm_intrinsic, to_pointer
 from codrl_mj.plugin import LayoutError, library
 
 _SCALARS = {
@@ -46,11 +48,14 @@ _SCALARS = {
     "uint64_t": ctypes.c_uint64,
     "uintptr_t": ctypes.c_int64,
 }
-"""C types as ctypes has them and, by numba's table, compiled code, which counts with signed numbers."""
+"""C type -> ctypes type; numba's table turns these into the types of compiled code.
+
+Sizes are signed, because numba makes floats of sums of signed and unsigned integers.
+"""
 
 
 def _ctype(node: Any) -> Any:
-    """The ctypes type of an introspected C type."""
+    """Return the ctypes type of an introspected C type."""
     if isinstance(node, ast_nodes.PointerType):
         return ctypes.c_void_p
     if isinstance(node, ast_nodes.ArrayType):
@@ -64,7 +69,8 @@ def _ctype(node: Any) -> Any:
         return _SCALARS[node.name]
     if node.name in STRUCTS:
         return struct(node.name)
-    if node.name.startswith("mjt"):  # the remaining mjt* types are enumerations
+    # The remaining mjt* types are enumerations, which C stores as int.
+    if node.name.startswith("mjt"):
         return ctypes.c_int
     raise LayoutError(
         f"MuJoCo {mujoco.__version__} declares a type that this version of codrl_mj does not know:"
@@ -79,12 +85,12 @@ def _structure(name: str, fields: Any) -> type[ctypes.Structure]:
 
 @functools.cache
 def struct(name: str) -> type[ctypes.Structure]:
-    """MuJoCo's structure of a C name (`mjModel`, `mjData`, `mjOption`, ...) as a ctypes structure."""
+    """Return the ctypes structure of a C name (`mjModel`, `mjData`, `mjOption`, ...)."""
     return _structure(name, STRUCTS[name].fields)
 
 
 def offset(struct_name: str, field: str) -> int:
-    """Offset in bytes of a field of `mjModel` or `mjData`, which may be dotted (`opt.timestep`)."""
+    """Return the offset [bytes] of a field, which may be dotted (`opt.timestep`)."""
     kind, total = struct(struct_name), 0
     for part in field.split("."):
         if not hasattr(kind, part):
@@ -123,111 +129,121 @@ _PROBE = """
 
 
 @functools.cache
-def _live() -> dict[str, Any]:
-    """A model and its data, of which every count has another value, by the names of their structures."""
-    model = mujoco.MjSpec.from_string(
-        _PROBE
-    ).compile()  # within `motors_added`, which this is no model for
+def _live_objects() -> dict[str, Any]:
+    """Return a live model and its data by the names of their structures.
+
+    Each of their counts has a different value, so that no field can be mistaken for another.
+    """
+    # MjSpec bypasses the patched loaders of `motors_added`: the probe must not get motors.
+    model = mujoco.MjSpec.from_string(_PROBE).compile()
     data = mujoco.MjData(model)
     data.time = 4.56
-    mujoco.mj_fwdPosition(model, data)  # uses the stack: `maxuse_stack` is no longer zero
+    # This uses the stack, so that `maxuse_stack` differs from zero.
+    mujoco.mj_fwdPosition(model, data)
     return {"mjModel": model, "mjData": data}
 
 
 def check_field(struct_name: str, field: str) -> None:
     """Compare the layout of a field of `mjModel` or `mjData` with a live object.
 
-    An array must lie where the layout says, anything else must have its value there. A field that
-    the public bindings do not show (`pbase`), or of which there is nothing, is checked through its
-    neighbours on both sides.
+    An array must have the address, and any other field the value, that is read at the offset. A
+    field that the bindings do not expose (`pbase`), or that is empty, is checked through its
+    nearest neighbors on both sides.
+
+    Raises:
+        LayoutError: the field differs.
     """
-    with ThreadPoolExecutor(
-        1
-    ) as thread:  # the compiler of a model, which may be running, is not reentrant in its own
-        owner = thread.submit(_live).result()[struct_name]
+    # MuJoCo's model compiler is not reentrant within a thread, and may be running in this one.
+    with ThreadPoolExecutor(1) as thread:
+        owner = thread.submit(_live_objects).result()[struct_name]
     raw: Any = struct(struct_name).from_address(owner._address)
     names = [field]
     if field.count(".") == 0 and not _is_shown(owner, field):
-        order = [one.name for one in STRUCTS[struct_name].fields]
-        place = order.index(field)
-        before, after = order[:place][::-1], order[place + 1 :]
-        names = [next(one for one in side if _is_shown(owner, one)) for side in (before, after)]
+        order = [member.name for member in STRUCTS[struct_name].fields]
+        index = order.index(field)
+        before, after = order[:index][::-1], order[index + 1 :]
+        names = [
+            next(member for member in side if _is_shown(owner, member)) for side in (before, after)
+        ]
     for name in names:
-        live, found = owner, raw
+        live, value = owner, raw
         for part in name.split("."):
-            live, found = getattr(live, part), getattr(found, part)
+            live, value = getattr(live, part), getattr(value, part)
         expected = live.ctypes.data if hasattr(live, "ctypes") else live
-        if found != expected:
+        if value != expected:
             raise LayoutError(
-                f"MuJoCo {mujoco.__version__}: {struct_name}.{name} reads {found!r} where its"
+                f"MuJoCo {mujoco.__version__}: {struct_name}.{name} reads {value!r} where its"
                 f" layout says, expected {expected!r}. Install a MuJoCo that this version of"
                 " codrl_mj was tested with (see pyproject.toml)"
             )
 
 
 def _is_shown(owner: Any, field: str) -> bool:
-    """Whether the bindings show a field of which there is something."""
+    """Return True if the bindings expose a field and it is not empty."""
     live = getattr(owner, field, None)
     return isinstance(live, int | float) or getattr(live, "size", 0) > 0
 
 
-class Fields(ModuleType):
-    """The fields of a structure, each a function of the structure's address for compiled code.
+class StructFields(ModuleType):
+    """Fields of a structure as functions of the structure's address, for compiled code.
 
-    That of an array is a typed pointer to its entries, any other its value. A module, because numba
-    looks up what these have while it compiles.
+    The function of an array returns a typed pointer to its entries, that of any other field its
+    value. The class is a module because numba resolves a module's attributes while it compiles.
     """
 
     def __init__(self, struct_name: str, within: str = "") -> None:
-        """Of `mjModel` or `mjData`; `within` ends with a dot where the fields are those of a part, such as `opt.`."""
+        """Name the structure, `mjModel` or `mjData`, and a part of it with a final dot (`opt.`)."""
         super().__init__(f"{struct_name}.{within}".rstrip("."))
         self._owner, self._within = struct_name, within
 
     def __getattr__(self, name: str) -> Any:
-        """The function of a field, made and compared when it is first named."""
+        """Return a field's function; create it and check the field on first access."""
         kind = STRUCTS[self._owner]
         for part in self._within.rstrip(".").split(".") if self._within else ():
-            kind = STRUCTS[next(one.type.name for one in kind.fields if one.name == part)]
-        node = next((one.type for one in kind.fields if one.name == name), None)
+            kind = STRUCTS[next(member.type.name for member in kind.fields if member.name == part)]
+        node = next((member.type for member in kind.fields if member.name == name), None)
         if node is None:
             raise AttributeError(name)
         path = f"{self._within}{name}"
         if isinstance(node, ast_nodes.ValueType) and node.name in STRUCTS:
-            made: Any = Fields(self._owner, f"{path}.")
+            attribute: Any = StructFields(self._owner, f"{path}.")
         else:
             check_field(self._owner, path)
-            made = _function(self._owner, path, node)
-        setattr(self, name, made)
-        return made
+            attribute = _function(self._owner, path, node)
+        setattr(self, name, attribute)
+        return attribute
 
 
 def _function(struct_name: str, path: str, node: Any) -> Any:
-    """What reads a field, compiled into whoever calls it."""
+    """Return an intrinsic that reads a field; it is inlined into its callers."""
     is_array = isinstance(node, ast_nodes.PointerType)
     element = from_ctypes(_SCALARS[node.inner_type.name if is_array else node.name])
-    kind, at = types.CPointer(element) if is_array else element, offset(struct_name, path)
+    kind, field_offset = types.CPointer(element) if is_array else element, offset(struct_name, path)
 
-    @emitted(lambda address: kind(types.uintp))  # noqa: ARG005 - one
+    @llvm_intrinsic(lambda address: kind(types.uintp))  # noqa: ARG005 - one
     def field(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001 - numba fixes them
-        place = builder.add(arguments[0], context.get_constant(types.uintp, at))
-        return builder.load(pointed(builder, place, context.get_value_type(kind)))
+        field_address = builder.add(arguments[0], context.get_constant(types.uintp, field_offset))
+        return builder.load(to_pointer(builder, field_address, context.get_value_type(kind)))
 
-    # numba has to know it at once: it may be compiling what names it
+    # Without a refresh, numba would not find the intrinsic in the function that it is compiling.
     cpu_target.typing_context.refresh()
     return field
 
 
-MODEL, DATA = Fields("mjModel"), Fields("mjData")
-"""The structures that a simulation is known by."""
+MODEL, DATA = StructFields("mjModel"), StructFields("mjData")
+"""Fields of `mjModel` and `mjData`."""
 
 
 def addresses(data: mujoco.MjData) -> tuple[int, int]:
-    """The addresses of an `MjData`'s model and of itself, by which compiled code knows them."""
+    """Return the addresses of an `MjData`'s model and of the `MjData`, for compiled code."""
     return data.model._address, data._address
 
 
-def address_of(owner: Any, name: str) -> int:
-    """Of a field of an `MjModel` or `MjData`, which may be dotted (`opt.timestep`): of an array that of its entries."""
+def field_address(owner: Any, name: str) -> int:
+    """Return the address of a field of an `MjModel` or `MjData`, or of an array's entries.
+
+    The field's name may be dotted (`opt.timestep`).
+    """
     live = functools.reduce(getattr, name.split("."), owner)
     if isinstance(live, np.ndarray):
         return live.ctypes.data
@@ -238,7 +254,7 @@ def address_of(owner: Any, name: str) -> int:
 
 @functools.cache
 def engine_function(name: str) -> Any:
-    """A function of MuJoCo's of (model, data), such as `mj_step`, by their addresses, for compiled code."""
+    """Return MuJoCo's function of (model, data), such as `mj_step`, for compiled code."""
     return external(
         f"codrl_mj_{name}", getattr(library(), name), types.void(types.uintp, types.uintp)
     )

@@ -1,4 +1,4 @@
-"""Reads and writes raw memory in functions that numba compiles: integer addresses become typed pointers."""
+"""Raw memory access in functions that numba compiles: integer addresses become typed pointers."""
 
 # ruff: noqa: ARG001, ARG005 - numba fixes the arguments
 
@@ -23,45 +23,48 @@ internal = functools.partial(
     no_cpython_wrapper=True,
     no_cfunc_wrapper=True,
 )
-"""`numba.njit` for what only compiled code calls: the ways in from Python, left out, take their time to compile.
+"""`numba.njit` for functions that only compiled code calls.
 
-Inlined, because numba hands over each number of a tuple by itself: to call with a drive's
-parameters costs 31 copies.
+They have no entry points for Python, which take time to compile. They are inlined because numba
+passes each entry of a tuple as an argument: a call with a drive's parameters would copy 31 numbers.
 """
 
 
-def emitted(signature: Callable[..., Any]) -> Callable[[Any], Any]:
-    """Make a numba intrinsic of what it emits: (context, builder, signature, arguments) -> LLVM value.
+def llvm_intrinsic(signature: Callable[..., Any]) -> Callable[[Any], Any]:
+    """Decorate a code generator (context, builder, signature, arguments) as a numba intrinsic.
 
-    `signature` is a function of the types of its arguments.
+    Args:
+        signature: a function of the argument types that returns numba's signature.
     """
 
-    def made(emit: Any) -> Any:
-        def typed(typing_context: Any, *given: Any) -> Any:
-            return signature(*given), emit
+    def decorate(generate: Any) -> Any:
+        def typed(typing_context: Any, *argument_types: Any) -> Any:
+            return signature(*argument_types), generate
 
-        named, own = (
+        # numba binds an intrinsic's arguments by the names in its signature, the typing context
+        # first.
+        kind, rest = (
             inspect.Parameter.POSITIONAL_OR_KEYWORD,
             inspect.signature(signature).parameters.values(),
         )
-        typed.__signature__ = inspect.Signature([inspect.Parameter("context", named), *own])  # type: ignore[attr-defined]
-        typed.__name__, typed.__doc__ = emit.__name__, emit.__doc__
+        typed.__signature__ = inspect.Signature([inspect.Parameter("context", kind), *rest])  # type: ignore[attr-defined]
+        typed.__name__, typed.__doc__ = generate.__name__, generate.__doc__
         return intrinsic(typed)
 
-    return made
+    return decorate
 
 
-def pointed(builder: Any, address: Any, kind: Any) -> Any:
-    """An integer as a pointer to an LLVM type."""
+def to_pointer(builder: Any, address: Any, kind: Any) -> Any:
+    """Convert an integer to a pointer to an LLVM type."""
     return builder.inttoptr(address, ir.PointerType(kind))
 
 
 def _pointer(element: Any) -> Any:
-    """An intrinsic that turns an integer address into a typed pointer."""
+    """Return an intrinsic that turns an integer address into a typed pointer."""
 
-    @emitted(lambda address: types.CPointer(element)(types.uintp))
+    @llvm_intrinsic(lambda address: types.CPointer(element)(types.uintp))
     def pointer(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return pointed(builder, arguments[0], context.get_data_type(element))
+        return to_pointer(builder, arguments[0], context.get_data_type(element))
 
     return pointer
 
@@ -71,49 +74,55 @@ f64, f32, i32, i64, u8, u64 = map(
 )
 
 
-def symbol(name: str, address: int) -> Any:
-    """An intrinsic for an address of this process, which compiled code knows by a name."""
+def named_address(name: str, address: int) -> Any:
+    """Return an intrinsic for an address of this process, which compiled code refers to by a name.
+
+    Compiled code that is cached on disk then stays valid in processes with other addresses.
+    """
     name = linked(name, address)
 
-    @emitted(lambda: types.uintp())
-    def at_symbol(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        known = builder.module.globals.get(name)
-        place = known or ir.GlobalVariable(builder.module, ir.IntType(8), name)
-        place.linkage = "external"
-        return builder.ptrtoint(place, context.get_value_type(types.uintp))
+    @llvm_intrinsic(lambda: types.uintp())
+    def address_of_symbol(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        declared = builder.module.globals.get(name)
+        variable = declared or ir.GlobalVariable(builder.module, ir.IntType(8), name)
+        variable.linkage = "external"
+        return builder.ptrtoint(variable, context.get_value_type(types.uintp))
 
-    return at_symbol
+    return address_of_symbol
 
 
-@emitted(lambda function, *given: types.float64(types.uintp, types.Tuple(given)))
+@llvm_intrinsic(lambda function, *arguments: types.float64(types.uintp, types.Tuple(arguments)))
 def call(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """Call a compiled C function by its address, with arguments of just its types; it returns a float64."""
-    kinds = [context.get_value_type(kind) for kind in signature.args[1]]
-    function = pointed(
-        builder, arguments[0], ir.FunctionType(context.get_value_type(types.float64), kinds)
+    """Call a C function at an address with arguments of exactly its types; it returns a float64."""
+    argument_types = [context.get_value_type(kind) for kind in signature.args[1]]
+    function = to_pointer(
+        builder,
+        arguments[0],
+        ir.FunctionType(context.get_value_type(types.float64), argument_types),
     )
     return builder.call(
-        function, [builder.extract_value(arguments[1], at) for at in range(len(kinds))]
+        function,
+        [builder.extract_value(arguments[1], index) for index in range(len(argument_types))],
     )
 
 
-@emitted(lambda pointer, entry: types.uintp(pointer, types.int64))
-def at(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """Address of an entry of what a typed pointer points to."""
+@llvm_intrinsic(lambda pointer, entry: types.uintp(pointer, types.int64))
+def entry_address(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """Return the address of an entry of the array behind a typed pointer."""
     return builder.ptrtoint(
         builder.gep(arguments[0], [arguments[1]]), context.get_value_type(types.uintp)
     )
 
 
-@emitted(lambda count: types.CPointer(types.float64)(types.int64))
-def on_stack(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """Typed pointer to so many float64 of no value, which end with the function that calls this."""
+@llvm_intrinsic(lambda count: types.CPointer(types.float64)(types.int64))
+def stack_floats(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """Return a pointer to uninitialized float64 on the stack, valid until the caller returns."""
     return builder.alloca(context.get_value_type(types.float64), size=arguments[0])
 
 
-@emitted(lambda target, source, count: types.void(types.uintp, types.uintp, types.int64))
+@llvm_intrinsic(lambda target, source, count: types.void(types.uintp, types.uintp, types.int64))
 def copy_bytes(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """Copy so many bytes from address `source` to address `target`."""
+    """Copy `count` bytes from address `source` to address `target`."""
     kind = ir.IntType(8).as_pointer()
     function = builder.module.declare_intrinsic("llvm.memcpy", [kind, kind, ir.IntType(64)])
     to, start = (builder.inttoptr(address, kind) for address in arguments[:2])
@@ -121,77 +130,79 @@ def copy_bytes(context: Any, builder: Any, signature: Any, arguments: Any) -> An
     return context.get_dummy_value()
 
 
-@emitted(lambda address, number: types.int64(types.uintp, types.int64))
-def count_on(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """Add a number to the int64 at an address, in one piece among threads; returns what was there before."""
+@llvm_intrinsic(lambda address, number: types.int64(types.uintp, types.int64))
+def atomic_add(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """Add a number to the int64 at an address atomically; return its previous value."""
     return builder.atomic_rmw(
-        "add", pointed(builder, arguments[0], ir.IntType(64)), arguments[1], "seq_cst"
+        "add", to_pointer(builder, arguments[0], ir.IntType(64)), arguments[1], "seq_cst"
     )
 
 
-@emitted(lambda address: types.int64(types.uintp))
-def look(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """The int64 at an address, as other threads have left it."""
-    return builder.load_atomic(pointed(builder, arguments[0], ir.IntType(64)), "seq_cst", 8)
+@llvm_intrinsic(lambda address: types.int64(types.uintp))
+def atomic_load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """Load the int64 at an address atomically, so that other threads' changes are seen."""
+    return builder.load_atomic(to_pointer(builder, arguments[0], ir.IntType(64)), "seq_cst", 8)
 
 
-@emitted(lambda address, kind: tuple_of(kind.instance_class)(types.uintp, kind))
+@llvm_intrinsic(lambda address, kind: named_tuple_type(kind.instance_class)(types.uintp, kind))
 def read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """The named tuple of class `kind` whose entries are the float64 numbers from an address on."""
-    made = signature.return_type
-    pointer = pointed(builder, arguments[0], context.get_value_type(types.float64))
-    places = (
-        builder.gep(pointer, [context.get_constant(types.intp, at)]) for at in range(len(made))
+    """Read a named tuple of class `kind` from consecutive float64 numbers at an address."""
+    tuple_type = signature.return_type
+    pointer = to_pointer(builder, arguments[0], context.get_value_type(types.float64))
+    entries = (
+        builder.gep(pointer, [context.get_constant(types.intp, index)])
+        for index in range(len(tuple_type))
     )
-    return context.make_tuple(builder, made, [builder.load(place) for place in places])
+    return context.make_tuple(builder, tuple_type, [builder.load(entry) for entry in entries])
 
 
 @internal
-def row_as(vector: Any, kind: Any) -> Any:
-    """An array of float64 as the named tuple of a class that it begins with."""
+def read_row(vector: Any, kind: Any) -> Any:
+    """Read a named tuple of class `kind` from the first entries of a float64 array."""
     return read(vector.ctypes.data, kind)
 
 
-def tuple_of(kind: type) -> Any:
-    """Numba's type of a named tuple of float64."""
+def named_tuple_type(kind: type) -> Any:
+    """Return numba's type of a named tuple of float64."""
     return types.BaseTuple.from_types((types.float64,) * len(kind._fields), kind)  # type: ignore[attr-defined]
 
 
 @functools.cache
 def entries_type(size: int) -> Any:
-    """A named tuple of so many entries, to `read` a row of an array with."""
-    return namedtuple("Entries", [f"entry{at}" for at in range(size)])
+    """Return a named tuple class of `size` entries, to `read` a row of an array."""
+    return namedtuple("Entries", [f"entry{index}" for index in range(size)])
 
 
-@emitted(lambda values: types.UniTuple(types.float64, len(values))(values))
-def floats(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """A tuple of numbers, of whatever types, as float64."""
+@llvm_intrinsic(lambda values: types.UniTuple(types.float64, len(values))(values))
+def to_floats(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """Convert a tuple of numbers of any types to float64."""
     return context.make_tuple(
         builder, signature.return_type, _as_floats(context, builder, signature, arguments)
     )
 
 
-@emitted(lambda values, address: types.void(values, types.uintp))
+@llvm_intrinsic(lambda values, address: types.void(values, types.uintp))
 def write(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """Write a tuple of numbers as float64 from an address on."""
-    pointer = pointed(builder, arguments[1], context.get_value_type(types.float64))
-    for at, value in enumerate(_as_floats(context, builder, signature, arguments)):
-        builder.store(value, builder.gep(pointer, [context.get_constant(types.intp, at)]))
+    """Write a tuple of numbers as consecutive float64 at an address."""
+    pointer = to_pointer(builder, arguments[1], context.get_value_type(types.float64))
+    for index, value in enumerate(_as_floats(context, builder, signature, arguments)):
+        builder.store(value, builder.gep(pointer, [context.get_constant(types.intp, index)]))
     return context.get_dummy_value()
 
 
 def _as_floats(context: Any, builder: Any, signature: Any, arguments: Any) -> list[Any]:
-    """The entries of the first argument, a tuple of numbers."""
+    """Convert the entries of the first argument, a tuple of numbers, to float64."""
     return [
-        context.cast(builder, builder.extract_value(arguments[0], at), kind, types.float64)
-        for at, kind in enumerate(signature.args[0])
+        context.cast(builder, builder.extract_value(arguments[0], index), kind, types.float64)
+        for index, kind in enumerate(signature.args[0])
     ]
 
 
-def callback(function: Any, returned: Any = None, *more: Any) -> Any:
-    """What MuJoCo's setters take for a compiled function of (mjModel, mjData) and `more`; it keeps that alive."""
-    made: Any = ctypes.CFUNCTYPE(returned, ctypes.c_void_p, ctypes.c_void_p, *more)(
+def callback(function: Any, return_type: Any = None, *argument_types: Any) -> Any:
+    """Wrap a compiled function of (mjModel, mjData, ...) as MuJoCo's setters take it."""
+    # The wrapper holds the function, whose machine code would be freed with it.
+    wrapper: Any = ctypes.CFUNCTYPE(return_type, ctypes.c_void_p, ctypes.c_void_p, *argument_types)(
         function.address
     )
-    made.owner = function
-    return made
+    wrapper.owner = function
+    return wrapper

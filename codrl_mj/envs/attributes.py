@@ -19,7 +19,7 @@ from codrl_mj.envs.setup import ResolvedEnv
 from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.variation import Variation, field_of, write_fields
 from codrl_mj.tasks import Task
-from codrl_mj.tasks.attributes import Attribute, Fixed, Follows, ModelNumber, Setting
+from codrl_mj.tasks.attributes import Attribute, Fixed, Derived, ModelNumber, Setting
 
 
 def shared(attribute: Attribute) -> bool:
@@ -32,7 +32,7 @@ def read(name: str, setup: ResolvedEnv, model: Any) -> Any:
     attribute = setup.task.attributes[name]
     if isinstance(attribute, Fixed):
         return attribute.value
-    if isinstance(attribute, Follows):
+    if isinstance(attribute, Derived):
         return attribute.of(*(read(each, setup, model) for each in attribute.names))
     if isinstance(attribute, Setting):
         value = getattr(
@@ -56,7 +56,7 @@ def written(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEn
     try:  # the messages are the remedy, or what the value must be
         if isinstance(attribute, Fixed):
             raise AttributeError(attribute.remedy)
-        if isinstance(attribute, Follows):
+        if isinstance(attribute, Derived):
             raise AttributeError(f"write {' and '.join(attribute.names)} first")
         if attribute is Setting.INTEGRATOR:
             known = " or ".join(f"integrator={name!r}" for name in setup.task.integrators)
@@ -101,12 +101,12 @@ def _place(attribute: ModelNumber, model: Any) -> np.ndarray:
 
 def _gymnasiums(physics: Any) -> Any:
     """The Gymnasium environment that a physics without a MuJoCo model drives."""
-    if not isinstance(physics, AnalyticPhysics) or not hasattr(physics.twin, "env"):
+    if not isinstance(physics, AnalyticPhysics) or not hasattr(physics.reference_env, "env"):
         raise AttributeError(
             f"{type(physics).__name__} has no MuJoCo model or data, and no environment of"
             " Gymnasium's, whose number it is; use physics='mujoco'"
         )
-    return physics.twin.env
+    return physics.reference_env.env
 
 
 def _number(value: Any, positive: bool) -> float:
@@ -130,7 +130,7 @@ def _write_number(
         setattr(env := _gymnasiums(model), name, number)
         for other, follows in setup.task.attributes.items():
             if (
-                isinstance(follows, Follows) and name in follows.names
+                isinstance(follows, Derived) and name in follows.names
             ):  # attributes of their own in Gymnasium
                 setattr(env, other, read(other, setup, model))
         return

@@ -34,7 +34,7 @@ from numba import types
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
-from codrl_mj.engine.memory import f32, f64, floats, i64, internal, on_stack
+from codrl_mj.engine.memory import f32, f64, to_floats, i64, internal, stack_floats
 from codrl_mj.envs.setup import FIRST_OPTION, NEEDS_KEY, ResolvedEnv
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
 from codrl_mj.physics.rows import Lane, Rows, load, store
@@ -165,7 +165,7 @@ def _kernels(
         read(state, where)
         observe(state, observation)
         if sensors > 0:
-            seen = numba.carray(on_stack(len(row) * sensors), (len(row), sensors))
+            seen = numba.carray(stack_floats(len(row) * sensors), (len(row), sensors))
             observed(row, seen, where)
             first = len(observation) - seen.size
             for motor in range(len(row)):
@@ -174,7 +174,7 @@ def _kernels(
 
     @compiled
     def step(force: Any, where: int) -> tuple[float, bool, bool]:
-        before, after = numba.carray(on_stack(size), size), numba.carray(on_stack(size), size)
+        before, after = numba.carray(stack_floats(size), size), numba.carray(stack_floats(size), size)
         read(before, where)
         fine = advance(force, where)
         trace = simulation_at(where)[4]
@@ -192,7 +192,7 @@ def _kernels(
         draws, state = np.empty(len(low)), np.empty(size)
         for entry in range(len(low)):
             draws[entry] = low[entry] + (high[entry] - low[entry]) * generator.random()
-        entries = floats(initial_entries(draws))
+        entries = to_floats(initial_entries(draws))
         for entry in range(size):
             state[entry] = entries[entry]
         key = (

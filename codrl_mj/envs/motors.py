@@ -12,9 +12,9 @@ from gymnasium import spaces
 from codrl_mj.actuators import ActuatorModel, Command, Family, Inputs, parameters_type
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import OFF, Disturbances
-from codrl_mj.engine.families import HEAD, signals_at
-from codrl_mj.engine.reading import Readout, bring_to_rest, sharing, slots
-from codrl_mj.engine.specs import matched_by, names_of
+from codrl_mj.engine.families import USER_HEADER_SIZE, signals_offset
+from codrl_mj.engine.reading import Readout, bring_to_rest, actuators_sharing_motor, motor_slots
+from codrl_mj.engine.specs import match_pattern, matchable_names
 from codrl_mj.envs.commands import ControlCommands, command_of
 from codrl_mj.envs.distributions import paths_of
 from codrl_mj.envs.randomization import (
@@ -79,17 +79,17 @@ class ActuatorBank:
         self.readout = Readout(model)
         self.present = dict(self.readout.motors)
         """Those of the present episode, by the index of the actuator in the model."""
-        names, forced = names_of(model), settings.action == "force"
+        names, forced = matchable_names(model), settings.action == "force"
         meant = {
             index: one
             for pattern, one in settings.commands.items()
-            for index in matched_by(pattern, names)
+            for index in match_pattern(pattern, names)
         }
         nominal = {
             index: meant[index].actuator if index in meant else one
             for index, one in self.present.items()
         }
-        self._slots = list(slots(data, self.present).values())
+        self._slots = list(motor_slots(data, self.present).values())
         self._warnings = data.warning.number[_POSITION:]  # live
         asked = {index: None if forced else meant.get(index) for index in self.present}
         self._commands = ControlCommands(data, actions, asked, settings.disturbances, step_duration)
@@ -124,7 +124,7 @@ class ActuatorBank:
         """Exchange the motors for others of their families; to be followed by a reset."""
         for index, one in zip(self.present, actuators, strict=True):
             numbers = (one.arm_radius, *one.numbers)
-            self.data.model.actuator_user[index, HEAD : HEAD + len(numbers)] = numbers
+            self.data.model.actuator_user[index, USER_HEADER_SIZE : USER_HEADER_SIZE + len(numbers)] = numbers
             self.present[index] = one
         self._parameters = list(map(_parameters, actuators))
 
@@ -154,7 +154,7 @@ class ActuatorBank:
         ):
             if motor.OBSERVED:
                 family: Family = type(motor)
-                start, count = signals_at(family), len(family.Signals._fields)
+                start, count = signals_offset(family), len(family.Signals._fields)
                 signals = family.Signals(*slot[start : start + count].tolist())
                 inputs = Inputs(0.0, 0.0, 0.0, self.data.time, float(slot[1]))
                 values += motor.observe(parameters, self.data.model.opt.timestep, signals, inputs)
@@ -194,11 +194,11 @@ class ActuatorBank:
 
 def motor_names(model: mujoco.MjModel, motors: Iterable[int]) -> tuple[str, ...]:
     """What motors are called: as their actuators, or else as what these drive; or else by their indices."""
-    every = [own[0] if own else "" for own in names_of(model)]
+    every = [own[0] if own else "" for own in matchable_names(model)]
     own = [
         name if name and every.count(name) == 1 else str(index) for index, name in enumerate(every)
     ]
-    return tuple(" & ".join(own[each] for each in sharing(model, index)) for index in motors)
+    return tuple(" & ".join(own[each] for each in actuators_sharing_motor(model, index)) for index in motors)
 
 
 def sensor_names(motors: Mapping[str, Family]) -> tuple[str, ...]:

@@ -22,8 +22,8 @@ from codrl_mj.actuators import (
     from_array,
     parameter_paths,
 )
-from codrl_mj.engine.reading import check_shafts, sharing
-from codrl_mj.engine.specs import matched_by, names_of
+from codrl_mj.engine.reading import check_shafts, actuators_sharing_motor
+from codrl_mj.engine.specs import match_pattern, matchable_names
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
 from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable, write_fields
@@ -371,15 +371,15 @@ def _matched(
         list(motors.values()),
         variable(model) if distributions else (),
     )
-    names, rubbing = names_of(model), [mounts_of(model, index)[2] is not None for index in motors]
-    called = [[name for one in sharing(model, index) for name in names[one]] for index in indices]
+    names, rubbing = matchable_names(model), [mounts_of(model, index)[2] is not None for index in motors]
+    called = [[name for one in actuators_sharing_motor(model, index) for name in names[one]] for index in indices]
     matched: dict[str, list[int]] = {}
     for path, distribution in distributions.items():
         pattern, field = split_path(path)
         try:
             every = list(range(len(indices)))
             own = (
-                [] if field.startswith(MODEL) else matched_by(pattern, called) if pattern else every
+                [] if field.startswith(MODEL) else match_pattern(pattern, called) if pattern else every
             )
             _check_known(field, [simulated[at] for at in own], varied, whose)
             if any(

@@ -50,7 +50,7 @@ class ResolvedEnv:
         made = cls(
             config,
             task,
-            task.steps_within(config.actuators[0], config.inner_steps, config.timestep),
+            task.num_inner_steps(config.actuators[0], config.inner_steps, config.timestep),
         )
         made._check()
         return made

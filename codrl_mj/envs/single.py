@@ -145,7 +145,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     @property
     def speeds(self) -> np.ndarray:
         """Velocities of the joints that the motors drive [m/s or rad/s], shape (motors,)."""
-        return self.physics.state[list(self.task.speeds)]
+        return self.physics.state[list(self.task.speed_indices)]
 
     @property
     def trace(self) -> np.ndarray:
@@ -194,7 +194,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         """
         super().reset(seed=seed)
         generator, setup = self.np_random, self.setup
-        initial = setup.task.initial(generator, options)
+        initial = setup.task.draw_initial_state(generator, options)
         self._draws.draw_one(generator)
         self.physics.reset(
             initial, float(setup.keys(lambda count: generator.random((1, count)))[0])

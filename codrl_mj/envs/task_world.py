@@ -140,17 +140,17 @@ class TaskEnvSource(EnvSource):
 
     def _by_pattern(self, patterns: Mapping[str, Any]) -> dict[str, Any]:
         """Motor -> what a pattern of the motors' names gives it, as a motor with several."""
-        from codrl_mj.engine.specs import matched_by, parts_of  # which imports numba
+        from codrl_mj.engine.specs import match_pattern, split_pattern  # which imports numba
 
         names, found = [[motor] for motor in self.task.motors], {}
         for pattern, given in patterns.items():
             check_pattern(pattern)
-            if len(parts_of(pattern)) > 1:
+            if len(split_pattern(pattern)) > 1:
                 raise ValueError(
                     f"{pattern!r}: {self.task.name} has a motor at each of its joints: give each"
                     " its own"
                 )
-            for index in matched_by(pattern, names):
+            for index in match_pattern(pattern, names):
                 motor = names[index][0]
                 if motor in found:
                     raise ValueError(f"{motor}: {pattern!r} and another pattern match it")
@@ -234,7 +234,7 @@ class TaskEnvSource(EnvSource):
         )
         driven = [
             self.task.state_names[self.task.qpos[self.task.qvel.index(at)]]
-            for at in self.task.speeds
+            for at in self.task.speed_indices
         ]
         at_joint = ["N*m" if name.endswith("[rad]") else "N" for name in driven]
         forced = config.action == "force"

@@ -181,21 +181,21 @@ class EnvSource(abc.ABC):
 
     def overlaid(self, config: Any, patterns: Mapping[str, Any]) -> dict[str, Any]:
         """Pattern -> what drives these motors: `patterns`, and what a configuration has for others, motor by motor."""
-        from codrl_mj.engine.reading import sharing
-        from codrl_mj.engine.specs import matched_by, names_of
+        from codrl_mj.engine.reading import actuators_sharing_motor
+        from codrl_mj.engine.specs import match_pattern, matchable_names
 
         if all(one == IDEAL for one in config.actuators):
             return dict(patterns)
         with contextlib.closing(config.make()) as env:
             model = env.unwrapped.model
-            names = names_of(model)
-        taken = {index for pattern in patterns for index in matched_by(pattern, names)}
+            names = matchable_names(model)
+        taken = {index for pattern in patterns for index in match_pattern(pattern, names)}
         left = {
             " & ".join(
-                re.escape(names[one][0]) for one in sharing(model, index) if one not in taken
+                re.escape(names[one][0]) for one in actuators_sharing_motor(model, index) if one not in taken
             ): actuator
             for pattern, actuator in config.driven.items()
-            for index in matched_by(pattern, names)
+            for index in match_pattern(pattern, names)
             if index not in taken
         }
         return {**left, **patterns}

@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.engine.specs import add_motors, matched_by, names_of, resolve_patterns
+from codrl_mj.engine.specs import add_motors, match_pattern, matchable_names, resolve_patterns
 from codrl_mj.tasks import TASKS
 
 
@@ -61,19 +61,19 @@ class Building:
         Raises:
             ValueError: see `codrl_mj.add_motors`.
         """
-        names = names_of(plain)
+        names = matchable_names(plain)
         self._met[repr(names)] = (
             names  # once each, though some build their model anew at every reset
         )
         wanted = {
             pattern: actuator
             for pattern, actuator in self.actuators.items()
-            if matched_by(pattern, names, needed=False)
+            if match_pattern(pattern, names, needed=False)
         }
         if not wanted:
             return plain
         for pattern, actuator in wanted.items() if self._action == "force" else ():
-            plainly = plain.actuator_biastype[matched_by(pattern, names)] == int(
+            plainly = plain.actuator_biastype[match_pattern(pattern, names)] == int(
                 mujoco.mjtBias.mjBIAS_NONE
             )
             if actuator.MOTION and actuator.commands() and plainly.any():
@@ -108,7 +108,7 @@ class Building:
                 " inside, or put motors into its MjSpec with codrl_mj.add_motors"
             )
         for pattern in self.actuators:
-            matched_by(pattern, [own for names in self._met.values() for own in names])
+            match_pattern(pattern, [own for names in self._met.values() for own in names])
 
 
 @contextlib.contextmanager

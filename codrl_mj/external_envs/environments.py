@@ -15,7 +15,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.disturbances import OFF, resolve
-from codrl_mj.engine.reading import bring_to_rest, motors, slots
+from codrl_mj.engine.reading import bring_to_rest, motors, motor_slots
 from codrl_mj.engine.specs import resolve_patterns
 from codrl_mj.envs.motors import ActuatorBank, MotorSettings, longer
 from codrl_mj.envs.recording import SubstepRecorder
@@ -158,7 +158,7 @@ def _with_motors(kind: Any) -> Any:
 
         @functools.cached_property
         def _motors(self) -> list[np.ndarray]:
-            return list(slots(self.data, motors(self.model)).values())
+            return list(motor_slots(self.data, motors(self.model)).values())
 
         def set_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
             for slot in self._motors:

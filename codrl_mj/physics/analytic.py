@@ -28,14 +28,14 @@ class AnalyticPhysics(Physics):
                         " physics='mujoco'"
                     )
         task = plant.task
-        if task.twin is None:
+        if task.reference_env is None:
             raise ValueError(
                 f"physics = 'analytic': {task.name} rebuilds no environment of Gymnasium's; use"
                 " 'mujoco'"
             )
         super().__init__(plant)
         self.timestep = plant.timestep
-        self.twin = task.twin()
+        self.reference_env = task.reference_env()
         self._actuators: list[tuple[float, Any]] = []
         self.set_actuators(plant.actuators)
         self.reset(np.zeros(len(task.state_names)))
@@ -59,7 +59,7 @@ class AnalyticPhysics(Physics):
     def step(self, desired_force: Any) -> None:
         """See `Physics.step`."""
         desired = np.atleast_2d(np.asarray(desired_force, dtype=np.float64))
-        several, speeds = len(self._actuators) > 1, list(self.plant.task.speeds)
+        several, speeds = len(self._actuators) > 1, list(self.plant.task.speed_indices)
         for rows in self.trace:
             commands, loads = (each[0] for each in self._disturber.disturbed(desired))
             for number, (row, command) in enumerate(zip(rows, commands.tolist(), strict=True)):
@@ -67,7 +67,7 @@ class AnalyticPhysics(Physics):
             force: Any = rows[:, 1] if several else float(rows[0, 1])
             if self._disturber.on:
                 force = force + (loads if several else float(loads[0]))
-            self.state = self.twin(self.state, force, self.timestep, self.plant.integrator)
+            self.state = self.reference_env(self.state, force, self.timestep, self.plant.integrator)
             self.time += self.timestep
             rows[:, -1] = self.state[speeds]
         self.check_finite()
@@ -75,7 +75,7 @@ class AnalyticPhysics(Physics):
     def _advance(self, number: int, command: float) -> tuple[float, ...]:
         """Advance an actuator by one integration step: the force that it delivers, and its signals."""
         arm, parameters = self._actuators[number]
-        at = self.plant.task.speeds[number]
+        at = self.plant.task.speed_indices[number]
         position, speed = self.state[
             [self.plant.task.qpos[self.plant.task.qvel.index(at)], at]
         ].tolist()

@@ -110,7 +110,7 @@ class SimulationConfig:
     def held(self, states: np.ndarray) -> np.ndarray:
         """Return the desired forces that hold states (m, s) there, shape (m, n): 0 unless commands are positions."""
         task = self.task
-        positions = states[:, [task.qpos[task.qvel.index(speed)] for speed in task.speeds]]
+        positions = states[:, [task.qpos[task.qvel.index(speed)] for speed in task.speed_indices]]
         return np.where(self.holds != 0.0, self.holds * positions, 0.0)
 
 

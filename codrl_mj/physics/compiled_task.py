@@ -15,7 +15,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
-from codrl_mj.engine.memory import entries_type, floats, internal, row_as, tuple_of
+from codrl_mj.engine.memory import entries_type, to_floats, internal, read_row, named_tuple_type
 from codrl_mj.physics.base import LARGEST
 from codrl_mj.tasks import Task
 
@@ -52,7 +52,7 @@ def compiled_constrain(
         return None
     fill, entries = compiled_reader(positions, velocities), entries_type(len(names))
     bounded = compiled_function(
-        constrain, names, "Task.state_names", tuple_of(entries), types.float64
+        constrain, names, "Task.state_names", named_tuple_type(entries), types.float64
     )
 
     @njit(nogil=True, error_model="numpy")
@@ -60,7 +60,7 @@ def compiled_constrain(
         fill(qpos, qvel, state)
         if not is_fine(state):
             state[:] = np.nan
-        kept = floats(bounded(row_as(state, entries), timestep))
+        kept = to_floats(bounded(read_row(state, entries), timestep))
         for entry in range(len(positions)):
             qpos[entry] = kept[positions[entry]]
         for entry in range(len(velocities)):
@@ -112,16 +112,16 @@ def _compiled(
 ) -> Outcomes:
     compiled = njit(nogil=True, error_model="numpy")
     options_count, entries = len(options_type._fields), entries_type(size)
-    state, force = tuple_of(entries), types.float64[::1] if several else types.float64
+    state, force = named_tuple_type(entries), types.float64[::1] if several else types.float64
     observation_of = compiled_function(observation, names, "Task.observation_names", state)
     reward_of = compiled_function(
-        reward, "", "Task.reward", state, force, state, tuple_of(options_type)
+        reward, "", "Task.reward", state, force, state, named_tuple_type(options_type)
     )
     terminated_at = compiled_function(terminated, "", "Task.terminated", state)
 
     @compiled
     def observe(state: np.ndarray, observation: np.ndarray) -> None:
-        seen = floats(observation_of(row_as(state, entries)))
+        seen = to_floats(observation_of(read_row(state, entries)))
         for entry in range(len(seen)):
             observation[entry] = seen[entry]
 
@@ -129,11 +129,11 @@ def _compiled(
     def rewarded(before: np.ndarray, force: Any, after: np.ndarray, options: np.ndarray) -> float:
         options_given = options_type(*to_fixed_tuple(options, options_count))
         return float(
-            reward_of(row_as(before, entries), force, row_as(after, entries), options_given)
+            reward_of(read_row(before, entries), force, read_row(after, entries), options_given)
         )
 
     @compiled
     def ended(state: np.ndarray) -> bool:
-        return bool(terminated_at(row_as(state, entries)))
+        return bool(terminated_at(read_row(state, entries)))
 
     return Outcomes(observe, rewarded, ended)

@@ -18,7 +18,7 @@ from codrl_mj.disturbances import (
     rate_limited,
     whole_and_fraction,
 )
-from codrl_mj.engine.memory import internal, row_as
+from codrl_mj.engine.memory import internal, read_row
 
 for _function in (delayed, quantised, rate_limited, philox, unit):
     register_jitable(_function)
@@ -158,5 +158,5 @@ def _disturb_each(
     loads: np.ndarray,
 ) -> None:
     for row in range(len(memory)):
-        own = row_as(numbers[row % len(numbers)], Numbers)
+        own = read_row(numbers[row % len(numbers)], Numbers)
         commands[row], loads[row] = disturb(own, memory[row], forces[row])

@@ -5,7 +5,7 @@ import mujoco
 from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel, Ideal, JointAdditions
 from codrl_mj.engine import HILL_NAMES
-from codrl_mj.engine.families import SIGNATURE, slot_size, user_head
+from codrl_mj.engine.families import SIGNATURE, slot_size, user_header
 from codrl_mj.engine.reading import motors
 from codrl_mj.physics.base import SimulationConfig
 from codrl_mj.tasks.base import INTEGRATORS
@@ -27,7 +27,7 @@ def drive(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float 
     target.gaintype = mujoco.mjtGain.mjGAIN_FIXED
     target.gainprm = [float(ideal)] + [0.0] * (mujoco.mjNGAIN - 1)
     target.biastype = mujoco.mjtBias.mjBIAS_NONE if ideal else mujoco.mjtBias.mjBIAS_USER
-    target.userdata = [] if ideal else [*user_head(family), *actuator.numbers]
+    target.userdata = [] if ideal else [*user_header(family), *actuator.numbers]
 
 
 def hills(model: mujoco.MjModel) -> list[int]:

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.engine.families import HEAD
+from codrl_mj.engine.families import USER_HEADER_SIZE
 from codrl_mj.physics.base import LARGEST, SimulationConfig, SimulationDivergedError
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.physics.mjcf import flags_with_friction
@@ -120,7 +120,7 @@ class MujocoBatchPhysics:
         )
         for at, (one, limit) in enumerate(zip(self._wiring, self.plant.max_forces, strict=True)):
             index, arm = int(one.actuator), arms[:, at]
-            user[rows, index, HEAD : HEAD + numbers.shape[2]] = numbers[:, at]
+            user[rows, index, USER_HEADER_SIZE : USER_HEADER_SIZE + numbers.shape[2]] = numbers[:, at]
             gear[rows, self.model.actuator_outadr[index], 0] = 1.0 / arm
             limits[rows, int(one.ctrl)] = np.stack([-limit * arm, limit * arm], axis=-1)
         self._arms[rows] = arms

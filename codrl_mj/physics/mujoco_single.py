@@ -8,7 +8,7 @@ import numpy as np
 
 from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel
-from codrl_mj.engine.families import HEAD
+from codrl_mj.engine.families import USER_HEADER_SIZE
 from codrl_mj.physics.base import Physics, SimulationConfig
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
 from codrl_mj.physics.stepping import Wiring, compiled_stepping, places_of
@@ -111,7 +111,7 @@ class MujocoPhysics(Physics):
             return
         for row, (one, limit) in enumerate(zip(actuators, self.plant.max_forces, strict=True)):
             index, arm, numbers = int(self.wiring[row].actuator), one.arm_radius, one.numbers
-            self.model.actuator_user[index, HEAD : HEAD + len(numbers)] = numbers
+            self.model.actuator_user[index, USER_HEADER_SIZE : USER_HEADER_SIZE + len(numbers)] = numbers
             self.model.actuator_gear[self.model.actuator_outadr[index], 0] = 1.0 / arm
             self.model.actuator_ctrlrange[int(self.wiring[row].ctrl)] = -limit * arm, limit * arm
             self.settings[row, ARM] = arm

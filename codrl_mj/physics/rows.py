@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.compile_cache import njit
-from codrl_mj.engine.layout import address_of, addresses, engine_function
+from codrl_mj.engine.layout import field_address, addresses, engine_function
 from codrl_mj.engine.memory import copy_bytes, f64, internal
 from codrl_mj.physics.mujoco_single import ARM, MujocoPhysics
 from codrl_mj.physics.sharing import apart
@@ -72,11 +72,11 @@ def part(model: mujoco.MjModel, name: str) -> slice:
 def lane(physics: MujocoPhysics, data: mujoco.MjData, fields: Mapping[str, np.ndarray]) -> Lane:
     """The lane of other data, with a model of its own, for simulations like this one; the rows have these fields."""
     rows = [
-        (address_of(data.model, name), values.ctypes.data, values.strides[0], values[0].nbytes)
+        (field_address(data.model, name), values.ctypes.data, values.strides[0], values[0].nbytes)
         for name, values in fields.items()
     ]
     parts = [(name, part(data.model, name)) for name in _MOVING]
-    live = [(address_of(data, name), one.start, one.stop - one.start) for name, one in parts]
+    live = [(field_address(data, name), one.start, one.stop - one.start) for name, one in parts]
     settings, trace = apart(physics.settings), apart(physics.trace)
     model, live_data = addresses(data)
     own = {"settings": settings.ctypes.data, "trace": trace.ctypes.data}

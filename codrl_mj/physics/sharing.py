@@ -18,7 +18,7 @@ import numpy as np
 from numba import types
 
 from codrl_mj.compile_cache import external, njit
-from codrl_mj.engine.memory import count_on, internal, look
+from codrl_mj.engine.memory import atomic_add, internal, atomic_load
 from codrl_mj.physics.compiled_task import Compiled
 
 _WORTH_WAKING = 64
@@ -61,13 +61,13 @@ def new_board() -> np.ndarray:
 @internal
 def _counted(board: np.ndarray, entry: int, more: int) -> int:
     """Count so many more; returns what was counted before."""
-    return count_on(board[entry:].ctypes.data, more)
+    return atomic_add(board[entry:].ctypes.data, more)
 
 
 @internal
 def _seen(board: np.ndarray, entry: int) -> int:
     """What is counted at present."""
-    return look(board[entry:].ctypes.data)
+    return atomic_load(board[entry:].ctypes.data)
 
 
 @internal

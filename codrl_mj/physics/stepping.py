@@ -18,15 +18,15 @@ from numba.extending import overload
 from codrl_mj.actuators import Family
 from codrl_mj.compile_cache import njit
 from codrl_mj.disturbances import OFF
-from codrl_mj.engine.doors import user_of
-from codrl_mj.engine.families import HEAD, Slot, compiled_observe, load_family, signals_at
+from codrl_mj.engine.model_access import user_address
+from codrl_mj.engine.families import USER_HEADER_SIZE, SlotHeader, compiled_observe, load_family, signals_offset
 from codrl_mj.engine.layout import DATA, MODEL, addresses, engine_function
-from codrl_mj.engine.memory import f64, i64, internal, on_stack, row_as
+from codrl_mj.engine.memory import f64, i64, internal, stack_floats, read_row
 from codrl_mj.physics.base import SimulationConfig
 from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_fine
 from codrl_mj.physics.disturber import KEY_COLUMN, Numbers, disturb
 
-TORQUE, NOISE_KEY = Slot._fields.index("torque"), Slot._fields.index("noise_key")
+TORQUE, NOISE_KEY = SlotHeader._fields.index("torque"), SlotHeader._fields.index("noise_key")
 
 
 class Wiring(NamedTuple):
@@ -145,7 +145,7 @@ def _stepping(
 ) -> Stepping:
     engine_step, engine_reset = engine_function("mj_step"), engine_function("mj_resetData")
     size, moving = len(positions) + len(velocities), len(positions)
-    first, count = signals_at(family), len(family.Signals._fields)
+    first, count = signals_offset(family), len(family.Signals._fields)
     observe = compiled_observe(family) if family.OBSERVED else None
 
     @njit(nogil=True, error_model="numpy")
@@ -153,13 +153,13 @@ def _stepping(
         model, data, settings, memory, trace = simulation_at(where)
         timestep = MODEL.opt.timestep(model)
         qpos, qvel, ctrl, act = DATA.qpos(data), DATA.qvel(data), DATA.ctrl(data), DATA.act(data)
-        state = numba.carray(on_stack(size), size)
+        state = numba.carray(stack_floats(size), size)
         for inner in range(len(trace)):
             for actuator in range(len(settings)):
-                wiring = row_as(settings[actuator], Wiring)
+                wiring = read_row(settings[actuator], Wiring)
                 command = force_of(force, actuator)
                 if disturbed:
-                    numbers = row_as(settings[actuator, WIRING:], Numbers)
+                    numbers = read_row(settings[actuator, WIRING:], Numbers)
                     command, DATA.qfrc_applied(data)[int(wiring.dof)] = disturb(
                         numbers, memory[actuator], command
                     )
@@ -175,7 +175,7 @@ def _stepping(
             if keep is not None:
                 keep(qpos, qvel, state, timestep)
             for actuator in range(len(settings)):
-                wiring = row_as(settings[actuator], Wiring)
+                wiring = read_row(settings[actuator], Wiring)
                 row = trace[inner, actuator]
                 if motors_added:
                     own = int(wiring.act)
@@ -199,12 +199,12 @@ def _stepping(
             qvel[entry] = state[velocities[entry]]
         for actuator in range(len(settings)):
             if motors_added:
-                DATA.act(data)[int(row_as(settings[actuator], Wiring).act) + NOISE_KEY] = (
+                DATA.act(data)[int(read_row(settings[actuator], Wiring).act) + NOISE_KEY] = (
                     key + actuator
                 )
             if disturbed:
-                hold = row_as(settings[actuator, WIRING:], Numbers).hold
-                position = qpos[int(row_as(settings[actuator], Wiring).qpos)]
+                hold = read_row(settings[actuator, WIRING:], Numbers).hold
+                position = qpos[int(read_row(settings[actuator], Wiring).qpos)]
                 memory[actuator] = 0.0
                 memory[actuator, : memory.shape[1] + KEY_COLUMN] = (
                     hold * position if hold != 0.0 else 0.0
@@ -221,9 +221,9 @@ def _stepping(
         model, data, settings, _, _ = simulation_at(where)
         if observe is not None:
             for actuator in range(len(settings)):
-                wiring = row_as(settings[actuator], Wiring)
+                wiring = read_row(settings[actuator], Wiring)
                 observe(
-                    user_of(model, int(wiring.actuator)) + 8 * HEAD,
+                    user_address(model, int(wiring.actuator)) + 8 * USER_HEADER_SIZE,
                     row[actuator, 2:].ctypes.data,
                     MODEL.opt.timestep(model),
                     DATA.time(data),

@@ -1,10 +1,10 @@
-r"""Settings for rl-zoo3's own command line, one YAML file and one module of the same name for each algorithm.
+r"""Settings for rl-zoo3's command line: a YAML file and a module for each algorithm.
 
     python -m rl_zoo3.train --algo ppo --env codrl_mj/CartPole-v0 --gym-packages codrl_mj \
         --conf-file codrl_mj.rl_zoo3.ppo
 
-rl-zoo3 takes either as its `--conf-file`: a path to the YAML file, or the module, which is found
-wherever the package is installed. docs/other_agents.md has the rest.
+The `--conf-file` of rl-zoo3 is a path to the YAML file, or the name of the module, which is found
+wherever the package is installed. See docs/other_agents.md for details.
 """
 
 from importlib.resources import files
@@ -12,7 +12,7 @@ from typing import Any
 
 
 def read(algorithm: str) -> dict[str, dict[str, Any]]:
-    """The settings of an algorithm, such as `ppo`: environment id -> hyperparameter -> value."""
+    """Return an algorithm's settings: environment id -> hyperparameter -> value."""
     import yaml
 
     settings: dict[str, dict[str, Any]] = yaml.safe_load(

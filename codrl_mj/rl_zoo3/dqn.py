@@ -1,4 +1,4 @@
-"""The settings of DQN in dqn.yml, as rl-zoo3 takes them from a module."""
+"""Settings of DQN from dqn.yml, in the form of a configuration module of rl-zoo3."""
 
 from codrl_mj.rl_zoo3 import read
 

@@ -1,4 +1,4 @@
-"""The settings of TD3 in td3.yml, as rl-zoo3 takes them from a module."""
+"""Settings of TD3 from td3.yml, in the form of a configuration module of rl-zoo3."""
 
 from codrl_mj.rl_zoo3 import read
 

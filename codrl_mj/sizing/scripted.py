@@ -52,7 +52,7 @@ def pumping(task: Task) -> Law:
     generator = np.random.default_rng(0)
 
     def law(states: np.ndarray) -> np.ndarray:
-        kick, speed = generator.choice([-1.0, 1.0], len(states)), states[:, task.speeds[0]]
+        kick, speed = generator.choice([-1.0, 1.0], len(states)), states[:, task.speed_indices[0]]
         return np.inf * np.where(np.abs(speed) > 1e-6, speed, kick)
 
     return law

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from codrl_mj.fields import Checked, choice
 from codrl_mj.training import TrainingStoppedError
-from codrl_mj.training.run import stopping
+from codrl_mj.training.run import collecting_signals
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +67,7 @@ def compute(
     none: list[int] = []
     with (
         _backend(workers) as backend,
-        stopping(signal.SIGINT) if local else contextlib.nullcontext(none) as asked,
+        collecting_signals(signal.SIGINT) if local else contextlib.nullcontext(none) as asked,
     ):
         parallel = joblib.Parallel(
             n_jobs=workers.jobs,

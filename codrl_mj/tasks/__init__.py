@@ -1,4 +1,4 @@
-"""The tasks: the only definition of their observations, rewards, ends and resets."""
+"""Tasks: the only definition of their observations, rewards, terminations and resets."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,53 +13,54 @@ from codrl_mj.tasks import (
     pendulum,
 )
 from codrl_mj.tasks.base import Task
+from codrl_mj.tasks.reference_env import ReferenceEnv
 from codrl_mj.tasks.registration import TASKS, find_task, reference_of, register
-from codrl_mj.tasks.twin import ReferenceEnv
 
-OURS = tuple(
-    register(each.TASK)
-    for each in (pendulum, cartpole, acrobot, mountain_car, mountain_car_continuous)
+PAPER_TASKS = tuple(
+    register(module.TASK)
+    for module in (pendulum, cartpole, acrobot, mountain_car, mountain_car_continuous)
 )
-"""The tasks that rebuild Gymnasium's, and have the paper's actuators."""
+"""Tasks that rebuild those of Gymnasium and have the paper's actuators."""
 register(furuta.TASK)
 
 
-def resolve_actuators(given: Any, task: Task) -> tuple[Any, ...]:
-    """Turn whatever a user may write for a task's actuator into one for each of its motors.
+def resolve_actuators(actuator: Any, task: Task) -> tuple[Any, ...]:
+    """Return an actuator for each of a task's motors.
 
     Args:
-        given: what `codrl_mj.actuators.resolve` takes, or the name `default`, which is the task's
-            own actuator; for all motors, or a list of these, one for each.
-        task: the task, whose own actuators the names vary.
+        actuator: an argument of `codrl_mj.actuators.resolve`, or the name `default` for the task's
+            default actuator. A list has an entry for each motor; anything else holds for all.
+        task: the task; names such as `weak` are variations of its paper actuators.
 
     Raises:
-        ValueError: unknown name or field, a value out of bounds, or not one for each motor, or of
-            several families.
+        ValueError: unknown name or field, a value out of bounds, a list of another length than
+            `task.motors`, or actuators of several families.
     """
     count = len(task.motors)
-    each = list(given) if isinstance(given, list | tuple) else [given] * count
-    if len(each) != count:
+    requests = list(actuator) if isinstance(actuator, list | tuple) else [actuator] * count
+    if len(requests) != count:
         hint = "; a list with one for each environment is for codrl_mj.make_vec" * (count == 1)
-        there = f"{task.name} has {count} motor{'s' * (count > 1)} ({', '.join(task.motors)})"
-        raise ValueError(f"actuator: got {len(each)} actuators, but {there}{hint}")
-    for at, one in enumerate(each):  # the task's own in the place of `default`
-        if isinstance(one, Mapping) and one.get("name") == "default":
-            each[at] = {**one, "name": task.default_actuator}
-        elif isinstance(one, str) and one == "default":
-            each[at] = task.default_actuator
+        motors = f"{task.name} has {count} motor{'s' * (count > 1)} ({', '.join(task.motors)})"
+        raise ValueError(f"actuator: got {len(requests)} actuators, but {motors}{hint}")
+    # `default` depends on the task, which `resolve` does not know.
+    for index, request in enumerate(requests):
+        if isinstance(request, Mapping) and request.get("name") == "default":
+            requests[index] = {**request, "name": task.default_actuator}
+        elif isinstance(request, str) and request == "default":
+            requests[index] = task.default_actuator
     papers = task.paper or (None,) * count
     actuators = tuple(
-        resolve(one, paper, task.name) for one, paper in zip(each, papers, strict=True)
+        resolve(request, paper, task.name) for request, paper in zip(requests, papers, strict=True)
     )
     check_same_family(actuators)
     return actuators
 
 
 def named_actuator(name: str, task: str) -> Any:
-    """The actuator called `name` on `task`; with several motors a tuple of them.
+    """Return the actuator of a name on a task; a tuple if the task has several motors.
 
     Args:
-        name: one of `codrl_mj.actuators.NAMED`, `default`, or a family's.
+        name: a name of `codrl_mj.actuators.NAMED`, `default`, or the name of a family.
         task: a task name, as on the command line.
 
     Raises:
@@ -70,7 +71,7 @@ def named_actuator(name: str, task: str) -> Any:
 
 
 __all__ = [
-    "OURS",
+    "PAPER_TASKS",
     "TASKS",
     "Task",
     "ReferenceEnv",

@@ -1,8 +1,8 @@
-"""Acrobot: swing the tip of a two-link chain above a line with a motor between the links. Gymnasium's Acrobot-v1.
+"""Acrobot: swing up a chain of two links by a motor between them. Gymnasium's Acrobot-v1.
 
 ## Description
 
-Two links (1 kg, 1 m each, centre of mass in the middle, 1 kg m^2 about it) hang from a fixed
+Two links (1 kg, 1 m each, center of mass in the middle, 1 kg m^2 about it) hang from a fixed
 shoulder under a gravity of 9.8 m/s^2. The actuator turns the elbow. These are Gymnasium's "book"
 dynamics, without its torque noise.
 
@@ -40,8 +40,8 @@ The tip is more than 1 m above the shoulder, which is success: -cos(angle 1) - c
 
 ## Arguments
 
-[Those of every environment](arguments.md). RK4 is Gymnasium's, ten steps with a motor the paper's
-choice.
+[The arguments of every environment](arguments.md). RK4 is Gymnasium's, ten steps with a motor the
+paper's choice.
 """
 
 import math
@@ -52,11 +52,11 @@ from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
-from codrl_mj.tasks.attributes import Fixed, ModelNumber, Setting, centre, mass
+from codrl_mj.tasks.attributes import Fixed, ModelNumber, Setting, center_of_mass, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import GymnasiumReferenceEnv, ReferenceStates, around
+from codrl_mj.tasks.reference_env import GymnasiumReferenceEnv, ReferenceStates, values_around
 
-# Gymnasium's Acrobot-v1
+# Constants of Gymnasium's Acrobot-v1.
 TORQUE = 1.0  # N*m
 MAX_SPEED_1 = 4 * math.pi  # rad/s
 MAX_SPEED_2 = 9 * math.pi  # rad/s
@@ -64,13 +64,13 @@ GOAL_HEIGHT = 1.0  # m above the shoulder
 
 
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The four entries lie in (-0.1, 0.1), or within the reset options' `low` and `high`."""
+    """Return -0.1 and 0.1 for all four entries, or the reset options' `low` and `high`."""
     low, high = utils.maybe_parse_reset_bounds(options, -0.1, 0.1)
     return np.full(4, low), np.full(4, high)
 
 
 def initial_state(draws: Entries) -> tuple[Any, ...]:
-    """The draws rounded to float32, as Gymnasium has them."""
+    """Return the draws rounded to float32, as Gymnasium does."""
     return _rounded(draws[0]), _rounded(draws[1]), _rounded(draws[2]), _rounded(draws[3])
 
 
@@ -86,14 +86,15 @@ def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
 
 
 def _wrapped(angle: Any) -> Any:
-    """The angle, turned back into [-pi, pi] by as many whole turns as it is beyond."""
+    """Return an angle, wrapped to [-pi, pi] by whole turns."""
+    # A modulo would round angles that are within the range already, and Gymnasium does not.
     turn = 2 * math.pi
     angle = angle - turn * np.maximum(np.ceil((angle - math.pi) / turn), 0.0)
     return angle + turn * np.maximum(np.ceil((-math.pi - angle) / turn), 0.0)
 
 
 def observation(state: Entries) -> tuple[Any, ...]:
-    """Cosines and sines of the angles, and the speeds."""
+    """Return the cosines and sines of the angles, and the speeds."""
     return (
         np.cos(state[0]),
         np.sin(state[0]),
@@ -105,12 +106,12 @@ def observation(state: Entries) -> tuple[Any, ...]:
 
 
 def terminated(state: Entries) -> Any:
-    """The tip is above the goal line."""
+    """Return True if the tip is above the goal line."""
     return -np.cos(state[0]) - np.cos(state[1] + state[0]) > GOAL_HEIGHT
 
 
 def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
-    """-1 a step, 0 for the step that reaches the goal."""
+    """Return -1, or 0 for the step that reaches the goal."""
     return -1.0 + terminated(next_state)
 
 
@@ -118,29 +119,29 @@ _HIGH = np.array([1.0, 1.0, 1.0, 1.0, MAX_SPEED_1, MAX_SPEED_2], dtype=np.float3
 
 
 class ReferenceEnv(GymnasiumReferenceEnv):
-    """`AcrobotEnv`: the torques to choose from and the time step are attributes."""
+    """Gymnasium's `AcrobotEnv`, whose available torques and time step are attributes."""
 
     env_id = "Acrobot-v1"
-    _LARGEST = 400.0  # N*m*s^2
+    _MAX_IMPULSE = 400.0  # N*m*s^2
 
     def __call__(
         self, state: np.ndarray, force: float, timestep: float, integrator: str
     ) -> np.ndarray:
-        """One `step` with the torque as the only one to choose from."""
-        del integrator  # it has one only
-        if (
-            not abs(force) * timestep**2 < self._LARGEST
-        ):  # Gymnasium wraps angles turn by turn: it would not come back
+        """Take a `step` with the torque as the only one available."""
+        # The environment has only one integrator.
+        del integrator
+        # Gymnasium wraps angles turn by turn: after a huge step its loop would not end.
+        if not abs(force) * timestep**2 < self._MAX_IMPULSE:
             return np.full(4, np.nan)
         return self.after(state, 0, AVAIL_TORQUE=[force], dt=timestep)
 
     def derivative(self, state: np.ndarray, force: float) -> np.ndarray:
-        """The environment's own equations of motion."""
+        """Return the state's time derivative by the environment's equations of motion."""
         return np.array(self.env._dsdt([*state, force]))[: len(state)]
 
 
 _LINK = ("body_mass",)
-_CENTRE = ("body_ipos",)
+_CENTER = ("body_ipos",)
 
 
 TASK = Task(
@@ -150,7 +151,7 @@ TASK = Task(
     reward_threshold=-100.0,
     agent="dqn",
     gymnasium_id="Acrobot-v1",
-    twin=ReferenceEnv,
+    reference_env=ReferenceEnv,
     asset="acrobot.xml",
     step_duration=0.2,
     motor_inner_steps=10,
@@ -175,7 +176,7 @@ TASK = Task(
     terminated=terminated,
     constrain=constrain,
     goal=terminated,
-    # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
+    # The gains and the arm are from the paper, Experimental Results; R, L, kT, kE are the defaults.
     paper=(DCMotorActuator(Motor(), CurrentLoop(kp=1.0, ki=10.0, kd=1e-6)),),
     wrapped=(0, 1),
     attributes={
@@ -188,8 +189,8 @@ TASK = Task(
         "LINK_LENGTH_2": Fixed(1.0, "nothing but the picture depends on it, in Gymnasium too"),
         "LINK_MASS_1": mass("upper", only=_LINK),
         "LINK_MASS_2": mass("lower", only=_LINK),
-        "LINK_COM_POS_1": centre("upper", -1.0, only=_CENTRE),
-        "LINK_COM_POS_2": centre("lower", -1.0, only=_CENTRE),
+        "LINK_COM_POS_1": center_of_mass("upper", -1.0, only=_CENTER),
+        "LINK_COM_POS_2": center_of_mass("lower", -1.0, only=_CENTER),
         "LINK_MOI": ModelNumber(
             *("body_inertia", "upper", 1),
             varies=("model.mass.upper", "model.mass.lower"),
@@ -201,17 +202,18 @@ TASK = Task(
         "torque_noise_max": Fixed(0.0, "make an environment with disturbances"),
         "book_or_nips": Fixed("book", "the MuJoCo model has no such thing"),
     },
-    trials=ReferenceStates(
-        # at the task's limits, twice as fast, one RK4 step of Gymnasium amplifies rounding to 1e-12
+    reference_states=ReferenceStates(
+        # Speeds are half the task's limits, at which an RK4 step of Gymnasium amplifies rounding to
+        # 1e-12.
         bounds=(np.pi, np.pi, 2 * np.pi, 4 * np.pi),
-        # on the cut of the angles, and faster than the first link may turn after the step
+        # On the cut of the angles, and faster than the first link may turn after the step.
         edges=(
-            (*around(math.pi), 0.0),
-            (*around(math.pi), 0.0),
+            (*values_around(math.pi), 0.0),
+            (*values_around(math.pi), 0.0),
             (-4 * math.pi, -1.0, 4 * math.pi),
             (-6.0, 6.0),
         ),
-        # a large swing, angles within half a turn, speeds below 4 pi
+        # In this run angles stay within half a turn and speeds below 4 pi.
         start=(2.0, 0.5, 0.0, 0.0),
         steps=7,
         balanced_steps=5,

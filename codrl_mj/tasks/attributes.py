@@ -1,4 +1,4 @@
-"""Where the numbers live that a task's environments have as attributes, as Gymnasium's do: `env.unwrapped.gravity`."""
+"""Sources of the numbers that environments have as attributes: `env.unwrapped.gravity`."""
 
 import enum
 from collections.abc import Callable
@@ -10,63 +10,66 @@ COMPILED = (
 
 
 class ModelNumber(NamedTuple):
-    """A number of the MuJoCo model; it can be written, and takes effect at once."""
+    """Number of the MuJoCo model; a written value takes effect at once."""
 
     field: str
     """Field of the `mjModel`: `body_mass`, `jnt_user`; or of its options: `opt.gravity`."""
     owner: str = ""
-    """Name of the body, joint or whatever the field belongs to; empty for options."""
+    """Name of the body, joint or other element that the field belongs to; empty for options."""
     entry: int = 0
-    """Which of the owner's numbers."""
+    """Index into the owner's numbers."""
     scale: float = 1.0
-    """The attribute for a 1 in the model."""
+    """Ratio of the attribute to the model's number."""
     inverse: bool = False
-    """Whether the attribute is the number's inverse."""
+    """True if the attribute is the inverse of the number."""
     varies: tuple[str, ...] = ()
-    """What is multiplied as the number is, as `randomize` names it; then the number must be > 0."""
+    """Quantities that scale with the number, by their names in `randomize`; it must then be > 0."""
     only: tuple[str, ...] = ()
-    """The fields of the model to which that is limited; all if empty."""
+    """Fields of the model to which the scaling is limited; all if empty."""
 
 
 class Fixed(NamedTuple):
-    """A number that cannot be written."""
+    """Number that cannot be written."""
 
     value: Any
-    """What it is."""
+    """The number."""
     remedy: str = COMPILED
-    """What to do instead of writing it."""
+    """Instruction on what to do instead of writing the number."""
 
 
-class Follows(NamedTuple):
-    """A number that follows from others."""
+class Derived(NamedTuple):
+    """Number that is a function of other attributes."""
 
     names: tuple[str, ...]
-    """Names of these attributes."""
+    """Names of the other attributes."""
     of: Callable[..., float]
-    """(their values) -> its value."""
+    """Function (their values) -> the number."""
 
 
 class Setting(enum.Enum):
-    """What the environment was made with; what a field of the task says can be written."""
+    """Setting of the environment; one that is a field of the task can be written."""
 
     STEP = "step_duration"
     LARGEST_FORCE = "max_force"
-    """Written, it scales the forces of all actions."""
+    """A written value scales the forces of all actions."""
     FORCES = "forces"
     INTEGRATOR = "integrator"
 
 
-Attribute = ModelNumber | Fixed | Follows | Setting
+Attribute = ModelNumber | Fixed | Derived | Setting
 GRAVITY = ModelNumber("opt.gravity", entry=2, scale=-1.0)
 
 
 def mass(body: str, only: tuple[str, ...] = (), inverse: bool = False) -> ModelNumber:
-    """A body's mass [kg], and its inertia with it."""
+    """Return the attribute of a body's mass [kg], with which its inertia scales."""
     return ModelNumber(
         "body_mass", body, inverse=inverse, varies=(f"model.mass.{body}",), only=only
     )
 
 
-def centre(body: str, scale: float = 1.0, only: tuple[str, ...] = ()) -> ModelNumber:
-    """How far a body's centre of mass is from its joint [m], and all lengths along the body with it."""
+def center_of_mass(body: str, scale: float = 1.0, only: tuple[str, ...] = ()) -> ModelNumber:
+    """Return the attribute of the distance of a body's center of mass from its joint [m].
+
+    All lengths along the body scale with it.
+    """
     return ModelNumber("body_ipos", body, 2, scale, varies=(f"model.length.{body}",), only=only)

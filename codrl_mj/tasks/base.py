@@ -1,4 +1,4 @@
-"""What a task is: a model file, a few numbers, and pure functions of a state's entries."""
+"""Definition of a task: a model file, a few numbers, and pure functions of a state's entries."""
 
 import functools
 import math
@@ -16,18 +16,18 @@ from codrl_mj import fields
 from codrl_mj.actuators import ActuatorModel, DCMotorActuator, Ideal
 from codrl_mj.tasks.attributes import Attribute
 from codrl_mj.tasks.checks import check_fields, check_functions, check_layout
-from codrl_mj.tasks.twin import ReferenceEnv, ReferenceStates
+from codrl_mj.tasks.reference_env import ReferenceEnv, ReferenceStates
 from codrl_mj.user_code import asset_path
 
 
 class NoOptions(NamedTuple):
-    """The options of a task that has none."""
+    """Options of a task without options."""
 
 
 Options = Any
-"""A task's options: a `NamedTuple` of floats and flags whose fields have defaults."""
+"""Type of a task's options: a `NamedTuple` of floats and flags whose fields have defaults."""
 Entries = Any
-"""A sequence of numbers, or of arrays with one number for each of N states."""
+"""Type of a state's entries: a sequence of numbers, or of arrays with a number for each state."""
 INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
     "semi-implicit": mujoco.mjtIntegrator.mjINT_EULER,
@@ -35,125 +35,143 @@ INTEGRATORS = {
     "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
-"""Integrators by name, and what a model has to have for them; with `euler` positions are moved by the old velocity."""
+"""Name of an integrator -> the setting that it needs in a model.
+
+`euler` moves positions by the velocity before the step, `semi-implicit` by the velocity after it.
+"""
 
 
 @dataclass(frozen=True)
 class Task(fields.Checked):
-    """One task, defined once; every face (single, batched, analytic, dm_control) is built from it.
+    """Definition of a task, from which all its environments are built.
 
-    A function of a state takes the state's entries, in Gymnasium's own order: `state[0]`,
-    `state[1]` and so on, each a number, or an array with a number for each of N states (`states.T`
-    of states (N, n)). What is the same for all states may be returned as a single number. These
-    functions are plain Python that numba compiles as it stands (`codrl_mj.physics.compiled_task`);
-    every face runs the compiled form.
+    These are single, batched, analytic and dm_control environments. A function of a state takes the
+    state's entries in Gymnasium's order: `state[0]`, `state[1]` and so on, each a number, or an
+    array with a number for each of N states (`states.T` of states (N, n)). A result that is the
+    same for all states may be a single number. The functions are plain Python, which numba compiles
+    (`codrl_mj.physics.compiled_task`); all environments run the compiled functions.
 
     Raises:
-        ValueError: a field is out of bounds, or a function, called once on plain numbers, does not
-            return what others declare.
+        ValueError: a field is out of bounds, or a function, called once on plain numbers, returns
+            something else than other fields declare.
     """
 
     name: str
     """Name on the command line, such as `cartpole`."""
     env_id: str
-    """Its id in Gymnasium's registry, such as `codrl_mj/CartPole-v0`."""
+    """Id in Gymnasium's registry, such as `codrl_mj/CartPole-v0`."""
     max_episode_steps: int | None = field(metadata=fields.integer(None, least=1).metadata)
     """Time limit [environment steps]; None for none."""
     asset: str
-    """MJCF file: a name among ours, or a path."""
+    """MJCF file: the name of one in the package, or a path."""
     step_duration: float = field(metadata=fields.real(1.0, above=0.0, unit="s").metadata)
     """Duration of one environment step [s]."""
     motor_inner_steps: int = field(metadata=fields.integer(1, least=1).metadata)
     """Integration steps per environment step when a motor is in the loop."""
     max_force: Any
-    """Largest desired force [N] or torque [N*m] of any action; where the action is the force, it
-    saturates here. One for each motor, or one for all.
+    """Largest desired force [N] or torque [N*m] of any action. If the action is the force, it is
+    clipped to this. A number for all motors, or one for each.
     """
     integrators: tuple[str, ...]
     """Names of the integrators that can be chosen, keys of `INTEGRATORS`; the first is Gymnasium's.
-    The model's own has to be of that kind.
+    The integrator of the model file must be of the same kind.
     """
     state_names: tuple[str, ...]
     """Names of the state's entries, with units."""
     observation_names: tuple[str, ...]
     """Names of the observation's entries."""
     initial_bounds: Callable[[dict[str, Any] | None], tuple[np.ndarray, np.ndarray]]
-    """(reset options) -> lower and upper bounds, shape (k,) each, of the k numbers that Gymnasium draws at a reset."""
+    """Function (reset options) -> lower and upper bounds of the k numbers drawn at a reset.
+
+    Each has shape (k,). The numbers are those that Gymnasium draws.
+    """
     initial_state: Callable[[Entries], tuple[Any, ...]]
-    """(k numbers drawn uniformly within those bounds) -> entries of the initial state."""
+    """Function (k numbers drawn uniformly within the bounds) -> entries of the initial state."""
     observation: Callable[[Entries], tuple[Any, ...]]
-    """(state) -> entries of the observation, to be rounded to float32."""
+    """Function (state) -> entries of the observation, which are then rounded to float32."""
     reward: Callable[[Entries, Any, Entries, Options], Any]
-    """(state before, force delivered, state after, options) -> reward."""
+    """Function (state before, force delivered, state after, options) -> reward."""
     terminated: Callable[[Entries], Any]
-    """(state) -> whether the episode ends there."""
+    """Function (state) -> True if the episode terminates in it."""
     constrain: Callable[[Entries, float], tuple[Any, ...]] | None = None
-    """(state as integrated, integration step [s]) -> entries of the state within the bounds that
-    Gymnasium's `step` keeps: speed limits, walls, wrapped angles. Applied after every integration
-    step; None where there are no bounds. Must let NaN through.
+    """Function (integrated state, integration step [s]) -> entries of the state within its bounds.
+
+    The bounds are those of Gymnasium's `step`: speed limits, walls, wrapped angles. They are
+    applied after every integration step. The function must pass NaN on. None if there are no
+    bounds.
     """
     goal: Callable[[Entries], Any] | None = None
-    """(state) -> whether the task's goal is reached there. An episode succeeds if it ends at the
-    goal and has been there for `goal_hold`. None where the goal is to last: an episode then
-    succeeds if it is not terminated before the time limit.
+    """Function (state) -> True if the state is at the task's goal.
+
+    An episode succeeds if it ends at the goal and has been there for `goal_hold`. None if the goal
+    is to survive: an episode then succeeds if it is not terminated before the time limit.
     """
     goal_hold: float = fields.real(0.0, least=0.0, unit="s")
-    """How long an episode that succeeds has been at the goal when it ends [s]."""
+    """Time at the goal [s], up to its end, that an episode needs for success."""
 
     forces: tuple[Any, ...] | None = None
-    """Desired forces [N] or torques [N*m] of the discrete actions, in order, each a number, or with
-    several motors a tuple; None where the action is the force.
+    """Desired forces [N] or torques [N*m] of the discrete actions, in order; None if the action is
+    the force. Each is a number, or a tuple if there are several motors.
     """
     options: type[Any] = NoOptions
-    """The task's options: a `NamedTuple` class whose fields all have defaults."""
+    """Class of the task's options: a `NamedTuple` whose fields all have defaults."""
     qpos: tuple[int, ...] = ()
-    """Which state entries are MuJoCo's `qpos`, in order; an arithmetic progression, as is `qvel`.
-    The state's first half unless told otherwise.
+    """Indices of the state entries that are MuJoCo's `qpos`, in order; by default the state's first
+    half. They are evenly spaced, as are those of `qvel`.
     """
     qvel: tuple[int, ...] = ()
-    """Which state entries are MuJoCo's `qvel`, in order; the second half unless told otherwise."""
+    """Indices of the state entries that are MuJoCo's `qvel`; by default the second half."""
     action_space: spaces.Space[Any] = None  # type: ignore[assignment]
-    """The action space, Gymnasium's; unless told otherwise up to `max_force`, or which of `forces`.
-    A copy of another force keeps it, as Gymnasium's Pendulum does where `max_torque` is written;
-    with None it gets its own.
+    """Action space, as in Gymnasium; by default forces up to `max_force` or indices of `forces`.
+
+    A copy of the task with another `max_force` keeps the space, as Gymnasium's Pendulum does when
+    `max_torque` is written; a copy with None gets a new one.
     """
     observation_space: spaces.Box = None  # type: ignore[assignment]
-    """The observation space, Gymnasium's; without bounds unless told otherwise."""
+    """Observation space, as in Gymnasium; by default without bounds."""
     render_fps: int = fields.integer(0, least=0)
-    """Frames per second of a video with one frame a step: real time unless told otherwise, as Gymnasium does."""
+    """Frames per second of a video with one frame a step; by default real time, as in Gymnasium."""
     motors: tuple[str, ...] = ("motor",)
-    """Names of the MJCF model's actuators that the task drives, in the order of actions and forces.
-    With several of them, forces and signals are arrays (n,) wherever they are numbers otherwise.
+    """Names of the MJCF model's actuators that the task uses, in the order of actions and forces.
+    With several of them, forces and signals are arrays (n,) instead of numbers.
     """
     reward_threshold: float | None = fields.real(None)
     """Mean return at which the task counts as solved."""
     agent: str = "ppo"
-    """The agent that `codrl-mj train` takes unless told otherwise."""
+    """Default agent of `codrl-mj train`."""
     gymnasium_id: str | None = None
-    """Id of the environment that this task rebuilds, with the same spaces, starts, rewards and
-    ends; None if it is none of Gymnasium's.
+    """Id of the Gymnasium environment that this task rebuilds, with the same spaces, initial
+    states, rewards and terminations; None if there is none.
     """
-    twin: Callable[[], ReferenceEnv] | None = None
-    """Makes that environment, or the equations of motion in closed form, to be driven by any force:
-    the analytic physics, and the oracle of the certificate.
+    reference_env: Callable[[], ReferenceEnv] | None = None
+    """Function that creates the reference: that environment, or equations of motion in closed form.
+
+    It can be driven by any force. The analytic physics and the certificate use it.
     """
     ideal_inner_steps: int = fields.integer(1, least=1)
-    """Integration steps per environment step when the actuator is ideal: Gymnasium's."""
+    """Integration steps per environment step when the actuator is ideal, as in Gymnasium."""
     paper: tuple[DCMotorActuator, ...] = ()
-    """The paper's actuators, one for each motor, of which other named actuators are variations;
-    none where there are none.
+    """The paper's actuators, one for each motor; empty if there are none.
+
+    Other named actuators are variations of them.
     """
     actuator: str = "ideal"
-    """Name of its actuator where it has none of the paper's, such as a motor of the catalogue."""
+    """Name of the default actuator of a task without `paper`, such as a motor of the catalog."""
     wrapped: tuple[int, ...] = ()
-    """State entries that `constrain` wraps to [-pi, pi]: a rounding error at the cut is one, and not a whole turn."""
+    """Indices of the state entries that `constrain` wraps to [-pi, pi].
+
+    Comparisons use them, so that a rounding error at the cut does not count as a whole turn.
+    """
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
-    """Numbers that environments of the task have as attributes, by their names, and where they live."""
-    trials: ReferenceStates | None = None
-    """What the certificate tries the task in; without it, the checks that need states of the task's are left out."""
+    """Numbers that the task's environments have as attributes, by name, with their sources."""
+    reference_states: ReferenceStates | None = None
+    """States in which the certificate tries the task.
+
+    Without them, it omits the checks that need states.
+    """
 
     def __post_init__(self) -> None:
-        """Validate, and fill in what follows from the rest."""
+        """Validate the fields, and compute defaults that depend on other fields."""
         super().__post_init__()
         check_fields(self)
         fields.check_names(self.integrators, INTEGRATORS, "integrator", every=True)
@@ -179,12 +197,12 @@ class Task(fields.Checked):
 
     @property
     def default_actuator(self) -> str:
-        """The name of the actuator where none is asked for."""
+        """Name of the default actuator."""
         return "paper" if self.paper else self.actuator
 
     @property
     def oracle(self) -> str:
-        """What its `twin` is, in words."""
+        """Description of `reference_env`."""
         return f"Gymnasium {self.gymnasium_id}" if self.gymnasium_id else "the closed form"
 
     @property
@@ -194,13 +212,15 @@ class Task(fields.Checked):
             np.array(self.max_force, dtype=np.float64), (len(self.motors),)
         ).copy()
 
-    def steps_within(
+    def num_inner_steps(
         self, actuator: ActuatorModel, inner_steps: int | None, timestep: float | None
     ) -> int:
-        """Integration steps in an environment step: their number, by the step [s], or the default for an actuator.
+        """Return the number of integration steps in an environment step.
+
+        It is given as `inner_steps`, by the integration step [s], or by default for an actuator.
 
         Raises:
-            ValueError: both were given, the number is below 1, or the timestep does not divide the
+            ValueError: both are given, the number is below 1, or the timestep does not divide the
                 environment step.
         """
         if inner_steps is not None and timestep is not None:
@@ -212,14 +232,16 @@ class Task(fields.Checked):
                 isinstance(timestep, numbers.Real) and math.isfinite(timestep) and timestep > 0
             ):
                 raise ValueError(f"timestep = {timestep!r}: must be a finite number > 0 [s]")
-            count = round(self.step_duration / timestep)
-            if count < 1 or not math.isclose(count * timestep, self.step_duration, rel_tol=1e-9):
+            num_steps = round(self.step_duration / timestep)
+            if num_steps < 1 or not math.isclose(
+                num_steps * timestep, self.step_duration, rel_tol=1e-9
+            ):
                 raise ValueError(
                     f"timestep = {timestep:g} s does not divide {self.name}'s environment step of"
                     f" {self.step_duration:g} s: the ratio is {self.step_duration / timestep:.6g},"
                     " must be an integer >= 1"
                 )
-            return count
+            return num_steps
         if inner_steps is None:
             return self.ideal_inner_steps if isinstance(actuator, Ideal) else self.motor_inner_steps
         if (
@@ -231,7 +253,7 @@ class Task(fields.Checked):
         return int(inner_steps)
 
     def integrator(self, name: str | None) -> str:
-        """An integrator's name; Gymnasium's if none is given.
+        """Return an integrator's name; Gymnasium's integrator if None.
 
         Raises:
             ValueError: the task has no such integrator.
@@ -243,65 +265,77 @@ class Task(fields.Checked):
         return name or self.integrators[0]
 
     @functools.cached_property
-    def speeds(self) -> tuple[int, ...]:
-        """Which state entries are the velocities of the joints that the motors drive, in their order: by the model."""
+    def speed_indices(self) -> tuple[int, ...]:
+        """Indices of the state entries that are the velocities of the motors' joints, in order."""
+        # The MJCF model knows which joints the motors drive.
         model = mujoco.MjSpec.from_file(str(asset_path(self.asset))).compile()
         joints = [model.actuator_trnid[model.actuator(name).id, 0] for name in self.motors]
         return tuple(self.qvel[model.jnt_dofadr[joint]] for joint in joints)
 
     @property
     def observation_units(self) -> tuple[str | None, ...]:
-        """Units of the observation's entries: the state's, where an entry is one of its; 1, within +-1; else None."""
+        """Units of the observation's entries.
+
+        An entry that equals a state entry has its unit, and one within +-1 the unit 1; otherwise
+        the unit is unknown, None.
+        """
+        # An entry that equals a state entry for several random states is that state entry.
         states = np.random.default_rng(0).uniform(0.1, 1.0, (len(self.state_names), 5))
         units: list[str | None] = []
-        for entry, least, most in zip(
+        for entry, low, high in zip(
             self.observation(states),
             self.observation_space.low,
             self.observation_space.high,
             strict=True,
         ):
-            same = [k for k, one in enumerate(states) if np.array_equal(entry, one)]
-            plain = "1" if (least, most) == (-1.0, 1.0) else None
+            matches = [k for k, state in enumerate(states) if np.array_equal(entry, state)]
+            default = "1" if (low, high) == (-1.0, 1.0) else None
             units.append(
-                self.state_names[same[0]].partition("[")[2].rstrip("]") or None if same else plain
+                self.state_names[matches[0]].partition("[")[2].rstrip("]") or None
+                if matches
+                else default
             )
         return tuple(units)
 
     def bounds(self, options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
-        """`initial_bounds` under a reset's options.
+        """Return `initial_bounds` with a reset's options.
 
         Raises:
-            ValueError: the task asks for no option of such a name, or bounds are not finite or not
-                in order.
+            ValueError: the task does not read an option of this name, or the bounds are not finite
+                or not in order.
         """
-        asked = None if options is None else _Asked(options)
-        low, high = self.initial_bounds(asked)  # type: ignore[arg-type]
-        if asked is not None:
+        # Only the names that the task looks up tell which options it has.
+        recorded = None if options is None else _RecordingOptions(options)
+        low, high = self.initial_bounds(recorded)  # type: ignore[arg-type]
+        if recorded is not None:
             fields.check_names(
-                asked.data, sorted(map(str, asked.names)), "reset option", every=True
+                recorded.data, sorted(map(str, recorded.names)), "reset option", every=True
             )
             if not (np.isfinite([low, high]).all() and np.less_equal(low, high).all()):
                 raise ValueError(
-                    f"reset options = {options}: ask for {low} to {high}; must be finite, in order"
+                    f"reset options = {options}: give bounds {low} to {high}, must be finite and in"
+                    " order"
                 )
         return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
 
-    def initial(self, generator: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
-        """One initial state, shape (n,): the state that Gymnasium's environment draws from the same generator."""
+    def draw_initial_state(
+        self, generator: np.random.Generator, options: dict[str, Any] | None
+    ) -> np.ndarray:
+        """Draw an initial state, shape (n,), the same as Gymnasium's with the same generator."""
         low, high = self.bounds(options)
         state = np.array(self.initial_state(low + (high - low) * generator.random(len(low))))
         return state.reshape(len(self.state_names))
 
     def initial_states(self, draws: np.ndarray) -> np.ndarray:
-        """Initial states, shape (N, n), from numbers drawn within the bounds, (N, k)."""
+        """Return initial states, shape (N, n), for numbers drawn within the bounds, (N, k)."""
         states = np.empty((len(draws), len(self.state_names)))
         for column, entry in zip(states.T, self.initial_state(draws.T), strict=True):
             column[:] = entry
         return states
 
 
-class _Asked(UserDict[str, Any]):
-    """Reset options that remember which names they were asked for."""
+class _RecordingOptions(UserDict[str, Any]):
+    """Reset options that record the names that were looked up."""
 
     def __init__(self, options: Mapping[str, Any]) -> None:
         self.names: set[Any] = set()

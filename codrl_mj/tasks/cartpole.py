@@ -21,7 +21,7 @@ it on a hinge. There is no friction. The actuator pushes the cart.
 ## Reward
 
 1 a step, the last one included. With `center_radius` a step that ends farther than that from the
-centre earns 0, and the episode goes on. With `sutton_barto_reward` the step that ends the episode
+center earns 0, and the episode goes on. With `sutton_barto_reward` the step that ends the episode
 earns -1, and with `center_radius` so does one that ends farther out; all others earn 0.
 
 ## Start
@@ -31,12 +31,12 @@ bounds.
 
 ## End
 
-The cart is more than 2.4 m from the centre, or the pole leans by more than 12 degrees. Truncated
+The cart is more than 2.4 m from the center, or the pole leans by more than 12 degrees. Truncated
 after 500 steps (10 s), which is success.
 
 ## Arguments
 
-[Those of every environment](arguments.md), and two of its own: `center_radius` [m], > 0, no limit
+[The arguments of every environment](arguments.md), and two more: `center_radius` [m], > 0, no limit
 by default, 0.1 in the paper's training; and Gymnasium's `sutton_barto_reward`. `euler` is explicit,
 Gymnasium's default.
 """
@@ -50,11 +50,11 @@ from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
-from codrl_mj.tasks.attributes import GRAVITY, Fixed, Follows, Setting, centre, mass
+from codrl_mj.tasks.attributes import GRAVITY, Derived, Fixed, Setting, center_of_mass, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import GymnasiumReferenceEnv, ReferenceStates, around
+from codrl_mj.tasks.reference_env import GymnasiumReferenceEnv, ReferenceStates, values_around
 
-# Gymnasium's CartPole-v1
+# Constants of Gymnasium's CartPole-v1.
 FORCE = 10.0  # N
 X_LIMIT = 2.4  # m
 ANGLE_LIMIT = 12 * 2 * np.pi / 360  # rad
@@ -64,34 +64,37 @@ class Options(NamedTuple):
     """Options of CartPole."""
 
     center_radius: float = np.inf
-    """Distance from the centre [m] beyond which a step earns nothing; the paper uses 0.1."""
+    """Distance from the center [m] beyond which a step earns nothing; the paper uses 0.1."""
     sutton_barto_reward: bool = False
-    """Gymnasium's option: -1 for the step that ends the episode and 0 for all others, instead of 1 for every step."""
+    """Gymnasium's option: -1 for the terminating step and 0 for all others, instead of 1."""
 
 
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The four entries lie in (-0.05, 0.05), or within the reset options' `low` and `high`."""
+    """Return -0.05 and 0.05 for all four entries, or the reset options' `low` and `high`."""
     low, high = utils.maybe_parse_reset_bounds(options, -0.05, 0.05)
     return np.full(4, low), np.full(4, high)
 
 
 def initial_state(draws: Entries) -> tuple[Any, ...]:
-    """The draws themselves."""
+    """Return the draws as the state."""
     return draws[0], draws[1], draws[2], draws[3]
 
 
 def observation(state: Entries) -> tuple[Any, ...]:
-    """The state."""
+    """Return the state."""
     return state[0], state[1], state[2], state[3]
 
 
 def terminated(state: Entries) -> Any:
-    """The cart has left the track or the pole has fallen past 12 degrees."""
+    """Return True if the cart is off the track or the pole leans by more than 12 degrees."""
     return (np.abs(state[0]) > X_LIMIT) | (np.abs(state[2]) > ANGLE_LIMIT)
 
 
 def reward(state: Entries, force: Any, next_state: Entries, options: Options) -> Any:
-    """1 a step, 0 outside `center_radius`; or Sutton and Barto's 0, and -1 outside it or at the end."""
+    """Return 1, or 0 outside `center_radius`; with `sutton_barto_reward` 1 less.
+
+    The terminating step then has -1, too.
+    """
     outside = np.abs(next_state[0]) > options.center_radius
     if options.sutton_barto_reward:
         return 0.0 - (terminated(next_state) | outside)
@@ -102,14 +105,15 @@ _HIGH = np.array([X_LIMIT * 2, np.inf, ANGLE_LIMIT * 2, np.inf], dtype=np.float3
 
 
 class ReferenceEnv(GymnasiumReferenceEnv):
-    """`CartPoleEnv`: the force magnitude, the time step and the integrator are attributes."""
+    """Gymnasium's `CartPoleEnv`, whose force, time step and integrator are attributes."""
 
     env_id = "CartPole-v1"
 
     def __call__(
         self, state: np.ndarray, force: float, timestep: float, integrator: str
     ) -> np.ndarray:
-        """One `step` with `force_mag` set to the force; the end of an episode is the task's to judge."""
+        """Take a `step` with `force_mag` set to the force."""
+        # Gymnasium warns of steps after a termination, unless it is reset.
         settings = {
             "tau": timestep,
             "kinematics_integrator": integrator,
@@ -125,7 +129,7 @@ TASK = Task(
     reward_threshold=475.0,
     agent="ppo",
     gymnasium_id="CartPole-v1",
-    twin=ReferenceEnv,
+    reference_env=ReferenceEnv,
     asset="cartpole.xml",
     step_duration=0.02,
     motor_inner_steps=1,
@@ -143,31 +147,31 @@ TASK = Task(
     observation=observation,
     reward=reward,
     terminated=terminated,
-    # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
+    # The gains and the arm are from the paper, Experimental Results; R, L, kT, kE are the defaults.
     paper=(DCMotorActuator(Motor(arm_radius=0.15), CurrentLoop(kp=4.3, ki=1.0, kd=1e-6, kff=0.6)),),
     attributes={
         "gravity": GRAVITY,
         "masscart": mass("cart"),
         "masspole": mass("pole"),
-        "total_mass": Follows(("masscart", "masspole"), operator.add),
-        "length": centre("pole"),
-        "polemass_length": Follows(("masspole", "length"), operator.mul),
+        "total_mass": Derived(("masscart", "masspole"), operator.add),
+        "length": center_of_mass("pole"),
+        "polemass_length": Derived(("masspole", "length"), operator.mul),
         "force_mag": Setting.LARGEST_FORCE,
         "tau": Setting.STEP,
         "kinematics_integrator": Setting.INTEGRATOR,
         "theta_threshold_radians": Fixed(ANGLE_LIMIT),
         "x_threshold": Fixed(X_LIMIT),
     },
-    trials=ReferenceStates(
-        # beyond what an episode can reach: all angles, and speeds of a falling pole
+    reference_states=ReferenceStates(
+        # More than an episode can reach: all angles, and the speeds of a falling pole.
         bounds=(4.8, 10.0, np.pi, 10.0),
         edges=(
             (-4.8, -2.4, 0.0, 2.4, 4.8),
             (-10.0, 0.0, 10.0),
-            (*around(math.pi), 0.0, math.pi / 2, 0.2094),
+            (*values_around(math.pi), 0.0, math.pi / 2, 0.2094),
             (-10.0, 0.0, 10.0),
         ),
-        # the pole falls to about a right angle
+        # In this run the pole falls by about a right angle.
         start=(0.1, -0.2, 0.1, 0.3),
         steps=30,
         balanced_steps=10,

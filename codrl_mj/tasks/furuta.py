@@ -1,4 +1,4 @@
-"""Furuta: swing a rod up at the end of a turning arm and hold it there. The rotary pendulum of Quanser's QUBE-Servo 2.
+"""Furuta: swing a rod up on a turning arm and hold it. Quanser's QUBE-Servo 2 rotary pendulum.
 
 ## Description
 
@@ -43,10 +43,10 @@ succeeds if the rod is within 0.1 rad of upright over its last second.
 
 ## Arguments
 
-[Those of every environment](arguments.md). The supply is the motor's nominal 18 V; the bench's
-amplifier is made for 10 V: set `{"name": "default", "supply": {"voltage": 10.0}}`, and its delay by
-`disturbances={"command_delay": 0.004}`. `physics="analytic"` has the equations in closed form, for
-actuators without a rotor.
+[The arguments of every environment](arguments.md). The supply is the motor's nominal 18 V; the
+bench's amplifier is made for 10 V: set `{"name": "default", "supply": {"voltage": 10.0}}`, and its
+delay by `disturbances={"command_delay": 0.004}`. `physics="analytic"` has the equations in closed
+form, for actuators without a rotor.
 
 ## What to expect
 
@@ -89,9 +89,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
-from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, centre, mass
+from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, center_of_mass, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import ReferenceStates, around
+from codrl_mj.tasks.reference_env import ReferenceStates, values_around
 
 MAX_TORQUE = 0.084  # N*m: 2 A, the amplifier's peak current, times kT = 0.042 N*m/A
 ARM_LIMIT = 2.0  # rad
@@ -100,18 +100,18 @@ GOAL_HOLD = 1.0  # s
 
 
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The four entries lie within 0.05 of hanging at rest, or within the reset options' `low` and `high` of it."""
+    """Return -0.05 and 0.05 about hanging at rest, or the reset options' `low` and `high`."""
     low, high = utils.maybe_parse_reset_bounds(options, -0.05, 0.05)
     return np.full(4, low), np.full(4, high)
 
 
 def initial_state(draws: Entries) -> tuple[Any, ...]:
-    """The draws, the rod's angle from hanging."""
+    """Return the draws as the state; the rod's angle is drawn from hanging."""
     return draws[0], draws[1] + math.pi, draws[2], draws[3]
 
 
 def observation(state: Entries) -> tuple[Any, ...]:
-    """Cosines and sines of the angles, and the speeds."""
+    """Return the cosines and sines of the angles, and the speeds."""
     return (
         np.cos(state[0]),
         np.sin(state[0]),
@@ -123,23 +123,27 @@ def observation(state: Entries) -> tuple[Any, ...]:
 
 
 def terminated(state: Entries) -> Any:
-    """The arm is beyond its limit."""
+    """Return True if the arm is beyond its limit."""
     return np.abs(state[0]) > ARM_LIMIT
 
 
 def goal(state: Entries) -> Any:
-    """The rod is upright."""
+    """Return True if the rod is upright."""
     return np.cos(state[1]) > math.cos(GOAL_ANGLE)
 
 
 def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
-    """The rod's height, less a share for the arm's angle and for the torque."""
-    off, share = next_state[0] / ARM_LIMIT, force / MAX_TORQUE
-    return 0.5 * (1.0 + np.cos(next_state[1])) * (1.0 - 0.5 * (off * off) - 0.1 * (share * share))
+    """Return the rod's height, reduced by shares for the arm's angle and for the torque."""
+    deviation, share = next_state[0] / ARM_LIMIT, force / MAX_TORQUE
+    return (
+        0.5
+        * (1.0 + np.cos(next_state[1]))
+        * (1.0 - 0.5 * (deviation * deviation) - 0.1 * (share * share))
+    )
 
 
 class ReferenceEnv:
-    """The equations of motion in closed form, of numbers of its own: nothing is read from the MJCF.
+    """Equations of motion in closed form, with constants that are independent of the MJCF file.
 
     With the inertias J of arm and hub about the shaft, I of the rod about its hinge and Z along it,
     the Lagrangian is
@@ -158,7 +162,7 @@ class ReferenceEnv:
     DAMPING = (5e-6, 1e-6)  # N*m*s/rad
 
     def derivative(self, state: np.ndarray, force: float) -> np.ndarray:
-        """Time derivative of a state (4,) under a torque [N*m] on the arm, shape (4,)."""
+        """Return the time derivative, shape (4,), of a state under a torque [N*m] on the arm."""
         _, angle, arm_speed, rod_speed = state
         (arm_mass, arm), (rod_mass, rod) = self.ARM, self.ROD
         sine, cosine = np.sin(angle), np.cos(angle)
@@ -169,29 +173,31 @@ class ReferenceEnv:
         )
         matrix_12 = -coupling * cosine
         twisting = (across - along) * sine * cosine
-        of_arm = (
+        arm_torque = (
             force
             - (self.DAMPING[0] + 2 * twisting * rod_speed) * arm_speed
             - coupling * sine * rod_speed**2
         )
         weight = rod_mass * self.GRAVITY * rod / 2
-        of_rod = weight * sine - self.DAMPING[1] * rod_speed + twisting * arm_speed**2
+        rod_torque = weight * sine - self.DAMPING[1] * rod_speed + twisting * arm_speed**2
         determinant = matrix_11 * across - matrix_12**2
         return np.array(
             [
                 arm_speed,
                 rod_speed,
-                (across * of_arm - matrix_12 * of_rod) / determinant,
-                (matrix_11 * of_rod - matrix_12 * of_arm) / determinant,
+                (across * arm_torque - matrix_12 * rod_torque) / determinant,
+                (matrix_11 * rod_torque - matrix_12 * arm_torque) / determinant,
             ]
         )
 
     def __call__(
         self, state: np.ndarray, force: float, timestep: float, integrator: str
     ) -> np.ndarray:
-        """One step of the classical Runge-Kutta method."""
-        del integrator  # it has one only
-        with np.errstate(all="ignore"):  # whoever asked notices a state that is lost
+        """Take a step of the classical Runge-Kutta method."""
+        # The environment has only one integrator.
+        del integrator
+        # Callers check for a state that has diverged, so numpy need not warn of it.
+        with np.errstate(all="ignore"):
             first = self.derivative(state, force)
             second = self.derivative(state + timestep / 2 * first, force)
             third = self.derivative(state + timestep / 2 * second, force)
@@ -205,7 +211,7 @@ TASK = Task(
     name="furuta",
     env_id="codrl_mj/Furuta-v0",
     max_episode_steps=250,
-    twin=ReferenceEnv,
+    reference_env=ReferenceEnv,
     asset="furuta.xml",
     step_duration=0.02,
     motor_inner_steps=10,
@@ -229,19 +235,19 @@ TASK = Task(
         "arm_limit": Fixed(ARM_LIMIT),
         "gravity": GRAVITY,
         "arm_mass": mass("arm"),
-        "arm_length": centre("arm", 2.0),
+        "arm_length": center_of_mass("arm", 2.0),
         "rod_mass": mass("rod"),
-        "rod_length": centre("rod", 2.0),
+        "rod_length": center_of_mass("rod", 2.0),
     },
-    trials=ReferenceStates(
+    reference_states=ReferenceStates(
         bounds=(ARM_LIMIT, math.pi, 25.0, 35.0),
         edges=(
-            (*around(ARM_LIMIT), 0.0),
-            (*around(math.pi), 0.0),
+            (*values_around(ARM_LIMIT), 0.0),
+            (*values_around(math.pi), 0.0),
             (-25.0, 0.0, 25.0),
             (-35.0, 0.0, 35.0),
         ),
-        # the rod swings through below its hinge
+        # In this run the rod swings through below its hinge.
         start=(0.2, 2.0, 0.0, 0.0),
         steps=20,
         balanced_steps=4,

@@ -1,4 +1,4 @@
-"""MountainCar: rock a weak car out of a valley, pushing left, right or not at all. Gymnasium's MountainCar-v0.
+"""MountainCar: rock a weak car out of a valley by three forces. Gymnasium's MountainCar-v0.
 
 ## Description
 
@@ -32,8 +32,8 @@ At the end of a step x >= 0.5 m with v >= 0, which is success. Truncated after 2
 
 ## Arguments
 
-[Those of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. Semi-implicit Euler is
-Gymnasium's, twenty steps with a motor the paper's choice.
+[The arguments of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. Semi-implicit
+Euler is Gymnasium's, twenty steps with a motor the paper's choice.
 """
 
 from typing import Any
@@ -45,9 +45,14 @@ from gymnasium.envs.classic_control import utils
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.tasks.attributes import Attribute, Fixed, ModelNumber, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import GymnasiumReferenceEnv, ReferenceStates, around, gymnasium_env
+from codrl_mj.tasks.reference_env import (
+    GymnasiumReferenceEnv,
+    ReferenceStates,
+    make_gymnasium_env,
+    values_around,
+)
 
-# Gymnasium's MountainCar-v0 and, but for the goal, its MountainCarContinuous-v0
+# Constants of Gymnasium's MountainCar-v0 and, except for the goal, of MountainCarContinuous-v0.
 FORCE = 1.0  # N
 MIN_POSITION, MAX_POSITION = -1.2, 0.6  # m
 MAX_SPEED = 0.07  # m/s
@@ -55,18 +60,19 @@ GOAL = 0.5  # m
 
 
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The position lies in (-0.6, -0.4), or within the reset options' `low` and `high`."""
+    """Return -0.6 and -0.4 for the position, or the reset options' `low` and `high`."""
     low, high = utils.maybe_parse_reset_bounds(options, -0.6, -0.4)
     return np.array([low]), np.array([high])
 
 
 def initial_state(draws: Entries) -> tuple[Any, ...]:
-    """The position drawn, at rest."""
+    """Return the drawn position, at rest."""
     return draws[0], 0.0 * draws[0]
 
 
 def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
-    """Limit the speed, by which the car then moves; keep the position between the walls; stop at the left one."""
+    """Limit the speed and the position; stop the car at the left wall."""
+    # Gymnasium limits the speed before it moves the car, so the position is corrected.
     speed = np.minimum(np.maximum(state[1], -MAX_SPEED), MAX_SPEED)
     position = state[0] - (state[1] - speed) * timestep
     speed = speed - np.minimum(speed, 0.0) * (position <= MIN_POSITION)
@@ -74,17 +80,17 @@ def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
 
 
 def observation(state: Entries) -> tuple[Any, ...]:
-    """The state."""
+    """Return the state."""
     return state[0], state[1]
 
 
 def terminated(state: Entries) -> Any:
-    """The car is at the flag or beyond, and not rolling back."""
+    """Return True if the car is at the flag or beyond, and not rolling back."""
     return (state[0] >= GOAL) & (state[1] >= 0.0)
 
 
 def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
-    """-1 a step."""
+    """Return -1 for every step."""
     return -1.0
 
 
@@ -92,25 +98,31 @@ _LOW, _HIGH = np.array([[MIN_POSITION, -MAX_SPEED], [MAX_POSITION, MAX_SPEED]], 
 
 
 class ReferenceEnv(GymnasiumReferenceEnv):
-    """`MountainCarEnv`: its step has no duration, but force, gravity and speed limit are attributes.
+    """Gymnasium's `MountainCarEnv`, whose force, gravity and speed limit are attributes.
 
-    One step is v += force - gravity cos(3 x), x += v. With w = v dt for its v, and force and
-    gravity times dt^2, it is a step of any duration dt.
+    Its step has no duration: v += force - gravity cos(3 x), x += v. With v dt in place of v, and
+    with force and gravity multiplied by dt^2, it becomes a step of any duration dt.
     """
 
     env_id = "MountainCar-v0"
 
     def __init__(self, source: str = env_id, strength: str = "force") -> None:
-        """Make the Gymnasium environment, with the `strength` [m/s^2 per N] of the one that it stands for."""
+        """Create the Gymnasium environment.
+
+        Args:
+            source: id of the environment from which the strength is taken.
+            strength: its attribute that is the acceleration per force [m/s^2 per N].
+        """
         super().__init__()
         self._strength = strength
-        setattr(self.env, strength, getattr(gymnasium_env(source), strength))
+        setattr(self.env, strength, getattr(make_gymnasium_env(source), strength))
 
     def __call__(
         self, state: np.ndarray, force: float, timestep: float, integrator: str
     ) -> np.ndarray:
-        """One `step` to the right with `force` set to the force's effect, of either sign."""
-        del integrator  # it has one only
+        """Take a `step` to the right, with `force` set to the acceleration of either sign."""
+        # The environment has only one integrator.
+        del integrator
         position, change = self.after(
             (state[0], state[1] * timestep),
             2,
@@ -122,7 +134,7 @@ class ReferenceEnv(GymnasiumReferenceEnv):
 
 
 def attributes(goal: float, strength: str) -> dict[str, Attribute]:
-    """What both mountain cars have: `strength` [m/s^2 per N] is the inverse of the car's mass."""
+    """Return the attributes of both mountain cars; `strength` names that of 1/mass [1/kg]."""
     return {
         "min_position": Fixed(MIN_POSITION),
         "max_position": Fixed(MAX_POSITION),
@@ -140,7 +152,7 @@ TASK = Task(
     reward_threshold=-110.0,
     agent="sarsa",
     gymnasium_id="MountainCar-v0",
-    twin=ReferenceEnv,
+    reference_env=ReferenceEnv,
     asset="mountain_car.xml",
     step_duration=1.0,
     motor_inner_steps=20,
@@ -158,16 +170,16 @@ TASK = Task(
     terminated=terminated,
     constrain=constrain,
     goal=terminated,
-    # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
+    # The gains and the arm are from the paper, Experimental Results; R, L, kT, kE are the defaults.
     paper=(DCMotorActuator(Motor(), CurrentLoop(kp=1.0, ki=1.0, kd=1e-2)),),
     attributes={**attributes(GOAL, "force"), "gravity": ModelNumber("jnt_user", "slider", 2)},
-    trials=ReferenceStates(
+    reference_states=ReferenceStates(
         bounds=(1.2, MAX_SPEED),
         edges=(
             (-1.2, -1.2 + 1e-9, -1.19, -0.5, 0.0, 0.5, 0.59, 0.6),
-            (*around(MAX_SPEED), 1e-9, -1e-9, 0.0),
+            (*values_around(MAX_SPEED), 1e-9, -1e-9, 0.0),
         ),
-        # between the walls, below 0.07 m/s
+        # This run stays between the walls and below 0.07 m/s.
         start=(-0.5, 0.02),
         steps=12,
         balanced_steps=2,

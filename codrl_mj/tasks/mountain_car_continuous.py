@@ -1,4 +1,4 @@
-"""MountainCarContinuous: rock a weak car out of a valley with little effort. Gymnasium's MountainCarContinuous-v0.
+"""MountainCarContinuous: rock a weak car out of a valley. Gymnasium's MountainCarContinuous-v0.
 
 ## Description
 
@@ -33,7 +33,7 @@ At the end of a step x >= 0.45 m with v >= 0, which is success. Truncated after 
 
 ## Arguments
 
-[Those of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. Integrated as
+[The arguments of every environment](arguments.md); Gymnasium's `goal_velocity` is 0. Integrated as
 MountainCar.
 """
 
@@ -49,18 +49,18 @@ from codrl_mj.tasks import mountain_car
 from codrl_mj.tasks.attributes import Fixed
 from codrl_mj.tasks.base import Entries
 
-# Gymnasium's MountainCarContinuous-v0
+# Constants of Gymnasium's MountainCarContinuous-v0.
 FORCE = 1.0  # N
 GOAL = 0.45  # m
 
 
 def terminated(state: Entries) -> Any:
-    """The car is at the flag or beyond, and not rolling back."""
+    """Return True if the car is at the flag or beyond, and not rolling back."""
     return (state[0] >= GOAL) & (state[1] >= 0.0)
 
 
 def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
-    """100 at the goal, minus the square of the force delivered."""
+    """Return 100 at the goal, minus 0.1 times the square of the delivered force."""
     return 100.0 * terminated(next_state) - 0.1 * (force * force)
 
 
@@ -72,9 +72,9 @@ TASK = dataclasses.replace(
     reward_threshold=90.0,
     agent="ddpg",
     gymnasium_id="MountainCarContinuous-v0",
-    # its own equations are the same, but written so that they cannot be scaled (its gravity is no
-    # attribute), and it rounds its state to float32
-    twin=functools.partial(mountain_car.ReferenceEnv, "MountainCarContinuous-v0", "power"),
+    # Gymnasium's MountainCarContinuousEnv has the same equations, but its gravity is no attribute
+    # that could be scaled, and it rounds its state to float32.
+    reference_env=functools.partial(mountain_car.ReferenceEnv, "MountainCarContinuous-v0", "power"),
     asset="mountain_car_continuous.xml",
     max_force=FORCE,
     forces=None,
@@ -82,7 +82,7 @@ TASK = dataclasses.replace(
     reward=reward,
     terminated=terminated,
     goal=terminated,
-    # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
+    # The gains and the arm are from the paper, Experimental Results; R, L, kT, kE are the defaults.
     paper=(DCMotorActuator(Motor(), CurrentLoop(kp=0.1, ki=10.0, kd=1e-3)),),
     attributes={
         **mountain_car.attributes(GOAL, "power"),

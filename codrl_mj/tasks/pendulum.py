@@ -1,4 +1,4 @@
-"""Pendulum: swing a rod up and hold it there with a weak torque at its pivot. Gymnasium's Pendulum-v1.
+"""Pendulum: swing a rod up and hold it there with a weak torque. Gymnasium's Pendulum-v1.
 
 ## Description
 
@@ -37,8 +37,8 @@ within 0.1 rad of upright and slower than 0.1 rad/s.
 
 ## Arguments
 
-[Those of every environment](arguments.md); Gymnasium's `g` is the model's gravity. Semi-implicit
-Euler is the installed Gymnasium's (the paper says explicit).
+[The arguments of every environment](arguments.md); Gymnasium's `g` is the model's gravity.
+Semi-implicit Euler is the installed Gymnasium's (the paper says explicit).
 """
 
 import math
@@ -49,25 +49,25 @@ from gymnasium import spaces
 from gymnasium.envs.classic_control import utils
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
-from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, centre, mass
+from codrl_mj.tasks.attributes import GRAVITY, Fixed, Setting, center_of_mass, mass
 from codrl_mj.tasks.base import Entries, Task
-from codrl_mj.tasks.twin import GymnasiumReferenceEnv, ReferenceStates, around
+from codrl_mj.tasks.reference_env import GymnasiumReferenceEnv, ReferenceStates, values_around
 
-# Gymnasium's Pendulum-v1
+# Constants of Gymnasium's Pendulum-v1.
 MAX_TORQUE = 2.0  # N*m
 MAX_SPEED = 8.0  # rad/s
-# ours: what counts as upright and still
+# Our definition of upright and still, which Gymnasium does not have.
 GOAL_ANGLE = 0.1  # rad
 GOAL_SPEED = 0.1  # rad/s
 GOAL_HOLD = 1.0  # s
 
 
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Angle and speed lie within +-pi and +-1, or within the reset options' `x_init` and `y_init`."""
-    given = options or {}
+    """Return +-pi and +-1 for angle and speed, or the reset options' `x_init` and `y_init`."""
+    values = options or {}
     high = np.array(
         [
-            utils.verify_number_and_cast(given.get(*entry))
+            utils.verify_number_and_cast(values.get(*entry))
             for entry in (("x_init", np.pi), ("y_init", 1.0))
         ]
     )
@@ -75,38 +75,39 @@ def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarr
 
 
 def initial_state(draws: Entries) -> tuple[Any, ...]:
-    """The draws themselves."""
+    """Return the draws as the state."""
     return draws[0], draws[1]
 
 
 def constrain(state: Entries, timestep: float) -> tuple[Any, ...]:
-    """Limit the speed; the angle moves by the limited one."""
+    """Limit the speed, and correct the angle as if the limited speed had moved it."""
+    # minimum and maximum in this order pass NaN on.
     speed = np.minimum(np.maximum(state[1], -MAX_SPEED), MAX_SPEED)
     return state[0] - (state[1] - speed) * timestep, speed
 
 
 def observation(state: Entries) -> tuple[Any, ...]:
-    """(cos(theta), sin(theta), theta_dot)."""
+    """Return cos(theta), sin(theta) and theta_dot."""
     return np.cos(state[0]), np.sin(state[0]), state[1]
 
 
 def terminated(state: Entries) -> Any:
-    """Never."""
+    """Return False: an episode ends only by its time limit."""
     return False
 
 
 def upright_angle(state: Entries) -> Any:
-    """The rod's angle from upright [rad], wrapped to [-pi, pi)."""
+    """Return the rod's angle from upright [rad], wrapped to [-pi, pi)."""
     return (state[0] + np.pi) % (2 * np.pi) - np.pi
 
 
 def goal(state: Entries) -> Any:
-    """The rod is upright and still."""
+    """Return True if the rod is upright and still."""
     return (np.abs(upright_angle(state)) < GOAL_ANGLE) & (np.abs(state[1]) < GOAL_SPEED)
 
 
 def reward(state: Entries, force: Any, next_state: Entries, options: Any) -> Any:
-    """Minus the squares of angle, speed and torque: the state's before the step, the torque's delivered in it."""
+    """Return the negated cost of angle and speed before the step, and of the torque delivered."""
     angle, speed = upright_angle(state), state[1]
     return -(angle * angle + 0.1 * (speed * speed) + 0.001 * (force * force))
 
@@ -115,15 +116,16 @@ _HIGH = np.array([1.0, 1.0, MAX_SPEED], dtype=np.float32)
 
 
 class ReferenceEnv(GymnasiumReferenceEnv):
-    """`PendulumEnv`: the torque limit and the time step are attributes, the action is the torque."""
+    """Gymnasium's `PendulumEnv`, whose torque limit and time step are attributes."""
 
     env_id = "Pendulum-v1"
 
     def __call__(
         self, state: np.ndarray, force: float, timestep: float, integrator: str
     ) -> np.ndarray:
-        """One `step` with the torque as a float64 action, which Gymnasium does not round."""
-        del integrator  # it has one only
+        """Take a `step` with the torque as a float64 action, which Gymnasium does not round."""
+        # The environment has only one integrator.
+        del integrator
         return self.after(state, np.array([force]), dt=timestep, max_torque=np.inf)
 
 
@@ -133,7 +135,7 @@ TASK = Task(
     max_episode_steps=200,
     agent="ddpg",
     gymnasium_id="Pendulum-v1",
-    twin=ReferenceEnv,
+    reference_env=ReferenceEnv,
     asset="pendulum.xml",
     step_duration=0.05,
     motor_inner_steps=1,
@@ -151,7 +153,7 @@ TASK = Task(
     constrain=constrain,
     goal=goal,
     goal_hold=GOAL_HOLD,
-    # the paper, Experimental Results: gains and arm; R, L, kT, kE are the dataclass defaults
+    # The gains and the arm are from the paper, Experimental Results; R, L, kT, kE are the defaults.
     paper=(DCMotorActuator(Motor(), CurrentLoop(kp=1.0, ki=20.0, kd=1e-6)),),
     attributes={
         "max_speed": Fixed(MAX_SPEED),
@@ -159,12 +161,15 @@ TASK = Task(
         "dt": Setting.STEP,
         "g": GRAVITY,
         "m": mass("rod"),
-        "l": centre("rod", 2.0),
+        "l": center_of_mass("rod", 2.0),
     },
-    trials=ReferenceStates(
+    reference_states=ReferenceStates(
         bounds=(2 * np.pi, MAX_SPEED),
-        edges=((*around(math.pi), 0.0, math.pi / 2, -2 * math.pi), (*around(MAX_SPEED), 0.0)),
-        # swings below 8 rad/s
+        edges=(
+            (*values_around(math.pi), 0.0, math.pi / 2, -2 * math.pi),
+            (*values_around(MAX_SPEED), 0.0),
+        ),
+        # In this run the rod swings below the speed limit of 8 rad/s.
         start=(2.0, 0.5),
         steps=20,
         balanced_steps=8,

@@ -1,4 +1,4 @@
-"""The tasks that are known, ours and anybody's, and their registration with Gymnasium."""
+"""Registry of tasks, built-in and custom, and their registration with Gymnasium."""
 
 import itertools
 import sys
@@ -11,28 +11,28 @@ from codrl_mj.tasks.base import Task
 from codrl_mj.user_code import look_up
 
 TASKS: dict[str, Task] = {}
-"""Every task by its name on the command line."""
+"""Registered tasks by their names on the command line."""
 
 
 def register(task: Task) -> Task:
-    """Make a task known: `gymnasium.make` and `make_vec` take its id, and every other face and command its name.
+    """Register a task: `gymnasium.make` then takes its id, and functions and commands its name.
 
-    Harmless when repeated.
+    A repeated call with the same task does nothing.
 
     Args:
-        task: the task, of any module.
+        task: the task, from any module.
 
     Returns:
         The task.
 
     Raises:
-        ValueError: another task has its name, or another environment its id.
+        ValueError: another task has the name, or another environment the id.
     """
     if not hasattr(task, "env_id"):
         raise ValueError(f"{task!r}: must be a codrl_mj.Task")
     if TASKS.get(task.name, task) is not task:
         raise ValueError(
-            f"task {task.name!r} is registered already, of {reference_of(TASKS[task.name])}:"
+            f"task {task.name!r} is registered already, as {reference_of(TASKS[task.name])}:"
             " rename one"
         )
     if task.name not in TASKS and task.env_id in registry:
@@ -54,19 +54,18 @@ def register(task: Task) -> Task:
 
 
 def reference_of(task: Any, home: str | None = None) -> str:
-    """What finds a task, or a world, by its name in any process: the name of ours, `module:NAME` of somebody's.
+    """Return a text that finds a task or env source in any process.
 
-    Of one that stands in no module it is the name, which only processes know that have registered
-    it.
+    It is the name of a built-in task, and `module:NAME` of a custom one. If no module has the task,
+    it is the task's name, which only processes that have registered the task can resolve.
 
     Args:
-        task: the task or world.
-        home: the module to look for it first; that of a task's functions if none is named.
+        task: the task or env source.
+        home: the module that is searched first; by default the module of the task's functions.
     """
-    home, script = (
-        home or task.reward.__module__,
-        "__main__",
-    )  # the first and the last choice where several have it
+    # If several modules have the task, its home is preferred; the script, which other processes
+    # cannot import by its name, is the last choice.
+    home, script = home or task.reward.__module__, "__main__"
     others = (module for module in list(sys.modules) if module not in (home, script, "__mp_main__"))
     for module in itertools.chain([home], others, [script]):
         for name, value in list(getattr(sys.modules.get(module), "__dict__", {}).items()):
@@ -76,11 +75,10 @@ def reference_of(task: Any, home: str | None = None) -> str:
 
 
 def find_task(name: str) -> Task:
-    """The task called `name`.
+    """Return the task of a name.
 
     Args:
-        name: a key of `TASKS`; or `module:NAME` of anybody's task, which is imported and
-            registered.
+        name: a key of `TASKS`, or `module:NAME` of a custom task, which is imported and registered.
 
     Raises:
         ValueError: unknown name; the nearest known one is suggested.

@@ -1,4 +1,4 @@
-"""Training runs: from a configuration to a run folder, however often they are interrupted."""
+"""Training runs, from a configuration to a run folder, with any number of interruptions."""
 
 from codrl_mj.runs import finished
 from codrl_mj.training.config import EVALUATION_SEED, TrainConfig, read_config

@@ -1,8 +1,9 @@
-"""Checkpoints: the whole state of a training, as files that appear whole, prove themselves intact, and hold no code.
+"""Checkpoints: files with the complete state of a training.
 
-A state is all that the rest of a training depends on: weights, optimisers, replay buffer,
-exploration noise, counters, the environments and every random generator. Nothing is pickled.
-Rollout buffers are left out: states are taken between two rollouts, when they are empty.
+They are written atomically, contain a digest of their content in their names, and contain no code.
+A state is everything that the rest of a training depends on: weights, optimizers, replay buffer,
+exploration noise, counters, environments and all random generators. Nothing is pickled. Rollout
+buffers are omitted, because states are captured between two rollouts, when they are empty.
 """
 
 import functools
@@ -25,34 +26,33 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, Vectori
 from codrl_mj.runs import checkpoints
 from codrl_mj.runs.files import below, writing
 
-KEPT = 2
-"""Checkpoints that are kept: the last, and the one before in case the last is damaged."""
+NUM_CHECKPOINTS = 2
+"""Number of checkpoints in a folder: the last, and the previous in case the last is damaged."""
 _COUNTERS = (
     "num_timesteps",
     "_n_updates",
     "_episode_num",
-    "_n_calls",  # DQN: steps towards the next update of the target network
+    # The steps of DQN since the last update of the target network.
+    "_n_calls",
     "_current_progress_remaining",
     "exploration_rate",
 )
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-_DRAWN = (
-    "exploration_mat",
-    "exploration_matrices",
-)  # of state-dependent noise, in use until it is drawn anew
+_NOISE_MATRICES = ("exploration_mat", "exploration_matrices")
+"""Attributes of state-dependent noise that are in use until its next draw."""
 
 
 class State(NamedTuple):
-    """A state: numbers as arrays, the rest as JSON."""
+    """State of a training: numbers as arrays, other values as JSON."""
 
     arrays: dict[str, np.ndarray]
     """Arrays by name."""
     facts: dict[str, Any]
-    """JSON-serialisable values by name."""
+    """JSON-serializable values by name."""
 
 
 def capture(model: BaseAlgorithm, envs: Any) -> State:
-    """The state of a model and its environments between two rollouts."""
+    """Return the state of a model and its environments between two rollouts."""
     arrays: dict[str, np.ndarray] = {}
     facts: dict[str, Any] = {
         name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)
@@ -80,12 +80,11 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
         facts["buffer"] = {"pos": int(buffer.pos), "full": bool(buffer.full)}
     arrays |= {f"noise.{index}": noise.noise_prev for index, noise in enumerate(_noises(model))}
     if (distribution := _state_dependent_noise(model)) is not None:
-        arrays |= {f"noise.{name}": _array(getattr(distribution, name)) for name in _DRAWN}
+        arrays |= {f"noise.{name}": _array(getattr(distribution, name)) for name in _NOISE_MATRICES}
     if hasattr(model, "snapshot"):
         arrays |= {f"model.{name}": value for name, value in model.snapshot().items()}
-    numpy_state: Any = np.random.get_state(
-        legacy=False
-    )  # Stable-Baselines3 draws from NumPy's global generator
+    # Stable-Baselines3 draws from NumPy's global generator.
+    numpy_state: Any = np.random.get_state(legacy=False)
     arrays["random.numpy.key"] = numpy_state["state"].pop("key")
     facts["random.numpy"] = numpy_state
     facts["random.actions"] = model.action_space.np_random.bit_generator.state
@@ -94,10 +93,11 @@ def capture(model: BaseAlgorithm, envs: Any) -> State:
 
 
 def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
-    """Bring a model of the same configuration to what `capture` returned, once `learn` has set it up.
+    """Restore the result of `capture` in a model of the same configuration, within its `learn`.
 
-    Model and environments are no good after a state that is refused, which is another
-    configuration's.
+    Raises:
+        ValueError: the state belongs to another configuration. Model and environments are then
+            partly changed, and must not be used.
     """
     arrays, facts = state
     try:
@@ -105,35 +105,38 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
             setattr(model, name, facts[name])
         modules, tensors = model._get_torch_save_params()
         for module in modules:
-            own = operator.attrgetter(module)(model)
-            if (state_dict := own.state_dict()).keys() == {"state", "param_groups"}:
+            part = operator.attrgetter(module)(model)
+            if (state_dict := part.state_dict()).keys() == {"state", "param_groups"}:
                 moments = {
                     int(index): {
                         name: torch.tensor(arrays[f"{module}.{index}.{name}"]) for name in names
                     }
                     for index, names in facts[f"{module}.moments"].items()
                 }
-                own.load_state_dict({"state": moments, "param_groups": facts[f"{module}.groups"]})
+                part.load_state_dict({"state": moments, "param_groups": facts[f"{module}.groups"]})
             else:
-                own.load_state_dict(
+                part.load_state_dict(
                     {name: torch.tensor(arrays[f"{module}.{name}"]) for name in state_dict}
                 )
         for name in tensors:
             with torch.no_grad():
                 operator.attrgetter(name)(model).copy_(torch.tensor(arrays[f"tensor.{name}"]))
-        begun = envs.restore(below("env.", arrays))
-        model._last_obs = arrays["last_obs"].copy() if begun is None else begun
+        new_observations = envs.restore(below("env.", arrays))
+        model._last_obs = (
+            arrays["last_obs"].copy() if new_observations is None else new_observations
+        )
         model._last_episode_starts = arrays["last_episode_starts"].copy()
-        if begun is not None:  # environments whose state nobody can set
+        if new_observations is not None:
+            # The environments cannot restore their states and have started new episodes.
             model._last_episode_starts[:] = True
         if (buffer := getattr(model, "replay_buffer", None)) is not None:
             buffer.pos, buffer.full = facts["buffer"]["pos"], facts["buffer"]["full"]
             for name in _BUFFER:
                 getattr(buffer, name)[: buffer.size()] = arrays[f"buffer.{name}"]
-        for place, noise in enumerate(_noises(model)):
-            noise.noise_prev = arrays[f"noise.{place}"].copy()
+        for index, noise in enumerate(_noises(model)):
+            noise.noise_prev = arrays[f"noise.{index}"].copy()
         if (distribution := _state_dependent_noise(model)) is not None:
-            for name in _DRAWN:
+            for name in _NOISE_MATRICES:
                 setattr(distribution, name, torch.tensor(arrays[f"noise.{name}"]))
         if hasattr(model, "restore"):
             model.restore(below("model.", arrays))
@@ -144,7 +147,7 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
         model.action_space.np_random.bit_generator.state = facts["random.actions"]
         torch.set_rng_state(torch.tensor(arrays["random.torch"]))
     except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(f"the checkpoint is of another configuration: {error!r}") from None
+        raise ValueError(f"the checkpoint belongs to another configuration: {error!r}") from None
 
 
 def _array(value: Any) -> np.ndarray:
@@ -152,23 +155,32 @@ def _array(value: Any) -> np.ndarray:
 
 
 def _noises(model: Any) -> list[OrnsteinUhlenbeckActionNoise]:
-    """The action noises that remember something."""
+    """Return the action noises that have a state."""
     noise = getattr(model, "action_noise", None)
-    every = noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]
-    return [one for one in every if isinstance(one, OrnsteinUhlenbeckActionNoise)]
+    parts = noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]
+    return [part for part in parts if isinstance(part, OrnsteinUhlenbeckActionNoise)]
 
 
 def _state_dependent_noise(model: Any) -> StateDependentNoiseDistribution | None:
-    """What explores by noise that is a function of the state, if the model does."""
+    """Return the distribution with state-dependent noise, or None if the model has none."""
     distribution = getattr(getattr(model, "actor", model.policy), "action_dist", None)
     return distribution if isinstance(distribution, StateDependentNoiseDistribution) else None
 
 
 def save_checkpoint(folder: Path, state: State, run: str) -> Path:
-    """Write a checkpoint and delete those that are no longer needed; those before stay where it cannot be written.
+    """Write a checkpoint, then delete those that are no longer needed.
 
-    Its name has its step and a digest of its content. `run` says what the run is (its
-    configuration), so that none is continued from another's checkpoint.
+    If it cannot be written, the previous ones remain. Its name contains its step and a digest of
+    its content.
+
+    Args:
+        folder: folder of checkpoints.
+        state: the state.
+        run: identity of the run, its configuration. A run is never continued from a checkpoint with
+            another identity.
+
+    Returns:
+        The path of the checkpoint.
     """
     content = save(state.arrays, metadata={"run": run, "facts": json.dumps(state.facts)})
     step = f"{state.facts['num_timesteps']:012d}"
@@ -176,28 +188,41 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
     with writing(path) as temporary, temporary.open("wb") as file:
         file.write(content)
         file.flush()
-        os.fsync(file.fileno())  # on the disk before the last but one is deleted
-    there = checkpoints(folder)
-    before = [other for other, named in there.items() if named["step"] < step]
-    # the rest is of the same step or, damaged, of a later one, from which the run fell back
-    for superfluous in there.keys() - {path, *before[1 - KEPT :]}:
-        superfluous.unlink(missing_ok=True)
+        # The content must be on the disk before an older checkpoint is deleted.
+        os.fsync(file.fileno())
+    existing = checkpoints(folder)
+    older = [name for name, parts in existing.items() if parts["step"] < step]
+    # Other files are of the same step, or of a later one that was damaged, so that the run went
+    # back.
+    for obsolete in existing.keys() - {path, *older[1 - NUM_CHECKPOINTS :]}:
+        obsolete.unlink(missing_ok=True)
     return path
 
 
 def load_checkpoint(folder: Path, run: str) -> State | None:
-    """The last checkpoint of a run that is intact; None if there is none. Of damaged ones it warns."""
-    for left, (path, named) in reversed(list(enumerate(checkpoints(folder).items()))):
+    """Return the last intact checkpoint of a run; None if there is none.
+
+    Each checkpoint that cannot be used causes a warning.
+    """
+    for remaining, (path, parts) in reversed(list(enumerate(checkpoints(folder).items()))):
         try:
-            return _read(path, named["digest"], run)
+            return _read(path, parts["digest"], run)
         except (ValueError, OSError) as error:
-            remedy = "going back to the one before" if left else "no other is left: starting anew"
+            remedy = (
+                "going back to the previous one"
+                if remaining
+                else "there is no other: starting from the beginning"
+            )
             warnings.warn(f"checkpoint {path} cannot be used ({error}): {remedy}", stacklevel=2)
     return None
 
 
 def _read(path: Path, digest: str, run: str) -> State:
-    """Read one checkpoint, refused if it is not what was written, or another run's."""
+    """Read a checkpoint.
+
+    Raises:
+        ValueError: its content is damaged, or it belongs to another run.
+    """
     content = path.read_bytes()
     if _digest(content) != digest:
         raise ValueError("it is damaged: its content does not have the digest in its name")
@@ -205,10 +230,10 @@ def _read(path: Path, digest: str, run: str) -> State:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata()
         if metadata["run"] != run:
-            raise ValueError("it is another run's")
+            raise ValueError("it belongs to another run")
         return State(load(content), json.loads(metadata["facts"]))
     except (SafetensorError, KeyError, TypeError) as error:
-        raise ValueError(f"it is no checkpoint: {error!r}") from None
+        raise ValueError(f"it is not a checkpoint: {error!r}") from None
 
 
 def _digest(content: bytes) -> str:

@@ -1,4 +1,4 @@
-"""What to train, on what, for how long: from Python, a YAML file or the command line."""
+"""Configuration of a training, from Python, a YAML file or the command line."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -8,42 +8,46 @@ from typing import Any
 from codrl_mj.actuators import trusting
 from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
-from codrl_mj.agents.presets import ELSEWHERE, find_preset
+from codrl_mj.agents.presets import OTHER_ENV, find_preset
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import Checked, check_names, integer
 from codrl_mj.user_code import read_yaml
 
 EVALUATION_SEED = 1_000_000
-"""Seed of the first episode in which a trained policy is evaluated, away from those that trainings start from."""
+"""Seed of the first evaluation episode, far from the seeds of trainings."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig(Checked):
-    """What to train, on what, for how long.
+    """Configuration of a training: the environment, the agent and the budget.
 
     Raises:
-        ValueError: a field is out of bounds, or the agent cannot act in the task; the message says
-            what would do.
+        ValueError: a field is out of bounds, or the agent cannot act in the task; the message names
+            what is possible.
     """
 
     env: EnvConfig
-    """What to train in: task, actuator and all else."""
+    """Training environment: task, actuator and all other settings."""
     agent: AgentConfig = PPOConfig()
     """The agent's settings."""
     seed: int = integer(0, least=0, most=2**32 - 1)
     """Seed of weights, actions and environments, from 0 to 2**32 - 1."""
     total_steps: int | None = integer(200_000, least=1, optional=True)
-    """Environment steps in all, >= 1; rounded up to whole rollouts. None: until `total_episodes`."""
+    """Total environment steps, >= 1; rounded up to whole rollouts. None: until `total_episodes`."""
     num_envs: int = integer(8, least=1)
-    """Environments side by side, >= 1."""
+    """Number of parallel environments, >= 1."""
     total_episodes: int | None = integer(None, least=1)
-    """Training episodes in all, >= 1, where they and not the steps are counted; None: until `total_steps`."""
+    """Total number of training episodes, >= 1; None: until `total_steps`."""
     checkpoint_interval: int = integer(20_000, least=1)
-    """Environment steps between two checkpoints, >= 1; the next end of a rollout counts."""
+    """Environment steps between two checkpoints, >= 1; rounded up to the end of a rollout."""
     evaluation_interval: int = integer(20_000, least=1)
-    """Environment steps between two evaluations of the greedy policy, >= 1, of which the best policy is kept."""
+    """Environment steps between two evaluations of the greedy policy, >= 1; the best policy is
+    saved.
+    """
     evaluation_episodes: int = integer(20, least=1)
-    """Episodes of each evaluation, >= 1: of the task as Gymnasium poses it, on the actuator trained through."""
+    """Episodes of each evaluation, >= 1, on the task with Gymnasium's time limit and reward and
+    with the training's actuator.
+    """
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -52,12 +56,12 @@ class TrainConfig(Checked):
                 raise ValueError(
                     f"TrainConfig.{name} = {getattr(self, name)!r}: must be a {kind.__name__}"
                 )
-        check_fits(self.agent.known_as(), self.env)
+        check_fits(self.agent.registry_name(), self.env)
         super().__post_init__()
         if self.total_steps is None and self.total_episodes is None:
             raise ValueError(
-                "TrainConfig.total_steps = None: must be an integer >= 1, or total_episodes must"
-                " be one"
+                "TrainConfig.total_steps = None: must be an integer >= 1 unless total_episodes is"
+                " set"
             )
         if self.total_steps is None and self.env.time_limit is None:
             raise ValueError(
@@ -72,12 +76,12 @@ class TrainConfig(Checked):
 
     @property
     def actuator(self) -> Any:
-        """What is trained through; with several motors, or patterns of them, a tuple."""
+        """Actuator in training; a tuple if there are several motors, or patterns of them."""
         return self.env.actuator
 
     @property
     def actuators(self) -> tuple[Any, ...]:
-        """The same, always as a tuple."""
+        """Actuators in training, always as a tuple."""
         return self.env.actuators
 
     @classmethod
@@ -90,71 +94,71 @@ class TrainConfig(Checked):
         env: Mapping[str, Any] | None = None,
         **changes: Any,
     ) -> "TrainConfig":
-        """Settings that suit an agent to a task.
+        """Return the preset configuration of an agent on a task.
 
         Args:
             task: task name.
             agent: the agent's name.
-            settings: one of `SETTINGS`: `default`, for some pairs `paper`, `repaired` or `fast`.
-            actuator: what to train through.
-            env: other fields of the environment, and options of the task, to set otherwise.
-            **changes: fields to set otherwise.
+            settings: a name of `SETTINGS`: `default`; for some pairs `paper`, `repaired` or `fast`.
+            actuator: actuator in training.
+            env: values of other fields of the environment, and of options of the task.
+            **changes: values of other fields.
 
         Raises:
             ValueError: there are no such settings, or a field is out of bounds.
         """
-        posed = EnvConfig(task, options=(env or {}).get("options"))
-        check_fits(agent, posed)
-        preset = find_preset(agent, posed.world.preset or ELSEWHERE, settings)
+        env_config = EnvConfig(task, options=(env or {}).get("options"))
+        check_fits(agent, env_config)
+        preset = find_preset(agent, env_config.world.preset or OTHER_ENV, settings)
         names = {field.name for field in dataclasses.fields(cls)} - {"env"}
-        chosen = {name: value for name, value in vars(preset).items() if name in names}
+        values = {name: value for name, value in vars(preset).items() if name in names}
         fields = {"actuator": actuator, **preset.env, **(env or {}), "task": task}
-        return cls(EnvConfig.from_mapping(fields), **(chosen | changes))
+        return cls(EnvConfig.from_mapping(fields), **(values | changes))
 
     @property
     def evaluation_env(self) -> EnvConfig:
-        """What policies are evaluated in: the environment without changes of time limit and reward."""
+        """Environment of evaluations: without the training's changes of time limit and reward."""
         changed: dict[str, Any] = dict.fromkeys(self.env.world.posed)
         return dataclasses.replace(self.env, **changed)
 
     def as_mapping(self) -> dict[str, Any]:
-        """The configuration as JSON-serialisable values; `from_mapping` reads it."""
+        """Return the configuration as JSON-serializable values, which `from_mapping` reads."""
         return {**vars(self), "env": self.env.as_mapping(), "agent": self.agent.as_mapping()}
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any], whole: bool = False) -> "TrainConfig":
-        """The configuration that a mapping describes: `as_mapping`'s, or any part of it.
+        """Return the configuration from a mapping: the result of `as_mapping`, or a part of it.
 
-        What is not given is the preset's of the given agent (a name, or a mapping with its `name`
-        and fields to set) and the given `settings` (`default` if none is named). Task and actuator
-        may stand in `env` or above it.
+        Missing fields are those of the preset of the agent and `settings` (`default` if missing).
+        `agent` is a name, or a mapping with its `name` and fields. `task` and `actuator` may be
+        in `env` or at the top level.
 
         Args:
             mapping: the fields.
-            whole: refuse a mapping that leaves fields out.
+            whole: raise an error if fields are missing.
 
         Raises:
             ValueError: a key is unknown (the message suggests one) or missing, or a value out of
                 bounds.
         """
         if not isinstance(mapping, Mapping):
-            raise ValueError(f"not a training configuration: {mapping!r} is no mapping")
-        given = dict(mapping)
-        above = {name: given.pop(name) for name in ("task", "actuator") if name in given}
-        if isinstance(given.get("env", {}), Mapping):
-            given["env"] = {**given.get("env", {}), **above}
+            raise ValueError(f"not a training configuration: {mapping!r} is not a mapping")
+        fields = dict(mapping)
+        top_level = {name: fields.pop(name) for name in ("task", "actuator") if name in fields}
+        if isinstance(fields.get("env", {}), Mapping):
+            fields["env"] = {**fields.get("env", {}), **top_level}
         names = [field.name for field in dataclasses.fields(cls)]
-        check_names(given, [*names, "task", "actuator", "settings"], "key")
-        missing = [name for name in names if name not in given] if whole else []
+        check_names(fields, [*names, "task", "actuator", "settings"], "key")
+        missing = [name for name in names if name not in fields] if whole else []
         if missing:
             raise ValueError(f"not a training configuration: it has no {', '.join(missing)}")
         env, settings, agent = (
-            given.pop("env"),
-            given.pop("settings", "default"),
-            given.pop("agent", None),
+            fields.pop("env"),
+            fields.pop("settings", "default"),
+            fields.pop("agent", None),
         )
         if whole:
-            return cls(EnvConfig.from_mapping(env), agent_from_mapping(agent), **given)
+            return cls(EnvConfig.from_mapping(env), agent_from_mapping(agent), **fields)
         if not isinstance(env, Mapping):
             raise ValueError(f"env = {env!r}: must be a mapping of the environment's arguments")
         if "task" not in env:
@@ -167,38 +171,38 @@ class TrainConfig(Checked):
                 f"agent = {agent!r}: must be an agent's name, or a mapping with its name and"
                 " settings"
             )
-        own = {"options": env["options"]} if env.get("options") else {}
-        base = cls.preset(task, agent["name"], settings, env.get("actuator", "default"), own)
+        options = {"options": env["options"]} if env.get("options") else {}
+        base = cls.preset(task, agent["name"], settings, env.get("actuator", "default"), options)
         agent = agent_from_mapping(base.agent.as_mapping() | dict(agent))
         return dataclasses.replace(
-            base, env=EnvConfig.from_mapping(env, base.env), agent=agent, **given
+            base, env=EnvConfig.from_mapping(env, base.env), agent=agent, **fields
         )
 
 
 def default_agent(task: str, options: Any = None) -> str:
-    """The agent that is trained on a task unless another is named; of the five tasks the paper's.
+    """Return the default agent of a task; for the paper's five tasks, the paper's agent.
 
-    In environments of others, SAC for continuous actions and PPO for others; their `options` may
-    decide on that.
+    In third-party environments it is SAC for continuous actions and PPO for other actions. The
+    actions may depend on the environment's `options`.
     """
-    posed = EnvConfig(task, options=options)
-    return posed.world.default_agent(posed)
+    env_config = EnvConfig(task, options=options)
+    return env_config.world.default_agent(env_config)
 
 
 def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConfig:
-    """Read a configuration from a YAML (or JSON) file, as `TrainConfig.from_mapping` understands it.
+    """Read a configuration from a YAML (or JSON) file for `TrainConfig.from_mapping`.
 
     Args:
-        path: the file; a run folder's `config.json` will do as well.
-        trust: whether to import the module of an actuator that it names as `module:NAME`, which
-            executes it.
-        **overriding: top-level keys to set otherwise; None leaves them, and so does the name of the
-            agent that the file has settings for.
+        path: the file; the `config.json` of a run folder is possible, too.
+        trust: import, and thereby execute, the module of an actuator that the file names as
+            `module:NAME`.
+        **overriding: values of other top-level keys. None has no effect, nor has the name of the
+            agent whose settings are in the file.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not YAML, has an unknown key, or a value out of bounds; the message has
-            the file's name.
+        ValueError: the file is not YAML, has an unknown key, or a value out of bounds; the message
+            has the file's name.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no configuration file at {path}")

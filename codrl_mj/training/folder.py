@@ -1,4 +1,4 @@
-"""A run folder: what is in it under which name, what it was made with, and whose it is while it grows."""
+"""Run folders: the files in them, the software behind them, and their lock during a training."""
 
 import contextlib
 import functools
@@ -40,27 +40,27 @@ _PACKAGES = ("codrl-mj", "gymnasium", "mujoco", "numba", "numpy", "stable-baseli
 
 
 class RunInUseError(RuntimeError):
-    """Another process trains in a run folder."""
+    """Error: another process trains in the run folder."""
 
 
 class TrainingStoppedError(Exception):
-    """A training was asked to stop by a signal; it can be continued."""
+    """Error: a signal stopped the training, which can be continued."""
 
     def __init__(self, message: str, signal_number: int) -> None:
-        """Keep the signal, for the exit status."""
+        """Store the signal's number for the exit status."""
         super().__init__(message)
         self.signal_number = signal_number
 
 
 def load_config(run: Path, trust: bool = False) -> TrainConfig:
-    """The configuration of a run folder.
+    """Return the configuration of a run folder.
 
     Args:
         run: the folder.
-        trust: whether to import the module of an actuator that is none of ours, which executes it.
+        trust: import, and thereby execute, the module of a custom task, agent or actuator.
 
     Raises:
-        FileNotFoundError: the folder is no run folder.
+        FileNotFoundError: the folder is not a run folder.
         ValueError: its configuration is damaged.
     """
     content = read_json(run / CONFIG, "run configuration")
@@ -76,118 +76,148 @@ def load_config(run: Path, trust: bool = False) -> TrainConfig:
         raise ValueError(f"{run / CONFIG}: not a run configuration: {error}") from None
 
 
-def admit(
+def prepare_run(
     run: Path, config: TrainConfig, resume: bool, accept_changes: bool
 ) -> dict[str, Any] | None:
-    """Refuse, before anything is made or compiled, a folder in which a training can neither begin nor go on.
+    """Check a run folder before a training, and return the content of a new `config.json`.
 
-    What a new run is, to be written once it begins; None where there is one to go on with, finished
-    or not.
+    The check comes before anything is created or compiled.
+
+    Returns:
+        The content, to be written when training begins; None if the folder has a run to continue,
+        which may be finished already.
+
+    Raises:
+        FileExistsError: the folder has other files, or a run, and `resume` is False.
+        OSError: the folder cannot be written.
+        RunInUseError: another process trains in it.
+        ValueError: its run has another configuration, or was started with other software.
     """
     check_writable(run)
     if (run / LOCK).exists():
-        with owned(run):
+        with locked(run):
             pass
-    exists, made_with = (run / CONFIG).exists(), provenance(config)
+    exists, software = (run / CONFIG).exists(), provenance(config)
     if resume and exists:
-        check_same(run, config, made_with, accept_changes)
+        check_resumable(run, config, software, accept_changes)
         return None
-    if run.exists() and not unused(run):
+    if run.exists() and not is_unused(run):
         remedy = "continue it with --resume, " if exists and not finished(run) else ""
         raise FileExistsError(
             f"run folder {run} exists already: {remedy}choose another --out, or delete it"
         )
-    labels = [label_of(one) for one in config.actuators]
+    labels = [label_of(actuator) for actuator in config.actuators]
     return {
         "train": config.as_mapping(),
-        **made_with,
+        **software,
         **({"labels": labels} if any(labels) else {}),
     }
 
 
-def unused(run: Path) -> bool:
-    """Whether no training has begun in a folder: it is empty, or who was to begin was killed before."""
+def is_unused(run: Path) -> bool:
+    """Return True if no training has started in a folder.
+
+    It is then empty, or has only leftovers of a process that was killed before it started.
+    """
     return {path.name for path in run.iterdir()} <= {LOCK, *(path.name for path in _leftovers(run))}
 
 
 def needs_trust(run: Path) -> bool:
-    """Return True if loading a run imports the module of somebody's own task, agent or actuator."""
+    """Return True if loading a run imports the module of a custom task, agent or actuator."""
     try:
         load_config(run)
-    except (ValueError, OSError):  # also of a damaged run, which says so when it is loaded
+    except (ValueError, OSError):
+        # A damaged run is included; loading it reports the damage.
         return True
     return False
 
 
-def resuming(run: Path) -> str:
+def resume_command(run: Path) -> str:
     """Return the command that continues a training."""
     return command("train", "--resume", run, trust=needs_trust(run))
 
 
-def standing(run: Path) -> str:
-    """What there is to go on from in the folder of a training that was broken off, and how."""
-    if kept := checkpoints(run / CHECKPOINTS):
-        step = max(int(named["step"]) for named in kept.values())
-        return f"Its last checkpoint is of step {step:,}: continue with {resuming(run)}"
+def describe_remains(run: Path) -> str:
+    """Return a sentence on how to continue a training that was interrupted."""
+    if existing := checkpoints(run / CHECKPOINTS):
+        step = max(int(parts["step"]) for parts in existing.values())
+        return f"Its last checkpoint is that of step {step:,}: continue with {resume_command(run)}"
     if (run / BEST / EVALUATION).exists():
         return (
             f"It has no checkpoint to continue from, only its best policy so far, in {run / BEST}:"
-            " start it anew"
+            " start it again"
         )
-    return "It had no checkpoint yet, and nothing of it is left: start it anew"
+    return "It had no checkpoint yet, and its files were deleted: start it again"
 
 
-def _leftovers(place: Path) -> list[Path]:
-    """Half-written files of a training."""
-    return [path for path, name in leftovers(place) if name in _FILES or CHECKPOINT.fullmatch(name)]
+def _leftovers(folder: Path) -> list[Path]:
+    """Return temporary files of a training that were not completed."""
+    return [
+        path for path, name in leftovers(folder) if name in _FILES or CHECKPOINT.fullmatch(name)
+    ]
 
 
-def _sweep(run: Path) -> None:
-    """Delete what a killed process left half-written. Only for who owns the folder: others' are in use."""
+def _delete_leftovers(run: Path) -> None:
+    """Delete incomplete files that a killed process has left in a run folder.
+
+    The caller must have the folder's lock, because another process may be writing such files.
+    """
     for path in [*_leftovers(run), *_leftovers(run / BEST), *_leftovers(run / CHECKPOINTS)]:
         path.unlink(missing_ok=True)
 
 
-def check_same(
-    run: Path, config: TrainConfig, now: Mapping[str, Any], accept_changes: bool
+def check_resumable(
+    run: Path, config: TrainConfig, software: Mapping[str, Any], accept_changes: bool
 ) -> None:
-    """Raise unless a run folder's training can be continued to the result that it would have had uninterrupted."""
-    begun = load_config(run, trust=True)  # as its caller does, who names it
-    if other := differing(begun.as_mapping(), config.as_mapping()):
-        told = "; ".join(
-            f"{name}: {there!r} and {asked!r}" for name, (there, asked) in other.items()
+    """Raise an error unless a training can be continued to the same result as without interruption.
+
+    Args:
+        run: the run folder.
+        config: configuration of the training.
+        software: result of `provenance` for it.
+        accept_changes: accept a run that was started with other software.
+
+    Raises:
+        ValueError: the configuration or the software differs.
+    """
+    # The caller has named the same configuration, and has thereby imported the same modules.
+    started_config = load_config(run, trust=True)
+    if differences := differing(started_config.as_mapping(), config.as_mapping()):
+        changes = "; ".join(
+            f"{name}: {started!r} and {requested!r}"
+            for name, (started, requested) in differences.items()
         )
         raise ValueError(
-            f"{run} was started with another configuration (there, and asked for): {told}. A run"
-            " continues as it began: choose another run folder for other settings"
+            f"{run} was started with another configuration (its value, and the requested one):"
+            f" {changes}. A run keeps its settings: choose another run folder for other settings"
         )
-    then = read_json(run / CONFIG, "run configuration")
-    versions = then.get("versions")
+    record = read_json(run / CONFIG, "run configuration")
+    versions = record.get("versions")
     if not isinstance(versions, Mapping):
         raise ValueError(
             f"{run / CONFIG}: not a run configuration: versions = {versions!r}: must be a mapping"
         )
     changed = [
         f"{name} was {was}, is {is_now}"
-        for name, (was, is_now) in differing(versions, now["versions"]).items()
+        for name, (was, is_now) in differing(versions, software["versions"]).items()
     ]
-    if then.get("code") != now["code"]:
+    if record.get("code") != software["code"]:
         changed.append(
-            f"the code of codrl_mj was {str(then.get('code'))[:8]}, is {now['code'][:8]}"
+            f"the code of codrl_mj was {str(record.get('code'))[:8]}, is {software['code'][:8]}"
         )
     if changed and not accept_changes:
         raise ValueError(
             f"{run} was started with other software: {'; '.join(changed)}. Its result might differ"
-            " from that of one uninterrupted run: go back to that software, or accept it with"
-            " --accept-changes"
+            " from that of an uninterrupted run: install that software again, or accept the change"
+            " with --accept-changes"
         )
 
 
 def provenance(config: TrainConfig) -> dict[str, Any]:
-    """What a run's result depends on besides its configuration: package versions, and a digest of code.
+    """Return the versions of packages and the digest of code on which a run's result depends.
 
-    The code is ours, and the files of task, model, agent and family of actuators where these are
-    somebody's own.
+    The code is that of this package, and the files of custom tasks, models, agents and families of
+    actuators.
     """
     versions = {package: importlib.metadata.version(package) for package in _PACKAGES}
     return {
@@ -197,8 +227,8 @@ def provenance(config: TrainConfig) -> dict[str, Any]:
 
 
 @functools.cache
-def _code_digest(*others: str | Path) -> str:
-    """SHA-256 over the package's Python files and models, and those modules and model files that are none of these."""
+def _code_digest(*extra: str | Path) -> str:
+    """Return the SHA-256 digest of the package's Python files and models, and of other files."""
     from codrl_mj.user_code import asset_folder
 
     package = Path(__file__).parents[1]
@@ -206,48 +236,51 @@ def _code_digest(*others: str | Path) -> str:
     for root, pattern in ((package, "*.py"), (asset_folder(), "*.xml")):
         for path in sorted(root.rglob(pattern)):
             digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes() + b"\0")
-    for other in others:
-        file = (
-            getattr(sys.modules[other], "__file__", None) if isinstance(other, str) else other
-        )  # a notebook has none
+    for source in extra:
+        # The module of a notebook has no file.
+        file = getattr(sys.modules[source], "__file__", None) if isinstance(source, str) else source
         if file is not None and not any(
-            Path(file).is_relative_to(ours) for ours in (package, asset_folder())
+            Path(file).is_relative_to(folder) for folder in (package, asset_folder())
         ):
             digest.update(Path(file).read_bytes())
     return digest.hexdigest()
 
 
 @contextlib.contextmanager
-def taken(run: Path, exists: bool) -> Iterator[None]:
-    """Own a run folder while the block runs, and leave no new one in which nothing was learned when it raises."""
-    made = [path for path in (run, *run.parents) if not path.exists()]
-    with owned(run):
-        if finished(run) or not ((run / CONFIG).exists() if exists else unused(run)):
+def locked_for_training(run: Path, exists: bool) -> Iterator[None]:
+    """Lock a run folder in a `with` block, and delete a new one if the block fails before a result.
+
+    A result is a checkpoint or a best policy.
+    """
+    new_folders = [path for path in (run, *run.parents) if not path.exists()]
+    with locked(run):
+        if finished(run) or not ((run / CONFIG).exists() if exists else is_unused(run)):
             raise RunInUseError(
                 f"{run}: another process trained in it in the meantime; start again"
             )
-        _sweep(run)
+        _delete_leftovers(run)
         try:
             yield
         except BaseException as error:
-            if exists or isinstance(
-                error, TrainingStoppedError
-            ):  # else all of it is this training's
+            # A folder that existed, or that a stopped training is to be continued in, is kept. All
+            # files of any other are this training's.
+            if exists or isinstance(error, TrainingStoppedError):
                 raise
-            _sweep(run)
+            _delete_leftovers(run)
             if not [*run.glob(f"{CHECKPOINTS}/*"), *run.glob(f"{BEST}/*")]:
                 for name in (CONFIG, PROGRESS, EPISODES, LOCK):
                     (run / name).unlink(missing_ok=True)
                 shutil.rmtree(run / TENSORBOARD, ignore_errors=True)
-                for path in (run / CHECKPOINTS, run / BEST, *made):
-                    with contextlib.suppress(OSError):  # a folder that others use by now stays
+                for path in (run / CHECKPOINTS, run / BEST, *new_folders):
+                    # A folder into which others have written meanwhile is not empty, and is kept.
+                    with contextlib.suppress(OSError):
                         path.rmdir()
             raise
 
 
 @contextlib.contextmanager
-def owned(run: Path) -> Iterator[None]:
-    """Hold a run folder for oneself while the block runs; the system lets go of it if the process dies."""
+def locked(run: Path) -> Iterator[None]:
+    """Lock a run folder in a `with` block; the system releases the lock if the process dies."""
     run.mkdir(parents=True, exist_ok=True)
     lock = FileLock(run / LOCK)
     try:

@@ -1,4 +1,4 @@
-"""What happened in a training: a table of episodes, a table of reports, and the learning curve that they make."""
+"""History of a training: a table of episodes, a table of reports, and the learning curve."""
 
 import csv
 import dataclasses
@@ -12,14 +12,14 @@ from codrl_mj.runs.files import writing
 from codrl_mj.viz.pages.plots import Curve, Plot, save
 
 WINDOW = 100
-"""Training episodes that means are taken over."""
+"""Number of training episodes in running means."""
 _DOTS = 4000
-"""Most training episodes of a learning curve that are drawn one by one."""
+"""Approximate number of training episodes that a learning curve shows as dots."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Where a training run stands, at the end of a rollout."""
+    """Progress of a training at the end of a rollout."""
 
     steps: int
     """Environment steps so far."""
@@ -31,10 +31,11 @@ class Progress:
     """Mean length of the same episodes [steps]."""
     torque_error: float
     """Root mean square of desired minus delivered torque at the motor shaft [N*m] at the ends of
-    the environment steps since the last report; an evaluation's is over all integration steps.
+    the environment steps since the last report. That of an evaluation is over all integration
+    steps.
     """
     evaluation_return: float
-    """Mean return of the evaluation that took place then (NaN where none did)."""
+    """Mean return of the evaluation at this step (NaN if there was none)."""
     steps_per_second: float
     """Environment steps per second since training started or was continued."""
     seconds: float
@@ -43,11 +44,15 @@ class Progress:
 
 REPORT_COLUMNS = tuple(field.name for field in dataclasses.fields(Progress))
 EPISODE_COLUMNS = ("episode", "steps", "return", "length")
-"""Number of the episode from 1, environment steps of the run when it ended, its return and its length [steps]."""
+"""Number of the episode from 1, steps of the run at its end, its return and its length [steps]."""
 
 
 def read_episodes(path: Path) -> np.ndarray:
-    """The table of a run's training episodes, shape (n, 4), columns `EPISODE_COLUMNS`; any other is refused."""
+    """Return the table of a run's training episodes, shape (n, 4), with columns `EPISODE_COLUMNS`.
+
+    Raises:
+        ValueError: the file has another form.
+    """
     with path.open(newline="") as file:
         header, *rows = [*csv.reader(file)] or [[]]
     try:
@@ -61,10 +66,14 @@ def read_episodes(path: Path) -> np.ndarray:
 def learning_curves(
     episodes: np.ndarray, steps: np.ndarray, evaluations: np.ndarray
 ) -> list[Curve]:
-    """Returns over environment steps: of the training episodes, their running mean, and of the evaluations.
+    """Return curves of returns over environment steps.
 
-    Episodes are rows of `EPISODE_COLUMNS`; evaluations (n,) are those at the steps (n,), NaN where
-    there was none.
+    They are those of the training episodes, of their running mean, and of the evaluations.
+
+    Args:
+        episodes: rows of `EPISODE_COLUMNS`.
+        steps: environment steps of the reports, shape (n,).
+        evaluations: mean returns at these steps, shape (n,); NaN if there was no evaluation.
     """
     curves = []
     if len(episodes):
@@ -86,7 +95,14 @@ def learning_curves(
 
 
 def save_learning_curve(path: Path, title: str, episodes: np.ndarray, reports: np.ndarray) -> None:
-    """Write the learning curve of a run as a PNG file, from rows of `EPISODE_COLUMNS` and of `REPORT_COLUMNS`."""
+    """Write the learning curve of a run as a PNG file.
+
+    Args:
+        path: the file.
+        title: the figure's title.
+        episodes: rows of `EPISODE_COLUMNS`.
+        reports: rows of `REPORT_COLUMNS`.
+    """
     steps, evaluations = (
         reports[:, REPORT_COLUMNS.index(name)] for name in ("steps", "evaluation_return")
     )
@@ -95,36 +111,39 @@ def save_learning_curve(path: Path, title: str, episodes: np.ndarray, reports: n
 
 
 class GrowingTable:
-    """A CSV file of numbers that grows, and its rows in memory."""
+    """Growing CSV file of numbers, with its rows in memory."""
 
     def __init__(self, path: Path, columns: Sequence[str], rows: np.ndarray | None = None) -> None:
-        """Write the file anew, with the rows (n, columns) that a checkpoint has."""
+        """Create the file, or replace it by one with the rows (n, columns) of a checkpoint."""
         self.rows: list[tuple[float, ...]] = (
             [] if rows is None else [tuple(row) for row in rows.tolist()]
         )
-        self._path, self._columns, self._kept = path, columns, 0
+        self._path, self._columns, self._num_written = path, columns, 0
         with writing(path) as temporary:
             temporary.write_text(f"{','.join(columns)}\r\n", newline="")
             self.flush(temporary)
 
     def add(self, row: Iterable[float]) -> None:
-        """A row more, in memory."""
+        """Add a row in memory."""
         self.rows.append(tuple(float(value) for value in row))
 
     def flush(self, path: Path | None = None) -> None:
-        """Bring what was added to the file; whole numbers as integers, so that a step is not `1000.0`."""
+        """Append the new rows to the file; whole numbers as integers, such as `1000` for a step."""
         with (path or self._path).open("a", newline="") as file:
             csv.writer(file).writerows(
-                [int(one) if math.isfinite(one) and one == int(one) else one for one in row]
-                for row in self.rows[self._kept :]
+                [
+                    int(value) if math.isfinite(value) and value == int(value) else value
+                    for value in row
+                ]
+                for row in self.rows[self._num_written :]
             )
-        self._kept = len(self.rows)
+        self._num_written = len(self.rows)
 
     def array(self) -> np.ndarray:
-        """The rows, shape (n, columns)."""
+        """Return the rows, shape (n, columns)."""
         return np.array(self.rows, dtype=np.float64).reshape(-1, len(self._columns))
 
     def last_mean(self, column: str, count: int = WINDOW) -> float:
-        """Mean over the last rows; NaN if there are none."""
+        """Return the mean of a column over the last rows; NaN if there are none."""
         values = [row[self._columns.index(column)] for row in self.rows[-count:]]
         return sum(values) / len(values) if values else math.nan

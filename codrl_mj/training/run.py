@@ -1,4 +1,4 @@
-"""Runs a training from a configuration to a finished run folder, from the start or from the last checkpoint."""
+"""Training from a configuration to a finished run folder, from the start or a checkpoint."""
 
 import contextlib
 import hashlib
@@ -26,7 +26,7 @@ def train(
     tensorboard: bool = True,
     wandb: str | None = None,
 ) -> Path:
-    """Train an agent and leave a run folder; or continue one.
+    """Train an agent into a run folder, or continue the training of one.
 
     The folder grows while the agent trains: `config.json` (resolved configuration, versions, digest
     of the code), `progress.csv` and `episodes.csv`, `checkpoints/`, `best/` (the policy of the best
@@ -40,12 +40,10 @@ def train(
     Args:
         config: what to train.
         out: the run folder.
-        on_progress: called at the ends of rollouts.
-        resume: continue the run if `out` has one, from its last checkpoint that is intact, to the
-            very result that an uninterrupted run has; start it if there is none, and return if it
-            is finished.
-        accept_changes: continue even if code or package versions differ from those it was started
-            with.
+        on_progress: function that is called at the ends of rollouts.
+        resume: continue the run in `out` from its last intact checkpoint, to the same result as
+            that of an uninterrupted run. Start it if there is none, and return if it is finished.
+        accept_changes: continue even if code or package versions differ from those at its start.
         tensorboard: write events for TensorBoard, if it is installed.
         wandb: name of a Weights & Biases project to report to as well.
 
@@ -53,48 +51,56 @@ def train(
         `out`.
 
     Raises:
-        FileExistsError: `out` exists and `resume` is False; nothing in it was touched.
+        FileExistsError: `out` exists and `resume` is False; nothing in it was changed.
         OSError: `out` cannot be written.
         ValueError: the configuration cannot be trained, for instance because the actuator is
-            unstable; or the run in `out` has another one, or was started with other software.
+            unstable; or the run in `out` has another configuration, or was started with other
+            software.
         RunInUseError: another process trains in `out`.
-        TrainingStoppedError: a signal asked to stop.
+        TrainingStoppedError: a signal stopped the training.
     """
     check_episodes(config.evaluation_episodes, "evaluation_episodes")
-    record = folder.admit(out, config, resume, accept_changes)
+    record = folder.prepare_run(out, config, resume, accept_changes)
     if record is None and finished(out):
         return out
     if wandb is not None and importlib.util.find_spec("wandb") is None:
         raise ValueError(f"wandb = {wandb!r}: Weights & Biases is not installed: pip install wandb")
     import torch
 
-    importlib.import_module("matplotlib.figure")  # what is missing is missed now and not in the end
+    # Learning curves are drawn at the end; a missing matplotlib should fail before the training.
+    importlib.import_module("matplotlib.figure")
     from stable_baselines3.common.logger import Logger
 
     from codrl_mj.envs.sb3 import ActuatedVecEnv
     from codrl_mj.training.watcher import LearningEnded, Watcher
 
-    torch.set_num_threads(1)  # networks this small run several times slower on two
-    with folder.taken(out, record is None), stopping(signal.SIGINT, signal.SIGTERM) as asked:
+    # Networks of this size run several times slower on two threads.
+    torch.set_num_threads(1)
+    with (
+        folder.locked_for_training(out, record is None),
+        collecting_signals(signal.SIGINT, signal.SIGTERM) as stop_signals,
+    ):
         envs = ActuatedVecEnv(config.env.world.vector(config.env, config.num_envs))
-        with contextlib.closing(envs), _reporting_to(wandb, out, config):
+        with contextlib.closing(envs), _wandb_context(wandb, out, config):
             model = config.agent.make_model(envs, config.seed)
-            watcher = Watcher(config, out, asked, on_progress, tensorboard)
-            with contextlib.closing(watcher), watcher.explaining():
+            watcher = Watcher(config, out, stop_signals, on_progress, tensorboard)
+            with contextlib.closing(watcher), watcher.explaining_errors():
                 if record is not None:
-                    write_json(
-                        out / CONFIG, sealed(record)
-                    )  # before anything else is in the folder
+                    # The configuration is the first file, so that a folder with other files of a
+                    # run always has it.
+                    write_json(out / CONFIG, sealed(record))
                 steps = config.total_steps
-                if steps is None:  # those of the longest possible episodes where these are counted
+                if steps is None:
+                    # Episodes are counted; this is the number of steps of the longest possible
+                    # ones.
                     steps = (
                         (config.total_episodes or 0)
                         * (config.env.time_limit or 0)
                         * config.num_envs
                     )
-                model.set_logger(
-                    Logger(None, [])
-                )  # until the watcher's: the default makes a folder in the system's
+                # The watcher sets its logger when learning begins. The default logger would create
+                # a folder among the system's temporary files before.
+                model.set_logger(Logger(None, []))
                 with contextlib.suppress(LearningEnded):
                     model.learn(steps, callback=watcher, log_interval=None)
                 watcher.finish()
@@ -102,30 +108,34 @@ def train(
 
 
 @contextlib.contextmanager
-def stopping(*signals: int) -> Iterator[list[int]]:
-    """Turn the first of some signals within the block into a wish, the list's entry; a second SIGINT raises."""
-    asked: list[int] = []
+def collecting_signals(*signals: int) -> Iterator[list[int]]:
+    """Collect signals in a list within a `with` block, instead of their usual effect.
+
+    A SIGINT after another signal raises KeyboardInterrupt.
+    """
+    received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield asked  # only the main thread may handle signals
+        # Only the main thread may set handlers of signals.
+        yield received
         return
 
-    def wish(number: int, _: Any) -> None:
-        if asked and number == signal.SIGINT:
+    def collect(number: int, _: Any) -> None:
+        if received and number == signal.SIGINT:
             raise KeyboardInterrupt
-        asked.append(number)
+        received.append(number)
 
-    before = {number: signal.signal(number, wish) for number in signals}
+    previous = {number: signal.signal(number, collect) for number in signals}
     try:
-        yield asked
+        yield received
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
-def _reporting_to(
+def _wandb_context(
     wandb_project: str | None, out: Path, config: TrainConfig
 ) -> contextlib.AbstractContextManager[Any]:
-    """A context in which Weights & Biases gets what goes to TensorBoard."""
+    """Return a context in which Weights & Biases receives the events for TensorBoard."""
     if wandb_project is None:
         return contextlib.nullcontext()
     import wandb
@@ -136,8 +146,7 @@ def _reporting_to(
         dir=out,
         config=config.as_mapping(),
         sync_tensorboard=True,
-        id=hashlib.sha256(str(out.resolve()).encode()).hexdigest()[
-            :16
-        ],  # a continued run goes on there
+        # The id is that of the folder, so that a continued run continues there, too.
+        id=hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:16],
         resume="allow",
     )

@@ -1,4 +1,4 @@
-"""Watches a model learn: records, reports, evaluates, writes checkpoints, and stops it."""
+"""Callback of trainings that records, reports, evaluates, writes checkpoints and stops."""
 
 import contextlib
 import json
@@ -30,32 +30,38 @@ from codrl_mj.training.config import EVALUATION_SEED, TrainConfig
 from codrl_mj.training.history import EPISODE_COLUMNS, REPORT_COLUMNS, GrowingTable, Progress
 
 REPORT_INTERVAL = 1000
-"""Environment steps between two reports; the next end of a rollout counts."""
+"""Environment steps between two reports, rounded up to the end of a rollout."""
 _RATES = ("learning_rate", "critic_learning_rate", "step_size")
 _REMEMBERED = ("marks", "squares", "samples", "best")
 
 
 class LearningEnded(Exception):  # noqa: N818 - no error
-    """The model is to learn no more: the run is complete."""
+    """Signal that the run is complete and learning must end."""
 
 
 class Watcher(BaseCallback):
-    """The callback of every training run; what it does, it does between two rollouts."""
+    """Callback of every training run, which acts between two rollouts."""
 
     def __init__(
         self,
         config: TrainConfig,
         out: Path,
-        asked: Sequence[int],
+        stop_signals: Sequence[int],
         on_progress: Callable[[Progress], None] | None,
         tensorboard: bool,
     ) -> None:
-        """Prepare; the arguments are those of `train`, and the signals that ask to stop."""
+        """Take the arguments of `train`, and the list of signals that stop the training."""
         super().__init__()
-        self._config, self._out, self._asked, self._on_progress = config, out, asked, on_progress
+        self._config, self._out, self._stop_signals, self._on_progress = (
+            config,
+            out,
+            stop_signals,
+            on_progress,
+        )
         self._tensorboard = tensorboard
         self._marks = {"report": 0, "evaluation": 0, "checkpoint": 0}
-        self._squares, self._samples = 0.0, 0  # of the torque error since the last report
+        # The sum of the squares of the torque error since the last report, and their number.
+        self._squares, self._samples = 0.0, 0
         self._best = {"return": -math.inf, "steps": 0}
         self._seconds_before, self._steps_before, self._start = 0.0, 0, time.perf_counter()
         self._identity = json.dumps(config.as_mapping(), sort_keys=True)
@@ -63,13 +69,14 @@ class Watcher(BaseCallback):
         self.saved_steps = 0
         self.evaluation: Evaluation | None = None
 
-    # -- the callback -------------------------------------------------------------------------------------
+    # -- the callback -----------------------------------------------------------------------------
 
     def _on_training_start(self) -> None:
-        """Continue from the last checkpoint, now that the model has set itself up to start from nothing."""
+        """Restore the last checkpoint after the model has initialized itself."""
         self._arms = self.training_env.arm_radii  # type: ignore[attr-defined]
         if any(path.endswith("arm_radius") for path in self._config.env.distributions):
-            self._arms = np.full_like(self._arms, math.nan)  # none is that of all episodes
+            # With a random arm there is no arm that holds for all episodes.
+            self._arms = np.full_like(self._arms, math.nan)
         state = self._resumed = load_checkpoint(self._out / CHECKPOINTS, self._identity)
         rows: dict[str, np.ndarray | None] = {"episodes": None, "reports": None}
         if state is not None:
@@ -83,7 +90,8 @@ class Watcher(BaseCallback):
         self.reports = GrowingTable(self._out / PROGRESS, REPORT_COLUMNS, rows["reports"])
         writers: list[KVWriter] = []
         if self._tensorboard:
-            with contextlib.suppress(AssertionError, ImportError):  # TensorBoard is not installed
+            # Stable-Baselines3 raises either error if TensorBoard is not installed.
+            with contextlib.suppress(AssertionError, ImportError):
                 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
                 writers.append(TensorBoardOutputFormat(str(self._out / TENSORBOARD)))
@@ -93,22 +101,22 @@ class Watcher(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self.complete:
             raise LearningEnded
-        if (
-            self._resumed is not None
-        ):  # Stable-Baselines3 has drawn state-dependent noise since it was restored
+        if self._resumed is not None:
+            # Stable-Baselines3 draws state-dependent noise between the start of a training and the
+            # first rollout, so the state is restored a second time.
             restore(self.model, self.training_env, self._resumed)
             self._resumed = None
-        stopping = bool(self._asked)
-        self.boundary(stopping)
+        stopping = bool(self._stop_signals)
+        self.run_due_actions(stopping)
         if stopping:
-            told = (
+            message = (
                 f"stopped after {self.saved_steps:,} steps: continue with"
-                f" {folder.resuming(self._out)}"
+                f" {folder.resume_command(self._out)}"
             )
-            raise folder.TrainingStoppedError(told, self._asked[-1])
+            raise folder.TrainingStoppedError(message, self._stop_signals[-1])
 
     def _on_step(self) -> bool:
-        # of every step since the last call, where an agent's compiled loop takes several
+        # An agent's compiled loop takes several steps a call, and has the signals of all of them.
         signals = self.locals.get("signals", self.training_env.signals)  # type: ignore[attr-defined]
         if signals is not None:
             errors = np.subtract(signals["desired_force"], signals["actual_force"]).reshape(
@@ -134,28 +142,32 @@ class Watcher(BaseCallback):
 
     @property
     def complete(self) -> bool:
-        """Whether the training has used its budget up."""
+        """True if the training's budget is used up."""
         steps = self._config.total_steps
         return self._episodes_done or (steps is not None and self.model.num_timesteps >= steps)
 
     @contextlib.contextmanager
-    def explaining(self) -> Iterator[None]:
-        """Say why the block could not go on: a full disk and its like, a second Ctrl-C, weights that are no numbers."""
+    def explaining_errors(self) -> Iterator[None]:
+        """Explain errors in a block: a full disk, a second Ctrl-C, weights that are not finite."""
         try:
             yield
         except OSError as error:
             raise OSError(
-                f"training in {self._out} was broken off: {error}. {folder.standing(self._out)}"
+                f"training in {self._out} was interrupted: {error}."
+                f" {folder.describe_remains(self._out)}"
             ) from error
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"stopped at once. {folder.standing(self._out)}") from None
+            raise KeyboardInterrupt(
+                f"stopped at once. {folder.describe_remains(self._out)}"
+            ) from None
         except Exception:
             self._check_weights()
             raise
 
     def _check_weights(self) -> None:
-        """Raise if a weight is no finite number, before that is kept, with what makes it likely."""
-        model = getattr(self, "model", None)  # not before learning begins
+        """Raise an error if a weight is not finite, before it is saved; name the likely cause."""
+        # The model is set when learning begins.
+        model = getattr(self, "model", None)
         if model is None or all(
             tensor.isfinite().all() for tensor in model.policy.state_dict().values()
         ):
@@ -163,15 +175,20 @@ class Watcher(BaseCallback):
         agent = self._config.agent.as_mapping()
         rates = [f"agent.{name} = {agent[name]:g}" for name in _RATES if agent.get(name)]
         raise FloatingPointError(
-            f"the weights of {agent['name']} became no finite numbers by step"
+            f"the weights of {agent['name']} are not finite at step"
             f" {self.model.num_timesteps:,}: learning diverged. Lower {' or '.join(rates)}, or"
             " scale the rewards down"
         )
 
-    # -- between two rollouts -----------------------------------------------------------------------------
+    # -- between two rollouts ---------------------------------------------------------------------
 
-    def boundary(self, stopping: bool = False, last: bool = False) -> None:
-        """Report, evaluate and write a checkpoint, whichever is due: a checkpoint if stopping, in the end all three."""
+    def run_due_actions(self, stopping: bool = False, last: bool = False) -> None:
+        """Report, evaluate and write a checkpoint, if they are due.
+
+        Args:
+            stopping: write a checkpoint in any case.
+            last: do all three in any case.
+        """
         if self.model.num_timesteps == 0:
             return
         evaluation = self._due("evaluation", self._config.evaluation_interval) or last
@@ -186,10 +203,10 @@ class Watcher(BaseCallback):
         if checkpoint:
             self._save()
 
-    def _due(self, what: str, interval: int) -> bool:
+    def _due(self, action: str, interval: int) -> bool:
         mark = self.model.num_timesteps // interval
-        due = mark > self._marks[what]
-        self._marks[what] = mark
+        due = mark > self._marks[action]
+        self._marks[action] = mark
         return due
 
     def _evaluate(self) -> None:
@@ -198,16 +215,17 @@ class Watcher(BaseCallback):
         self.evaluation = evaluate(self.model.policy, env, episodes, EVALUATION_SEED)
         if self.evaluation.returns.mean > self._best["return"]:
             self._best = {"return": self.evaluation.returns.mean, "steps": self.model.num_timesteps}
-            self._keep_policy(self._out / BEST, self.evaluation)
+            self._save_policy(self._out / BEST, self.evaluation)
 
-    def _keep_policy(self, place: Path, evaluation: Evaluation) -> None:
-        """Write the policy as it is, with what it was found to be worth."""
-        save_policy(self.model.policy, self._config.agent, place)
-        write_json(place / EVALUATION, sealed(evaluation.as_mapping()))
+    def _save_policy(self, path: Path, evaluation: Evaluation) -> None:
+        """Write the present policy with its evaluation."""
+        save_policy(self.model.policy, self._config.agent, path)
+        write_json(path / EVALUATION, sealed(evaluation.as_mapping()))
 
     def _report(self, evaluated: bool) -> None:
         if self.reports.last_mean("steps", 1) == self.model.num_timesteps:
-            return  # killed after the last report, before the run was marked as finished
+            # The process was killed after the last report, before the run was marked as finished.
+            return
         elapsed = time.perf_counter() - self._start
         progress = Progress(
             steps=self.model.num_timesteps,
@@ -243,10 +261,11 @@ class Watcher(BaseCallback):
         self.saved_steps = self.model.num_timesteps
 
     def finish(self) -> None:
-        """Write what a run leaves besides its tables and checkpoints; the result, which marks it as finished, last."""
-        self.boundary(last=True)
-        assert self.evaluation is not None  # of the last boundary
-        self._keep_policy(self._out, self.evaluation)
+        """Write the policy, its evaluation, the learning curve and the result."""
+        # The result comes last, because it marks the run as finished.
+        self.run_due_actions(last=True)
+        assert self.evaluation is not None
+        self._save_policy(self._out, self.evaluation)
         title = f"{self._config.agent.name.upper()} on {self._config.task}"
         history.save_learning_curve(
             self._out / CURVE, title, self.episodes.array(), self.reports.array()
@@ -263,5 +282,6 @@ class Watcher(BaseCallback):
 
     def close(self) -> None:
         """Close the logger's files."""
-        if hasattr(getattr(self, "model", None), "_logger"):  # learning may not have begun
+        # Before learning begins there is no logger.
+        if hasattr(getattr(self, "model", None), "_logger"):
             self.logger.close()

@@ -14,7 +14,7 @@ import mujoco
 
 from codrl_mj.engine.specs import NO_ACTUATORS_READ
 from codrl_mj.physics import install_callbacks, motors
-from codrl_mj.tasks import OURS, TASKS, find_task
+from codrl_mj.tasks import PAPER_TASKS, TASKS, find_task
 from codrl_mj.validation import execution, own_model
 from codrl_mj.validation.compare import is_ours
 from codrl_mj.validation.table import REPORT, Check, Skipped
@@ -162,7 +162,7 @@ _OWN = (
     "an `advance` or a function of your own has to depend on its arguments alone; if it does,"
     f" {REPORT}"
 )
-_RUN = f"if it passes on a gentler run in Task.trials, this one was too violent; if not, {REPORT}"
+_RUN = f"if it passes on a gentler run in Task.reference_states, this one was too violent; if not, {REPORT}"
 _TWIN = "your model and your twin differ: compare masses, gravity and the integrator"
 _FAULTS = {"dynamics": _TWIN, "trajectories": _TWIN, "convergence": _RUN, "energy": _RUN}
 """Whose fault it is if a check of somebody's own task or model fails, by its group."""
@@ -200,7 +200,7 @@ def validate(
     """Check that the port is right.
 
     A task of one's own is put through all that applies to it: what needs a twin, or states and a
-    run of `Task.trials`, is skipped without them.
+    run of `Task.reference_states`, is skipped without them.
 
     Args:
         tasks: a task, several, or None for all that are registered.
@@ -218,7 +218,7 @@ def validate(
             " of them"
         )
     names = dict.fromkeys(find_task(name).name for name in given)
-    others = [name for name in names if TASKS[name] not in OURS]
+    others = [name for name in names if TASKS[name] not in PAPER_TASKS]
     chosen = list(GROUPS) if groups is None else list(groups)
     for group in chosen:
         if group not in GROUPS:

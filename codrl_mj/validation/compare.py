@@ -43,14 +43,14 @@ def is_ours(task: Task) -> bool:
 def without_oracle(task: Task) -> str:
     """Why a task cannot be compared with Gymnasium step by step; empty if it can."""
     several = "it has several motors, and commands are made for one" if len(task.motors) > 1 else ""
-    return NO_TWIN if task.twin is None else several
+    return NO_TWIN if task.reference_env is None else several
 
 
 def both(
     task: Task, actuator: ActuatorModel, integrator: str, max_force: float | None = None
 ) -> tuple[MujocoPhysics, AnalyticPhysics]:
     """The task in MuJoCo, and on Gymnasium's equations; `max_force` changes MuJoCo's limit of the desired force."""
-    steps = task.steps_within(actuator, None, None)
+    steps = task.num_inner_steps(actuator, None, None)
     limits = task.max_forces if max_force is None else np.array([max_force])
     return (
         MujocoPhysics(SimulationConfig(task, [actuator], steps, integrator, limits)),
@@ -60,7 +60,7 @@ def both(
 
 def physics_of(task: Task) -> tuple[tuple[str, type], ...]:
     """The physics that a task can be simulated by, MuJoCo first."""
-    return PHYSICS if task.twin is not None else PHYSICS[:1]
+    return PHYSICS if task.reference_env is not None else PHYSICS[:1]
 
 
 def actuators_named(name: str, task: Task) -> tuple[Any, ...]:
@@ -106,8 +106,8 @@ def gymnasium_equations(task: Task, dt: float | None = None) -> Equations:
     environment gives a = (v_new - v)/dt, and the derivative of a position is its velocity. dt [s]
     is a power of two, or None for one of at most a quarter of an environment step.
     """
-    assert task.twin is not None
-    driver: Any = task.twin()
+    assert task.reference_env is not None
+    driver: Any = task.reference_env()
     if hasattr(driver, "derivative"):
         return driver.derivative
     for owner, name in itertools.product((driver, getattr(driver, "env", None)), BOUNDS):

@@ -34,7 +34,7 @@ from codrl_mj.physics import (
     install_callbacks,
 )
 from codrl_mj.physics.mjcf import task_model
-from codrl_mj.tasks import OURS, Task, find_task
+from codrl_mj.tasks import PAPER_TASKS, Task, find_task
 from codrl_mj.validation.compare import (
     NO_TWIN,
     Equations,
@@ -59,15 +59,15 @@ from codrl_mj.validation.table import (
 
 
 def free_run(task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The run of `Task.trials`, the same every time; of a task that has none, a few steps from one of its starts.
+    """The run of `Task.reference_states`, the same every time; of a task that has none, a few steps from one of its starts.
 
     Its initial state, the desired forces, full either way and each held for one environment step,
     and the first of these, over which energies are balanced.
     """
-    trials = task.trials
+    trials = task.reference_states
     steps, balanced = (6, 2) if trials is None else (trials.steps, trials.balanced_steps)
     start = (
-        task.initial(np.random.default_rng(3), None) if trials is None else np.array(trials.start)
+        task.draw_initial_state(np.random.default_rng(3), None) if trials is None else np.array(trials.start)
     )
     forces = forces_of(task, np.random.default_rng(3).choice([-1.0, 1.0], steps * len(task.motors)))
     return start, forces, forces[:balanced]
@@ -75,7 +75,7 @@ def free_run(task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def obstacle(task: Task) -> str:
     """Why the run of somebody's task is not smooth; empty if it is."""
-    if task in OURS:  # whose runs are tested
+    if task in PAPER_TASKS:  # whose runs are tested
         return ""
     start, forces, _ = free_run(task)
     free = dataclasses.replace(task, step_duration=task.step_duration / 16, constrain=None)
@@ -89,12 +89,12 @@ def obstacle(task: Task) -> str:
         if physics.data.nefc:
             return (
                 "a contact, a limit, friction or another constraint acts in the run: name another"
-                " in Task.trials"
+                " in Task.reference_states"
             )
         if task.constrain is not None:
             kept = np.array(task.constrain(physics.state, free.step_duration))
             if not np.array_equal(kept, physics.state):
-                return "the run meets the task's bounds: name another in Task.trials"
+                return "the run meets the task's bounds: name another in Task.reference_states"
     return ""
 
 
@@ -167,7 +167,7 @@ def solve(
             motor, loop = actuator.motor, actuator.controller
             current, integral = state[size + 2 * at : size + 2 * at + 2]
             reference = desired[at] * motor.arm_radius / motor.torque_constant
-            back_emf = motor.back_emf_constant * state[task.speeds[at]] / motor.arm_radius
+            back_emf = motor.back_emf_constant * state[task.speed_indices[at]] / motor.arm_radius
             error = reference - current
             voltage = (
                 loop.kp * error
@@ -212,7 +212,7 @@ def analogues(task: Task) -> tuple[DCMotorActuator, ...]:
 
 def halvings(task: Task, most: int = 4) -> range:
     """Return how many times more the steps of a run are halved, in turn, until its errors show an order."""
-    first = 2 if task.trials is None else 0  # in a run that nobody chose the first steps are finer
+    first = 2 if task.reference_states is None else 0  # in a run that nobody chose the first steps are finer
     return range(first, first + (1 if is_ours(task) else most + 1), 2)
 
 
@@ -241,7 +241,7 @@ def blamed(
         " smooth"
     )
     return Skipped(
-        outcome.name, f"{why}. Name a gentler one in Task.trials, or a smaller max_force"
+        outcome.name, f"{why}. Name a gentler one in Task.reference_states, or a smaller max_force"
     )
 
 
@@ -343,7 +343,7 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     if reason:
         yield Skipped("all checks", reason)
         return
-    if task.twin is None:
+    if task.reference_env is None:
         yield Skipped("equations of motion that are not MuJoCo's", NO_TWIN)
         equations, whose, named = engine_equations(task), "MuJoCo's own accelerations", "MuJoCo"
     else:

@@ -13,7 +13,7 @@ import numpy as np
 from codrl_mj.actuators import IDEAL
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import Task, find_task
-from codrl_mj.tasks.twin import ReferenceStates
+from codrl_mj.tasks.reference_env import ReferenceStates
 from codrl_mj.validation.compare import both, differences, gymnasium_equations, without_oracle
 from codrl_mj.validation.table import Case, Check, Skipped, check
 
@@ -134,11 +134,11 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     """The checks of this group."""
     task = find_task(task_name)
     missing = without_oracle(task)
-    if missing or task.trials is None:
-        yield Skipped("all checks", missing or "it names no states to try it in: Task.trials")
+    if missing or task.reference_states is None:
+        yield Skipped("all checks", missing or "it names no states to try it in: Task.reference_states")
         return
     flat = len(task.state_names) == 2
     points = (9 if flat else 3) if quick else (51 if flat else 7)
-    yield from accelerations(task, task.trials, points)
+    yield from accelerations(task, task.reference_states, points)
     for integrator in task.integrators:
-        yield from one_step(task, task.trials, integrator, quick)
+        yield from one_step(task, task.reference_states, integrator, quick)

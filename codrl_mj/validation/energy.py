@@ -80,7 +80,7 @@ class Meter:
         self._data = mujoco.MjData(self._model)
         self._qpos, self._qvel = list(task.qpos), list(task.qvel)
         hilly = bool(hills(self._model))
-        if hilly and task.twin is None:
+        if hilly and task.reference_env is None:
             raise ValueError("its model has a hill, whose height only a twin knows")
         self._hill = hill_potential(task, float(self._model.body_mass[-1])) if hilly else None
         options = self._model.opt
@@ -200,7 +200,7 @@ def keep(
         np.array([getattr(motor, name) for motor in motors])
         for name in ("resistance", "inductance", "back_emf_constant", "arm_radius")
     )
-    speeds = list(task.speeds)
+    speeds = list(task.speed_indices)
     positions = [task.qpos[task.qvel.index(speed)] for speed in speeds]
     back_emf = constant * state[:, speeds] / arm
     mean = (current[1:] + current[:-1]) / 2
@@ -243,7 +243,7 @@ def step_by_step(task: Task, quick: bool) -> Iterator[Case]:
         actuators = actuators_named(name, task)
         generator = np.random.default_rng(5)
         forces = forces_of(task, generator.choice([-1.0, 1.0], steps * len(task.motors)))
-        start = task.initial(generator, None)
+        start = task.draw_initial_state(generator, None)
         for label, kind in physics_of(task):
             where = f"{name} actuator, {label}"
             try:

@@ -162,7 +162,7 @@ def _simulation(
     physics = MujocoPhysics(
         SimulationConfig(task, actuators_of(task), task.motor_inner_steps, integrator)
     )
-    initial = task.initial(generator, None)
+    initial = task.draw_initial_state(generator, None)
     physics.reset(initial)
     return physics, initial, forces_of(task, generator.uniform(-1.0, 1.0, steps * len(task.motors)))
 

@@ -118,11 +118,11 @@ class Mechanics:
         )
         self._friction = motor.coulomb_friction / arm
         self._task, self._timestep, self._integrator = task, timestep, integrator
-        assert task.twin is not None
+        assert task.reference_env is not None
         self._twin, self._equations, self._at = (
-            task.twin(),
+            task.reference_env(),
             gymnasium_equations(task),
-            task.speeds[0],
+            task.speed_indices[0],
         )
         _, slope = self._linear(np.zeros(len(task.state_names)))
         self._softness = (
@@ -168,12 +168,12 @@ _TWIN = "Gymnasium {task.gymnasium_id} with a rotor on its joint, the winding by
 def fitted_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
     """A run of a task with its drive of `FITTED`, which has that motor, in the engine, under bang-bang commands."""
     one, generator = fitted(task.name), np.random.default_rng(0)
-    inner, arm, speed = task.motor_inner_steps, one.arm_radius, task.speeds[0]
+    inner, arm, speed = task.motor_inner_steps, one.arm_radius, task.speed_indices[0]
     longest = round((5e4 if quick else 5e5) / (task.step_duration * one.controller.sample_rate))
     steps = min(
-        longest, task.max_episode_steps or longest, (task.trials and task.trials.horizon) or longest
+        longest, task.max_episode_steps or longest, (task.reference_states and task.reference_states.horizon) or longest
     )
-    timestep, state = task.step_duration / inner, task.initial(generator, None)
+    timestep, state = task.step_duration / inner, task.draw_initial_state(generator, None)
     physics = MujocoPhysics(SimulationConfig(task, [one], inner, integrator))
     physics.reset(state)
     bench, mechanics = Bench(one, timestep), Mechanics(task, one, timestep, integrator)

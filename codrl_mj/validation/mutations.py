@@ -22,11 +22,11 @@ import numpy as np
 from codrl_mj import engine
 from codrl_mj.actuators import ActuatorModel, current_loop, drive
 from codrl_mj.engine import control
-from codrl_mj.engine.families import SLOT, replaced
+from codrl_mj.engine.families import SLOT_HEADER_SIZE, family_replaced
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import MujocoPhysics, compiled_task, mjcf
 from codrl_mj.physics.variation import bare_model
-from codrl_mj.tasks import OURS, find_task
+from codrl_mj.tasks import PAPER_TASKS, find_task
 from codrl_mj.validation.certificate import (
     WITHOUT_TASK,
     Certificate,
@@ -117,9 +117,9 @@ def _wrong_callbacks(edits: tuple[Edit, ...]) -> Callable[[], Any]:
 @contextlib.contextmanager
 def wrong_callback(*edits: Edit) -> Iterator[None]:
     """MuJoCo runs a callback that was compiled from edited source."""
-    names, _, remedy = control._PARTS["motor"]
+    names, _, remedy = control._GROUPS["motor"]
     engine.uninstall()
-    with mock.patch.dict(control._PARTS, motor=(names, _wrong_callbacks(edits), remedy)):
+    with mock.patch.dict(control._GROUPS, motor=(names, _wrong_callbacks(edits), remedy)):
         try:
             yield
         finally:
@@ -152,7 +152,7 @@ def wrong_loop(
     with contextlib.ExitStack() as stack:
         for family in _wrong_families(module, edits):
             right = getattr(module, family.__name__)
-            stack.enter_context(replaced(right, family))
+            stack.enter_context(family_replaced(right, family))
             if everywhere:
                 stack.enter_context(mock.patch.object(right, "advance", vars(family)["advance"]))
         yield
@@ -188,10 +188,10 @@ _LATE_FORCE: tuple[Edit, ...] = (
 )
 _EVERY_PASS: Edit = ("if time != f64(slot)[0]:", "if True:")
 _EVERY_STAGE: Edit = ("if DATA.pbase(data) != 0:", "if False:")
-_ADVANCED = "if size_of(number, INERTIA) else math.inf,\n            )\n"
-_CANDIDATE = SLOT + len(current_loop.State._fields)
+_ADVANCED = "if family_size(number, INERTIA) else math.inf,\n            )\n"
+_CANDIDATE = SLOT_HEADER_SIZE + len(current_loop.State._fields)
 _SHARED_CURRENT: tuple[Edit, ...] = (
-    (_COMMIT, f"{_COMMIT}                f64(slot)[{SLOT}] = f64(HIDDEN)[0]\n"),
+    (_COMMIT, f"{_COMMIT}                f64(slot)[{SLOT_HEADER_SIZE}] = f64(HIDDEN)[0]\n"),
     (_ADVANCED, f"{_ADVANCED}            f64(HIDDEN)[0] = f64(slot)[{_CANDIDATE}]\n"),
 )
 
@@ -231,7 +231,7 @@ class Mutation:
     """Makes it, for the length of a `with` block."""
     groups: tuple[str, ...]
     """The groups of checks that it is shown to."""
-    tasks: tuple[str, ...] = tuple(task.name for task in OURS)
+    tasks: tuple[str, ...] = tuple(task.name for task in PAPER_TASKS)
     """The tasks in which it is a fault."""
 
 
@@ -239,10 +239,10 @@ _PHYSICS = ("dynamics", "trajectories")
 _MECHANICS = (*_PHYSICS, "convergence", "energy")
 _LOOP = ("trajectories", "motor")
 _UNEQUAL_GAINS = tuple(
-    task.name for task in OURS if task.paper[0].controller.kp != task.paper[0].controller.ki
+    task.name for task in PAPER_TASKS if task.paper[0].controller.kp != task.paper[0].controller.ki
 )
-_BOUNDED = tuple(task.name for task in OURS if task.constrain is not None)
-_RUNGE_KUTTA = tuple(task.name for task in OURS if "rk4" in task.integrators)
+_BOUNDED = tuple(task.name for task in PAPER_TASKS if task.constrain is not None)
+_RUNGE_KUTTA = tuple(task.name for task in PAPER_TASKS if "rk4" in task.integrators)
 _TURNING = ("pendulum", "cartpole", "acrobot")
 """Where back-EMF counts: gains that follow the winding hide it from anything else, and the cars'
 motors hardly turn (a difference of 3e-10, where 1e-9 is allowed).
@@ -385,7 +385,7 @@ def faulty(tasks: str | Sequence[str] | None = None) -> list[str]:
     """The names of the tasks that faults are made in, all that there are or those given, which must be ours."""
     names = [tasks] if isinstance(tasks, str) else list(tasks or Mutation.tasks)
     for name in names:
-        if find_task(name) not in OURS:
+        if find_task(name) not in PAPER_TASKS:
             raise ValueError(
                 f"task {name!r}: faults are made in these alone: {', '.join(Mutation.tasks)}"
             )

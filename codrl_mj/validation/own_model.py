@@ -31,10 +31,10 @@ from codrl_mj.actuators import (
     spectral_radius,
 )
 from codrl_mj.engine import load_family
-from codrl_mj.engine.doors import shaft_inertia
-from codrl_mj.engine.families import SLOT, Slot, slot_size
-from codrl_mj.engine.reading import sharing, slots
-from codrl_mj.engine.specs import doubled
+from codrl_mj.engine.model_access import shaft_inertia
+from codrl_mj.engine.families import SLOT_HEADER_SIZE, SlotHeader, slot_size
+from codrl_mj.engine.reading import actuators_sharing_motor, motor_slots
+from codrl_mj.engine.specs import describe_duplicate_dynamics
 from codrl_mj.physics import SimulationConfig, install_callbacks, motors
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.variation import without_motors
@@ -67,7 +67,7 @@ UNKNOWN = {
 """Groups that need to know more of a model than its motors, and what."""
 
 
-KEY = Slot._fields.index("noise_key")
+KEY = SlotHeader._fields.index("noise_key")
 
 
 def entries(actuator: ActuatorModel) -> tuple[str, ...]:
@@ -86,7 +86,7 @@ def beside(
     engine and in Python, of shape (steps, k), columns as in `entries`.
     """
     data = mujoco.MjData(model)
-    slot_of = slots(data, actuators)
+    slot_of = motor_slots(data, actuators)
     kinds: dict[int, Family] = {at: type(one) for at, one in actuators.items()}
     parameters = {at: parameters_type(kinds[at])(*one.numbers) for at, one in actuators.items()}
     states = {at: kind.State(*[0.0] * len(kind.State._fields)) for at, kind in kinds.items()}
@@ -129,7 +129,7 @@ def beside(
                 else torque / arm
             )
             oracle = [*states[at], *signals, torque]
-            after = SLOT + len(states[at])  # the candidate state, then the signals
+            after = SLOT_HEADER_SIZE + len(states[at])  # the candidate state, then the signals
             found[at][0, step] = (
                 *slot_of[at][after : after + len(oracle) - 1],
                 before.actuator_force[output],
@@ -177,12 +177,12 @@ def motor_checks(model: mujoco.MjModel, quick: bool) -> Iterator[Check | Skipped
     """The motors of a model whose callbacks are installed: stable, in step with Python, and each loop alone."""
     named = {at: model.actuator(at).name or f"actuator {at}" for at in range(model.nactuator)}
     ours = motors(model)
-    driven = {one for at in ours for one in sharing(model, at)}
+    driven = {one for at in ours for one in actuators_sharing_motor(model, at)}
     if foreign := [model.actuator(at).name or str(at) for at in named if at not in driven]:
         yield Skipped(
             f"actuators {', '.join(foreign)}", "not motors of codrl_mj, which leaves them alone"
         )
-    for text in doubled(without_motors(model, ours), ours):
+    for text in describe_duplicate_dynamics(without_motors(model, ours), ours):
         yield Skipped(
             "whether a motor is counted twice", f"this cannot be seen in a compiled model: {text}"
         )

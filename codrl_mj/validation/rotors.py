@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, CurrentLoop, DCMotorActuator, Motor
-from codrl_mj.engine.families import signals_at, slot_size
+from codrl_mj.engine.families import signals_offset, slot_size
 from codrl_mj.physics import install_callbacks, mjcf
-from codrl_mj.tasks import OURS
+from codrl_mj.tasks import PAPER_TASKS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +108,7 @@ def drive(model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None
     """
     data = mujoco.MjData(model)
     entry = (
-        signals_at(DCMotorActuator)
+        signals_offset(DCMotorActuator)
         if model.na == model.nactuator * slot_size(DCMotorActuator)
         else 0
     )  # current comes first
@@ -170,7 +170,7 @@ EVERY_FEATURE = Loop(
 def standard_loops() -> dict[str, Loop]:
     """The paper's loop of each of our tasks at the task's inner step, and one with every feature."""
     paper = {
-        task.name: Loop(task.paper[0], task.step_duration / task.motor_inner_steps) for task in OURS
+        task.name: Loop(task.paper[0], task.step_duration / task.motor_inner_steps) for task in PAPER_TASKS
     }
     return {**paper, "every feature": EVERY_FEATURE}
 

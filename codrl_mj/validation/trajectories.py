@@ -1,6 +1,6 @@
 """Whole runs under the same commands: MuJoCo with the motor in its callback against Gymnasium with the motor in Python.
 
-A run is judged twice. Up to the horizon of `Task.trials` the difference itself must stay below
+A run is judged twice. Up to the horizon of `Task.reference_states` the difference itself must stay below
 1e-9. Over a whole episode, where a chaotic task would enlarge even the smallest rounding beyond any
 fixed bound, the difference is measured against what rounding becomes in the oracle itself along
 this run (`Growth`): what remains is the error made, not what chaos made of it.
@@ -105,7 +105,7 @@ def _run(
     """
     mujoco, analytic = both(task, actuator, integrator)
     generator = np.random.default_rng(seed)
-    initial = task.initial(generator, None)
+    initial = task.draw_initial_state(generator, None)
     forces = task.max_force * generator.choice([-1.0, 1.0], steps)
     for physics in (mujoco, analytic):
         physics.reset(initial)
@@ -178,7 +178,7 @@ def whole_runs(
             {"controller.max_voltage": 0.5, "controller.bemf_compensation": False}
         )
     steps = min(longest, task.max_episode_steps or UNLIMITED_STEPS)
-    horizon = min(steps, (task.trials and task.trials.horizon) or steps)
+    horizon = min(steps, (task.reference_states and task.reference_states.horizon) or steps)
     for seed in seeds:
         gaps, where, growth = _run(task, actuator, integrator, steps, seed)
         in_roundings = gaps / np.append(growth.rounding, np.ones(len(gaps) - len(growth.rounding)))

@@ -63,8 +63,8 @@ class Model:
         from scipy import sparse
 
         task = TASKS[TASK]
-        assert task.twin is not None
-        step = task.twin()
+        assert task.reference_env is not None
+        step = task.reference_env()
         self.grid = grid
         points = np.stack(
             [axis.ravel() for axis in np.meshgrid(*grid.axes, indexing="ij")], axis=-1

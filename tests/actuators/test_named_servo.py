@@ -25,7 +25,7 @@ from codrl_mj.actuators import (
 from codrl_mj.cli import main
 from codrl_mj.sizing import find_drive, find_loop
 from codrl_mj.training import load_config
-from codrl_mj.training.folder import admit
+from codrl_mj.training.folder import prepare_run
 from tests.cli.lines import TINY, ran, refused
 
 MOTOR, LENGTH, MASS = "maxon-ec45-flat-50w", 0.2, 0.5
@@ -180,7 +180,7 @@ def test_the_command_line_makes_a_servo_of_a_name_and_a_run_keeps_it(files, monk
     )
     Path("run").mkdir()
     Path("run/config.json").write_text(
-        json.dumps(admit(Path("other"), configs[0], resume=False, accept_changes=False))
+        json.dumps(prepare_run(Path("other"), configs[0], resume=False, accept_changes=False))
     )
     made = load_config(Path("run")).actuators[0]
     changes = {"motor": {"gear_ratio": 50.0}, "loop": {"position_gain": 10.0}}

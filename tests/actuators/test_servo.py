@@ -22,7 +22,7 @@ from codrl_mj.actuators import (
     parameters_type,
 )
 from codrl_mj.engine.reading import check_shafts
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 INERTIA, RATIO = 0.02, 10.0
 MOTOR = GearMotor(gear_ratio=RATIO, rotor_inertia=1e-6)
@@ -61,7 +61,7 @@ def turned(one, targets, timestep=0.001, load=0.0):
 
 @pytest.mark.parametrize(
     ("timestep", "rate"),
-    but([(0.001, 2000.0)], [(0.0005, 2000.0), (0.001, 2000.0), (0.0005, 500.0)]),
+    matrix_params([(0.001, 2000.0)], [(0.0005, 2000.0), (0.001, 2000.0), (0.0005, 500.0)]),
 )
 def test_a_position_loop_is_the_linear_system_that_it_looks_like(timestep, rate):
     """Torque g*(K*(q* - q) - w), held over a sample, on an inertia; the loop's rate may be that of the steps or not."""

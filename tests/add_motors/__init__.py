@@ -1,1 +1,1 @@
-"""Motors in models of other people's, behind MuJoCo's plugin."""
+"""Tests of motors in third-party models, with MuJoCo's plugin."""

@@ -1,4 +1,4 @@
-"""Models with our actuators at either door, and robots of other people's."""
+"""Models with our actuators in either backend, and third-party robots."""
 
 import dataclasses
 from importlib.util import find_spec
@@ -31,17 +31,17 @@ INTEGRATORS = ("Euler", "RK4", "implicitfast")
 
 
 class State(NamedTuple):
-    """What `Worn` remembers."""
+    """State of `Worn`."""
 
     heat: float
     turns: float
 
 
 class Signals(NamedTuple):
-    """What is seen of it."""
+    """Signals of `Worn`."""
 
     heat: float
-    told: float
+    recorded: float
 
 
 def advance(parameters, timestep, state, inputs):
@@ -51,13 +51,13 @@ def advance(parameters, timestep, state, inputs):
         - parameters.stiffness * inputs.position
         - 0.01 * inputs.speed
     )
-    told = inputs.time + 1e-3 * inputs.noise_key
-    return State(heat, state.turns + timestep * inputs.speed), torque, Signals(heat, told)
+    recorded = inputs.time + 1e-3 * inputs.noise_key
+    return State(heat, state.turns + timestep * inputs.speed), torque, Signals(heat, recorded)
 
 
 @dataclasses.dataclass(frozen=True)
 class Worn(ActuatorModel):
-    """A family of somebody else's, which uses everything that it is told."""
+    """Custom family that uses all inputs."""
 
     State: ClassVar[type] = State
     Signals: ClassVar[type] = Signals
@@ -101,7 +101,7 @@ ACTUATORS = {
         ServoLoop(position_gain=2.0, velocity_gain=0.5, velocity_integral_gain=0.1),
     ),
     "torque_speed": TorqueSpeed(stall_torque=0.8, no_load_speed=3.0, max_torque=0.6),
-    "somebody's": Worn(),
+    "custom": Worn(),
 }
 
 _ARM = """
@@ -127,17 +127,17 @@ _ARM = """
 
 
 def arm(integrator="Euler", kind="hinge"):
-    """The spec of two links with a plain motor at each joint; the first may slide."""
+    """Return the spec of two links with a plain motor at each joint; the first may slide."""
     return mujoco.MjSpec.from_string(_ARM.format(integrator=integrator, kind=kind))
 
 
 def behind_plugin(spec, actuators):
-    """A spec's motors driven by ours at the plugin's door, compiled."""
+    """Return a spec with our motors behind its actuators in the plugin backend, compiled."""
     return codrl_mj.add_motors(spec, actuators).compile()
 
 
 def behind_callback(spec, actuators):
-    """The same at the control callback's door, where controls are torques at the shaft."""
+    """Return the same in the callback backend, where controls are torques at the shaft."""
     spec = spec.copy()
     for name, actuator in actuators.items():
         codrl_mj.engine.load_family(type(actuator))
@@ -150,13 +150,13 @@ def behind_callback(spec, actuators):
 
 
 def controls(steps, nu, seed=0, low=-1.0, high=1.0):
-    """Random controls, each held for five steps."""
+    """Return random controls, each held for five steps."""
     generator = np.random.default_rng(seed)
     return np.repeat(generator.uniform(low, high, (steps // 5 + 1, nu)), 5, axis=0)[:steps]
 
 
 def own_controls(model, steps, seed=0):
-    """Random controls over a model's own ranges."""
+    """Return random controls within a model's control ranges."""
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = model.actuator_ctrlrange.T
     return controls(
@@ -165,7 +165,10 @@ def own_controls(model, steps, seed=0):
 
 
 def trajectory(model, inputs, data=None, before_step=None):
-    """What a model without plugins has of state, and its forces, after each step; `before_step(data)` may interfere."""
+    """Return the state without that of plugins, and the forces, after each step.
+
+    `before_step(data)` is called before each step.
+    """
     data = mujoco.MjData(model) if data is None else data
     rows = []
     for ctrl in inputs:
@@ -182,19 +185,20 @@ def trajectory(model, inputs, data=None, before_step=None):
 
 
 def full_state(data):
-    """Everything that a simulation is continued from."""
+    """Return all values from which a simulation can be continued."""
     state = np.empty(mujoco.mj_stateSize(data.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(data.model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     return state
 
 
 def _package(name):
-    found = find_spec(name)
-    return Path(found.origin).parent if found else Path("/nowhere")
+    package = find_spec(name)
+    return Path(package.origin).parent if package else Path("/nowhere")
 
 
 GYMNASIUM = sorted((_package("gymnasium") / "envs/mujoco/assets").glob("*.xml"))
-_WITHOUT_ACTUATORS = {"lqr", "swimmer"}  # the suite adds them in Python
+# The suite adds the actuators of these models in Python.
+_WITHOUT_ACTUATORS = {"lqr", "swimmer"}
 SUITE = [
     path
     for path in sorted((_package("dm_control") / "suite").glob("*.xml"))

@@ -1,4 +1,4 @@
-"""`add_motors`: what goes where, what is refused and why, and what is added to joints."""
+"""`add_motors`: patterns, refusals with their reasons, and additions to joints."""
 
 import re
 
@@ -39,7 +39,7 @@ THREE = (
 )
 
 
-def test_patterns_match_names_or_what_is_driven_from_beginning_to_end():
+def test_patterns_match_whole_names_of_actuators_or_their_targets():
     lag = Lag(time_constant=0.1)
     model = codrl_mj.add_motors(_spec(*THREE), {"left": lag, "hip_r.*": LOOP}).compile()
     assert codrl_mj.engine.motors(model) == {0: lag, 1: LOOP}
@@ -48,7 +48,7 @@ def test_patterns_match_names_or_what_is_driven_from_beginning_to_end():
 
 
 @pytest.mark.parametrize(
-    ("given", "expected"),
+    ("actuator", "expected"),
     [
         (None, Ideal()),
         ({"family": "lag", "time_constant": 0.2}, Lag(time_constant=0.2)),
@@ -57,13 +57,13 @@ def test_patterns_match_names_or_what_is_driven_from_beginning_to_end():
         ("tests.add_motors.models:LOOP", LOOP),
     ],
 )
-def test_actuators_are_given_as_everywhere(given, expected):
-    assert codrl_mj.engine.motors(codrl_mj.add_motors(arm(), {"one": given}).compile()) == {
+def test_actuators_have_the_usual_forms(actuator, expected):
+    assert codrl_mj.engine.motors(codrl_mj.add_motors(arm(), {"one": actuator}).compile()) == {
         0: expected
     }
 
 
-def test_the_given_spec_is_not_changed_and_what_is_unstable_allowed_on_request():
+def test_the_spec_is_not_changed_and_allow_unstable_accepts_unstable_motors():
     spec, unstable = arm(), DCMotorActuator(controller=CurrentLoop(kp=500.0))
     before = spec.to_xml()
     model = codrl_mj.add_motors(spec, {".*": unstable}, allow_unstable=True).compile()
@@ -71,7 +71,8 @@ def test_the_given_spec_is_not_changed_and_what_is_unstable_allowed_on_request()
     assert spec.to_xml() == before
 
 
-IMPOSSIBLE = [  # an actuator, and why it cannot be motorised
+# An actuator that cannot have a motor, and the reason.
+IMPOSSIBLE = [
     ('<muscle name="it" joint="hip_left"/>', "mjDYN_MUSCLE"),
     ('<dcmotor name="it" joint="hip_left" motorconst="1" resistance="1"/>', "mjDYN_DCMOTOR"),
     ('<pid name="it" joint="hip_left" kp="1"/>', "mjGAIN_PID"),
@@ -100,11 +101,15 @@ SITE = '<general name="push" site="here" gear="1 0 0 0 0 0"/>'
     ("actuators", "patterns", "message"),
     [
         *(
-            ((one,), {".*": "ideal"}, f"^actuator it of [a-z_]+: cannot be motorised: .*{why}")
-            for one, why in IMPOSSIBLE
+            ((element,), {".*": "ideal"}, f"^actuator it of [a-z_]+: cannot have a motor: .*{why}")
+            for element, why in IMPOSSIBLE
         ),
-        ((SITE,), {"push": RUBBING}, "it drives neither a joint nor a tendon, which the friction"),
-        (THREE, {"hip": "lag"}, "'hip': no actuator has such a name, nor drives anything that has"),
+        ((SITE,), {"push": RUBBING}, "it drives neither a joint nor a tendon, to which MuJoCo"),
+        (
+            THREE,
+            {"hip": "lag"},
+            "'hip': no actuator has such a name, nor drives a target of this name",
+        ),
         (
             THREE,
             {"hip_rihgt": "lag"},
@@ -127,21 +132,21 @@ SITE = '<general name="push" site="here" gear="1 0 0 0 0 0"/>'
         ),
     ],
 )
-def test_what_cannot_be_motorised_is_refused_with_the_reason(actuators, patterns, message):
+def test_add_motors_raises_and_names_the_reason(actuators, patterns, message):
     with pytest.raises(ValueError, match=message):
         codrl_mj.add_motors(_spec(*actuators), patterns)
 
 
-def test_what_cannot_be_simulated_is_not_allowed_with_what_is_unstable():
+def test_allow_unstable_does_not_accept_invalid_actuators():
     with pytest.raises(ValueError, match=r"'one': Lag\.delay = 5: must be <= 0\.04 s"):
         codrl_mj.add_motors(arm(), {"one": Lag(delay=5.0)}, allow_unstable=True)
 
 
-def test_plugins_and_motors_of_ours_are_not_motorised_again():
+def test_actuators_with_plugins_or_our_motors_do_not_get_a_second_motor():
     once = codrl_mj.add_motors(arm(), {"one": "lag"})
     with pytest.raises(
         ValueError,
-        match=r"actuator one of upper: cannot be motorised: it is a plugin, codrl_mj\.actuator",
+        match=r"actuator one of upper: cannot have a motor: it is a plugin, codrl_mj\.actuator",
     ):
         codrl_mj.add_motors(once, {"one": "ideal"})
     twice = codrl_mj.add_motors(once, {"two": "ideal"}).compile()
@@ -149,7 +154,7 @@ def test_plugins_and_motors_of_ours_are_not_motorised_again():
 
 
 def test_the_limit_of_a_tendon_is_not_applied_to_plugins():
-    """Why such a tendon is refused: MuJoCo looks for it among actuators that are no plugins."""
+    """Check the reason for a refusal: MuJoCo ignores plugins when it limits a tendon's force."""
     spec = _spec('<motor tendon="weak_rope"/>')
     forces = []
     for plugin in (False, True):
@@ -170,7 +175,7 @@ def test_the_limit_of_a_tendon_is_not_applied_to_plugins():
     assert forces == [1.0, 45.0]
 
 
-def test_several_actuators_of_one_joint_are_several_motors_if_one_says_so():
+def test_actuators_of_one_joint_get_several_motors_by_several_patterns():
     plain, ours = (
         _spec(*PAIR).compile(),
         codrl_mj.add_motors(_spec(*PAIR), {"kp": "ideal", "kv": "ideal"}).compile(),
@@ -179,44 +184,44 @@ def test_several_actuators_of_one_joint_are_several_motors_if_one_says_so():
     np.testing.assert_array_equal(trajectory(ours, inputs), trajectory(plain, inputs))
 
 
-def test_two_motors_of_one_joint_are_together_one_twice_as_strong():
+def test_two_motors_of_one_joint_equal_one_that_is_twice_as_strong():
     """A lag is linear, and halves and doubles are exact."""
     lag = Lag(time_constant=0.05)
     two = _spec(
         '<motor name="a" joint="hip_left" gear="2"/>', '<motor name="b" joint="hip_left" gear="2"/>'
     )
-    one = _spec('<motor name="a" joint="hip_left" gear="4"/>')
+    single = _spec('<motor name="a" joint="hip_left" gear="4"/>')
     inputs = controls(100, 1)
     together = trajectory(
         codrl_mj.add_motors(two, {"a": lag, "b": lag}).compile(), np.tile(inputs, 2)
     )
-    alone = trajectory(codrl_mj.add_motors(one, {"a": lag}).compile(), inputs)
-    count = one.compile().nq + one.compile().nv
-    np.testing.assert_array_equal(together[:, :count], alone[:, :count])
+    expected = trajectory(codrl_mj.add_motors(single, {"a": lag}).compile(), inputs)
+    count = single.compile().nq + single.compile().nv
+    np.testing.assert_array_equal(together[:, :count], expected[:, :count])
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicitfast"])
 def test_inertia_and_friction_are_added_to_the_joint_through_the_gear(integrator):
-    """Torques pass a gear once, inertia and damping twice; what the joint and the actuator have stays."""
+    """The gear acts once on torque, twice on inertia and damping; existing values are kept."""
 
-    def spec():
-        made = arm(integrator)
-        made.actuator("one").gear = [3.0, 0, 0, 0, 0, 0]
-        made.actuator("one").armature = 0.01
-        made.joint("upper").armature, made.joint("upper").frictionloss = 0.02, 0.03
-        return made
+    def make_spec():
+        spec = arm(integrator)
+        spec.actuator("one").gear = [3.0, 0, 0, 0, 0, 0]
+        spec.actuator("one").armature = 0.01
+        spec.joint("upper").armature, spec.joint("upper").frictionloss = 0.02, 0.03
+        return spec
 
-    by_hand = spec()
+    by_hand = make_spec()
     by_hand.joint("upper").armature += 9 * 0.004
     by_hand.joint("upper").damping[0] += 9 * 2 * 0.004
     by_hand.joint("upper").frictionloss += 3 * 3 * 0.004
-    added = codrl_mj.add_motors(spec(), {"one": Worn(rotor=0.004)}, joint_dynamics="keep")
+    added = codrl_mj.add_motors(make_spec(), {"one": Worn(rotor=0.004)}, joint_dynamics="keep")
     expected = codrl_mj.add_motors(by_hand, {"one": Worn()})
     inputs = controls(200, 2)
     np.testing.assert_allclose(
         trajectory(added.compile(), inputs), trajectory(expected.compile(), inputs), atol=1e-11
     )
-    plain = trajectory(codrl_mj.add_motors(spec(), {"one": Worn()}).compile(), inputs)
+    plain = trajectory(codrl_mj.add_motors(make_spec(), {"one": Worn()}).compile(), inputs)
     assert not np.allclose(trajectory(added.compile(), inputs), plain, atol=1e-3)
 
 
@@ -228,7 +233,7 @@ def test_friction_goes_to_a_tendon_that_is_driven():
     assert model.actuator_armature[0] == 0.1
 
 
-def test_motorised_models_are_attached_to_others():
+def test_models_with_motors_are_attached_to_others():
     child = codrl_mj.add_motors(arm(), {"one": LOOP, "two": "lag"})
     scene = mujoco.MjSpec()
     scene.option.timestep = child.option.timestep
@@ -236,11 +241,11 @@ def test_motorised_models_are_attached_to_others():
         scene.attach(child.copy(), prefix=f"{name}/", frame=scene.worldbody.add_frame())
     model = scene.compile()
     assert list(codrl_mj.engine.motors(model).values()) == [LOOP, Lag(), LOOP, Lag()]
-    alone = child.compile()
-    inputs = own_controls(alone, 100)
-    both, one = trajectory(model, np.tile(inputs, 2)), trajectory(alone, inputs)
-    np.testing.assert_allclose(both[:, :2], one[:, :2], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(both[:, 2:4], one[:, :2], rtol=0, atol=1e-12)
+    single = child.compile()
+    inputs = own_controls(single, 100)
+    both, expected = trajectory(model, np.tile(inputs, 2)), trajectory(single, inputs)
+    np.testing.assert_allclose(both[:, :2], expected[:, :2], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(both[:, 2:4], expected[:, :2], rtol=0, atol=1e-12)
 
 
 CABLE = """
@@ -256,10 +261,10 @@ CABLE = """
 PULLEY = '<geom geom="pulley" sidesite="side"/>'
 
 
-def test_a_rotor_has_no_place_on_a_tendon_around_a_geom():
+def test_a_rotor_on_a_tendon_around_a_geom_raises():
     around, straight = (mujoco.MjSpec.from_string(CABLE.format(via)) for via in (PULLEY, ""))
     message = (
-        "actuator flexor of rope: cannot be motors_added: its tendon wraps around geom pulley, where"
+        "actuator flexor of rope: cannot have a motor: its tendon wraps around geom pulley, where"
         " MuJoCo has no"
     )
     with pytest.raises(ValueError, match=message):
@@ -298,12 +303,12 @@ velocity="3"/></joint></robot>"""
 
 
 @pytest.mark.parametrize(("kind", "controls"), [("position", "velocity"), ("velocity", "position")])
-def test_a_servo_reads_a_control_as_the_model_means_it(kind, controls):
-    """Else 0.5 rad/s would be taken for 0.5 rad, or the other way round."""
+def test_a_servo_reads_controls_in_the_models_units(kind, controls):
+    """Otherwise 0.5 rad/s would be read as 0.5 rad, or the reverse."""
     spec = _spec(f'<{kind} name="it" joint="hip_left"/>')
     servo = {"family": "servo", "controller": {"sample_rate": 10e3}, "loop": {"controls": controls}}
     with pytest.raises(
-        ValueError, match=f"its control is a {kind}, and its motor is asked for a {controls}"
+        ValueError, match=f"its control is a {kind}, but its motor's command is a {controls}"
     ):
         codrl_mj.add_motors(spec, {"it": servo}, allow_unstable=True)
     servo["loop"]["controls"] = kind

@@ -1,4 +1,4 @@
-"""The control callback and the plugin run the same actuators: bit for bit, whatever happens in between."""
+"""The two backends, the control callback and the plugin, run the same actuators bit for bit."""
 
 import copy
 import itertools
@@ -24,7 +24,7 @@ from tests.add_motors.models import (
     full_state,
     trajectory,
 )
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
 
@@ -32,8 +32,8 @@ STEPS = 200
 
 
 def _both(actuators, integrator, kind="hinge"):
-    """Positions, speeds and signals at both doors after each step."""
-    found, motors, count = [], list(actuators.values()), len(actuators)
+    """Return positions, speeds and signals in both backends after each step."""
+    results, motors, count = [], list(actuators.values()), len(actuators)
     for build in (behind_callback, behind_plugin):
         model = build(arm(integrator, kind), actuators)
         data, read, rows, shaft = (
@@ -43,46 +43,50 @@ def _both(actuators, integrator, kind="hinge"):
             np.ones(2),
         )
         codrl_mj.engine.clear_motors(data, range(5, 5 + count))
-        if (
-            build is behind_callback
-        ):  # where a control is the torque at the shaft, or the shaft's motion
+        # In the callback backend a control is the torque at the shaft, or the shaft's motion.
+        if build is behind_callback:
             shaft[:count] = [
-                (1 / one.arm_radius if one.MOTION else one.arm_radius) for one in motors
+                (1 / motor.arm_radius if motor.MOTION else motor.arm_radius) for motor in motors
             ]
         for desired in controls(STEPS, 2):
             data.ctrl[:] = desired * shaft
             mujoco.mj_step(model, data)
-            seen = read(data)
-            # one door stores the force, the other makes it from the torque
-            wanted = np.where([one.tracks for one in motors], desired[:count], seen["actual_force"])
-            np.testing.assert_allclose(seen.pop("desired_force"), wanted, rtol=1e-15)
-            rows.append(np.concatenate((data.qpos, data.qvel, data.qfrc_actuator, *seen.values())))
+            signals = read(data)
+            # The plugin backend stores the force, the callback backend computes it from the torque.
+            expected = np.where(
+                [motor.tracks for motor in motors], desired[:count], signals["actual_force"]
+            )
+            np.testing.assert_allclose(signals.pop("desired_force"), expected, rtol=1e-15)
+            rows.append(
+                np.concatenate((data.qpos, data.qvel, data.qfrc_actuator, *signals.values()))
+            )
         assert list(codrl_mj.engine.motors(model).values()) == motors
-        found.append(np.array(rows))
-    return found
+        results.append(np.array(rows))
+    return results
 
 
 ALONE = [(name, None, "hinge") for name in ACTUATORS]
-MIXED = ("noisy_current_loop", "somebody's", "slide")
+MIXED = ("noisy_current_loop", "custom", "slide")
 PAIRS = [*ALONE, *itertools.product(ACTUATORS, ACTUATORS, ["hinge", "slide"])]
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize(("first", "second", "kind"), but([*ALONE, MIXED], PAIRS))
-def test_both_doors_agree(first, second, kind, integrator):
+@pytest.mark.parametrize(("first", "second", "kind"), matrix_params([*ALONE, MIXED], PAIRS))
+def test_both_backends_agree(first, second, kind, integrator):
     second = {} if second is None else {"two": ACTUATORS[second]}
     callback, plugin = _both({"one": ACTUATORS[first], **second}, integrator, kind)
     np.testing.assert_array_equal(plugin, callback)
-    assert second or np.isfinite(plugin).all()  # two families lack what the other has
+    # With two families, each lacks signals of the other.
+    assert second or np.isfinite(plugin).all()
 
 
-def of_state(what):
+def of_state(signature):
     def restored(data):
-        state = np.empty(mujoco.mj_stateSize(data.model, what))
-        mujoco.mj_getState(data.model, data, state, what)
-        other = mujoco.MjData(data.model)
-        mujoco.mj_setState(data.model, other, state, what)
-        return other
+        state = np.empty(mujoco.mj_stateSize(data.model, signature))
+        mujoco.mj_getState(data.model, data, state, signature)
+        copied = mujoco.MjData(data.model)
+        mujoco.mj_setState(data.model, copied, state, signature)
+        return copied
 
     return restored
 
@@ -96,9 +100,9 @@ SAVED = {
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("how", SAVED)
-def test_a_simulation_is_continued_from_what_is_saved_of_it(how, integrator):
-    """Whatever forward calls there are meanwhile, and wherever the saved one goes."""
+@pytest.mark.parametrize("method", SAVED)
+def test_a_simulation_continues_from_its_saved_state(method, integrator):
+    """There are forward calls between steps, and the saved simulation is advanced meanwhile."""
     model, inputs = (
         behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["lag"]}),
         controls(STEPS, 2),
@@ -110,9 +114,10 @@ def test_a_simulation_is_continued_from_what_is_saved_of_it(how, integrator):
 
     data = mujoco.MjData(model)
     first = trajectory(model, inputs[:70], data)
-    other = SAVED[how](data)
-    mujoco.mj_step(model, data, 3)  # the first goes its own way
-    rest = trajectory(other.model, inputs[70:], other, before_step=meddle)
+    saved = SAVED[method](data)
+    # The original simulation goes on by itself.
+    mujoco.mj_step(model, data, 3)
+    rest = trajectory(saved.model, inputs[70:], saved, before_step=meddle)
     np.testing.assert_array_equal(np.concatenate((first, rest)), trajectory(model, inputs))
 
 
@@ -126,8 +131,8 @@ def test_a_reset_and_a_keyframe_bring_motors_to_rest(integrator):
     mujoco.mj_resetData(model, used)
     assert not used.plugin_state.any()
     np.testing.assert_array_equal(trajectory(model, inputs, used), trajectory(model, inputs, fresh))
-    # the time of a keyframe is not that of the motors' rest: under RK4 the first step must be held
-    # as all others are
+    # The time of a keyframe differs from that of the motors' rest. With RK4 the force must be held
+    # in the first step, as in all others.
     mujoco.mj_resetDataKeyframe(model, used, 0)
     plain = mujoco.MjData(model)
     plain.qpos[:] = used.qpos
@@ -138,8 +143,8 @@ def test_a_reset_and_a_keyframe_bring_motors_to_rest(integrator):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("share", [0.3, 1.0, 1.7])
-def test_after_a_keyframe_s_time_a_step_takes_no_torque_from_before(integrator, share):
-    spec, found = arm(integrator), []
+def test_a_step_after_a_keyframe_has_no_earlier_torque(integrator, share):
+    spec, states = arm(integrator), []
     spec.add_key(name="later", time=share * 0.005, qpos=[0.1, -0.2])
     for model in (spec.copy().compile(), behind_plugin(spec, {".*": TorqueSpeed(1e6, 1e6, 1e6)})):
         data = mujoco.MjData(model)
@@ -148,12 +153,12 @@ def test_after_a_keyframe_s_time_a_step_takes_no_torque_from_before(integrator, 
         mujoco.mj_resetDataKeyframe(model, data, 0)
         data.ctrl[:] = -0.5
         mujoco.mj_step(model, data, 2)
-        found.append(np.concatenate([data.qpos, data.qvel]))
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
+        states.append(np.concatenate([data.qpos, data.qvel]))
+    np.testing.assert_allclose(states[1], states[0], rtol=1e-6)
 
 
-def test_several_families_of_one_model_are_each_as_if_alone():
-    """Two separate joints: what drives one has nothing to do with the other."""
+def test_families_of_a_model_do_not_affect_each_other():
+    """The joints are separate, so that none affects another."""
     spec = mujoco.MjSpec()
     for name in ACTUATORS:
         body = spec.worldbody.add_body(pos=[len(spec.bodies), 0, 0])
@@ -164,27 +169,28 @@ def test_several_families_of_one_model_are_each_as_if_alone():
     together = trajectory(codrl_mj.add_motors(spec, ACTUATORS).compile(), inputs)
     count = len(ACTUATORS)
     for index, (name, actuator) in enumerate(ACTUATORS.items()):
-        alone = trajectory(codrl_mj.add_motors(spec, {name: actuator}).compile(), inputs)
+        single = trajectory(codrl_mj.add_motors(spec, {name: actuator}).compile(), inputs)
         for column in (index, count + index, 2 * count + index):
-            np.testing.assert_array_equal(together[:, column], alone[:, column])
+            np.testing.assert_array_equal(together[:, column], single[:, column])
 
 
 @pytest.mark.parametrize("nthread", [1, 2])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_a_batch_is_a_loop(integrator, nthread):
-    """Each simulation with its own motors."""
+def test_a_batch_equals_a_loop(integrator, nthread):
+    """Each simulation has different motors."""
     nsim, steps = 8, 60
     resistances = np.linspace(0.8, 2.0, nsim)
     actuators = [LOOP.replaced({"motor.resistance": value}) for value in resistances]
     models = [
-        behind_plugin(arm(integrator), {"one": one, "two": ACTUATORS["lag"]}) for one in actuators
+        behind_plugin(arm(integrator), {"one": actuator, "two": ACTUATORS["lag"]})
+        for actuator in actuators
     ]
     inputs = [controls(steps, 2, seed) for seed in range(nsim)]
     batch = Batch(models[0], nsim=nsim, nthread=nthread)
     batch.expand("actuator_user")[:] = [model.actuator_user for model in models]
     ctrl, qpos, state = batch.bind("ctrl"), batch.bind("qpos"), batch.bind("plugin_state")
     for step in range(steps):
-        ctrl[:] = [one[step] for one in inputs]
+        ctrl[:] = [sequence[step] for sequence in inputs]
         batch.step()
     for sim, model in enumerate(models):
         data = mujoco.MjData(model)
@@ -195,18 +201,18 @@ def test_a_batch_is_a_loop(integrator, nthread):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_a_rollout_is_a_loop(integrator):
+def test_a_rollout_equals_a_loop(integrator):
     model = behind_plugin(arm(integrator), {"one": NOISY, "two": ACTUATORS["torque_speed"]})
     inputs = np.array([controls(50, 2, seed) for seed in range(6)])
     start = full_state(mujoco.MjData(model))
     states, _ = rollout.rollout(model, [mujoco.MjData(model) for _ in range(2)], start, inputs)
-    for sequence, found in zip(inputs, states, strict=True):
+    for sequence, final_states in zip(inputs, states, strict=True):
         data = mujoco.MjData(model)
         trajectory(model, sequence, data)
-        np.testing.assert_array_equal(found[-1], full_state(data))
+        np.testing.assert_array_equal(final_states[-1], full_state(data))
 
 
-def test_a_set_state_needs_motors_cleared_and_then_they_are():
+def test_motors_are_cleared_after_a_state_is_set():
     model = behind_plugin(arm("RK4"), {"one": NOISY, "two": ACTUATORS["lag"]})
     inputs, used = controls(STEPS, 2), mujoco.MjData(model)
     trajectory(model, inputs, used)
@@ -225,7 +231,7 @@ def test_a_set_state_needs_motors_cleared_and_then_they_are():
     assert not np.allclose(after[0], expected, atol=1e-3)
 
 
-def test_noise_has_the_key_that_it_is_given():
+def test_noise_depends_on_its_key():
     model = behind_plugin(arm(), {"one": NOISY, "two": NOISY})
     inputs, ends = controls(50, 2), []
     for keys in ((1, 2), (1, 2), (2, 1)):
@@ -236,8 +242,8 @@ def test_noise_has_the_key_that_it_is_given():
     assert not np.array_equal(ends[0], ends[2])
 
 
-def test_actuation_switched_off_and_on_again_is_the_same_at_both_doors():
-    found = []
+def test_disabled_and_enabled_actuation_is_the_same_in_both_backends():
+    states = []
     for build in (behind_callback, behind_plugin):
         model = build(arm(), {"one": LOOP.replaced({"motor.arm_radius": 1.0})})
 
@@ -246,5 +252,5 @@ def test_actuation_switched_off_and_on_again_is_the_same_at_both_doors():
             step = round(data.time / model.opt.timestep)
             model.opt.disableflags = flag if 20 <= step < 30 else 0
 
-        found.append(trajectory(model, controls(60, 2), before_step=switch)[:, :4])
-    np.testing.assert_array_equal(*found)
+        states.append(trajectory(model, controls(60, 2), before_step=switch)[:, :4])
+    np.testing.assert_array_equal(*states)

@@ -1,4 +1,4 @@
-"""An ideal actuator behind the plugin delivers, bit for bit, what the actuator would have delivered without it."""
+"""An ideal actuator in the plugin backend gives the bits of the model without motors."""
 
 import mujoco
 import numpy as np
@@ -14,11 +14,10 @@ from tests.add_motors.models import (
     own_controls,
     trajectory,
 )
-from tests.matrix import but
+from tests.matrix import matrix_params
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::UserWarning"
-)  # deprecated attributes in other people's models
+# Third-party models have deprecated attributes.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
 
 def behind(spec):
@@ -47,9 +46,9 @@ SOME = [
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize(
-    "path", but(SOME, ROBOTS), ids=lambda path: f"{path.parent.name}-{path.stem}"
+    "path", matrix_params(SOME, ROBOTS), ids=lambda path: f"{path.parent.name}-{path.stem}"
 )
-def test_every_robot_is_as_before(path, integrator):
+def test_ideal_actuators_do_not_change_any_robot(path, integrator):
     _check(path, integrator, 100 if path in SOME else 1000)
 
 
@@ -115,15 +114,15 @@ def everything(kind, integrator="Euler"):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_of_actuator_is_as_before(kind, integrator):
+def test_ideal_actuators_do_not_change_any_kind_of_actuator(kind, integrator):
     spec = everything(kind, integrator)
-    inputs, found = models.controls(150, 1, low=-1.2, high=1.2), []
+    inputs, states = models.controls(150, 1, low=-1.2, high=1.2), []
     for model in (spec.compile(), behind(spec)):
         data = mujoco.MjData(model)
         data.qvel[:] = 0.7
-        found.append(trajectory(model, inputs, data))
-    assert found[0][:, -4].any()  # the force
-    np.testing.assert_array_equal(*found)
+        states.append(trajectory(model, inputs, data))
+    assert states[0][:, -4].any()  # the force
+    np.testing.assert_array_equal(*states)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +133,7 @@ def test_every_kind_of_actuator_is_as_before(kind, integrator):
         ("group", "disableactuator", 1 << 3),
     ],
 )
-def test_what_is_disabled_is_off_as_before(kind, field, flags):
+def test_disabled_actuators_stay_disabled(kind, field, flags):
     spec, inputs = everything(kind), models.controls(300, 1, low=-2, high=2)
     setattr(spec.option, field, getattr(spec.option, field) | int(flags))
     expected = trajectory(spec.compile(), inputs)
@@ -143,7 +142,7 @@ def test_what_is_disabled_is_off_as_before(kind, field, flags):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1e11])
-def test_bad_controls_are_treated_as_before(bad):
+def test_bad_controls_are_handled_as_without_motors(bad):
     spec = mujoco.MjSpec.from_string(
         _EVERYTHING.format(actuator=KINDS["motor"] + KINDS["unlimited"], integrator="Euler")
     )
@@ -156,8 +155,8 @@ def test_bad_controls_are_treated_as_before(bad):
 @pytest.mark.parametrize(
     "fields", ["actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "actuator_ctrlrange"]
 )
-def test_what_is_changed_in_a_compiled_model_has_its_effect(fields):
-    """Randomisation of other people's environments sets these."""
+def test_changes_of_a_compiled_model_have_an_effect(fields):
+    """Randomization of third-party environments changes these fields."""
     spec = everything("position, force limit", "implicitfast")
     both = spec.compile(), behind(spec)
     inputs = models.controls(300, 1, low=-2, high=2)

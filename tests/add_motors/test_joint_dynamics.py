@@ -1,4 +1,4 @@
-"""What a model has of a motor already: damping, armature and friction, named, added up or taken out."""
+"""Damping, armature and friction that a model has for a motor: warned of, added or replaced."""
 
 import math
 import warnings
@@ -45,8 +45,8 @@ def _nothing_warned(monkeypatch):
     monkeypatch.setattr(specs, "_WARNED", set())
 
 
-def _arm(own=OWN, gear=1.0):
-    return mujoco.MjSpec.from_string(_ARM.format(own, gear))
+def _arm(attributes=OWN, gear=1.0):
+    return mujoco.MjSpec.from_string(_ARM.format(attributes, gear))
 
 
 def _top_speed(model):
@@ -59,22 +59,24 @@ def _top_speed(model):
 
 @pytest.mark.parametrize("saved", [False, True])
 def test_kept_losses_brake_a_joint_and_replaced_ones_do_not(saved):
-    """Full voltage without a load: (stall - friction)/(stall/free + damping), and the motor's own no-load speed."""
-    found = {}
-    for how in ("keep", "replace"):
-        spec = codrl_mj.add_motors(_arm(), {"shoulder": MOTOR}, joint_dynamics=how)
-        found[how] = mujoco.MjModel.from_xml_string(spec.to_xml()) if saved else spec.compile()
-    assert _top_speed(found["keep"]) == pytest.approx(
+    """Without a load, the speeds are (stall - friction)/(stall/free + damping) or the motor's."""
+    models = {}
+    for joint_dynamics in ("keep", "replace"):
+        spec = codrl_mj.add_motors(_arm(), {"shoulder": MOTOR}, joint_dynamics=joint_dynamics)
+        models[joint_dynamics] = (
+            mujoco.MjModel.from_xml_string(spec.to_xml()) if saved else spec.compile()
+        )
+    assert _top_speed(models["keep"]) == pytest.approx(
         (STALL - 0.05) / (STALL / FREE + 0.55), rel=1e-3
     )
-    assert found["replace"].dof_damping[0] == 0.0
-    assert found["replace"].dof_armature[0] == 0.0
-    # friction is no loss that this motor brings, and stays
-    assert found["replace"].dof_frictionloss[0] == 0.05
-    assert _top_speed(found["replace"]) == pytest.approx((STALL - 0.05) / (STALL / FREE), rel=1e-3)
+    assert models["replace"].dof_damping[0] == 0.0
+    assert models["replace"].dof_armature[0] == 0.0
+    # This motor has no friction of its own, so that of the model stays.
+    assert models["replace"].dof_frictionloss[0] == 0.05
+    assert _top_speed(models["replace"]) == pytest.approx((STALL - 0.05) / (STALL / FREE), rel=1e-3)
 
 
-def test_the_warning_names_joint_numbers_and_remedy_once_and_at_the_caller():
+def test_the_warning_names_joint_values_and_remedy_once_at_the_callers_line():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for _ in range(2):
@@ -98,23 +100,21 @@ QUIET = [
     (OWN, MOTOR, "replace"),
     (OWN, "ideal", None),
     (OWN, "lag", None),
-    (
-        'armature="0.03" frictionloss="0.05"',
-        TorqueSpeed(),
-        None,
-    ),  # it brings neither rotor nor friction
-    ('damping="0.001"', TorqueSpeed(stall_torque=1.0, no_load_speed=10.0), None),  # a bearing's
+    # This motor has neither a rotor nor friction.
+    ('armature="0.03" frictionloss="0.05"', TorqueSpeed(), None),
+    # The damping is that of a bearing.
+    ('damping="0.001"', TorqueSpeed(stall_torque=1.0, no_load_speed=10.0), None),
 ]
 
 
-@pytest.mark.parametrize(("own", "actuator", "how"), QUIET)
-def test_no_warning_where_nothing_can_be_counted_twice(own, actuator, how):
+@pytest.mark.parametrize(("attributes", "actuator", "joint_dynamics"), QUIET)
+def test_no_warning_where_nothing_can_be_counted_twice(attributes, actuator, joint_dynamics):
     with warnings.catch_warnings():
         warnings.simplefilter("error", MotorWarning)
-        codrl_mj.add_motors(_arm(own), {"shoulder": actuator}, joint_dynamics=how)
+        codrl_mj.add_motors(_arm(attributes), {"shoulder": actuator}, joint_dynamics=joint_dynamics)
 
 
-def test_by_default_everything_is_kept():
+def test_joint_dynamics_are_kept_by_default():
     with pytest.warns(MotorWarning):
         default = codrl_mj.add_motors(_arm(), {"shoulder": MOTOR}).to_xml()
     assert (
@@ -122,7 +122,7 @@ def test_by_default_everything_is_kept():
     )
 
 
-def test_actuators_and_tendons_have_them_too():
+def test_actuators_and_tendons_can_have_duplicate_dynamics():
     spec = mujoco.MjSpec.from_string("""
 <mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size=".1" mass="1"/></body></worldbody>
 <tendon><fixed name="rope" damping="2" armature="0.5"><joint joint="j" coef="1"/></fixed></tendon>
@@ -138,11 +138,15 @@ def test_actuators_and_tendons_have_them_too():
     assert (model.actuator_armature[0], model.actuator_damping[0]) == (pytest.approx(rotor), 0.0)
 
 
-def test_a_certificate_says_what_it_cannot_see():
-    def reasons(own):
-        model = codrl_mj.add_motors(_arm(own), {"shoulder": MOTOR}, joint_dynamics="keep").compile()
+def test_a_certificate_names_possible_duplicate_dynamics():
+    def reasons(attributes):
+        model = codrl_mj.add_motors(
+            _arm(attributes), {"shoulder": MOTOR}, joint_dynamics="keep"
+        ).compile()
         skipped = validate_model(model, quick=True).skipped
-        return [one.reason for one in skipped if one.name == "whether a motor is counted twice"]
+        return [
+            check.reason for check in skipped if check.name == "whether a motor is counted twice"
+        ]
 
     (reason,) = reasons(OWN)
     assert (
@@ -152,7 +156,7 @@ def test_a_certificate_says_what_it_cannot_see():
     assert reasons('damping="0"') == []
 
 
-def test_environments_keep_or_replace_and_so_do_their_configurations():
+def test_environments_and_configurations_have_joint_dynamics():
     arguments = {".*": MOTOR.replaced({"motor.gear_ratio": 1.0, "motor.rotor_inertia": 1e-4})}
     config = codrl_mj.EnvConfig(
         "InvertedPendulum-v5", arguments, joint_dynamics="replace", allow_unstable=True
@@ -160,19 +164,19 @@ def test_environments_keep_or_replace_and_so_do_their_configurations():
     again = codrl_mj.EnvConfig.from_mapping(config.as_mapping())
     assert again == config
     with pytest.warns(MotorWarning, match=r"joint slider has .*damping 1 \(") as caught:
-        kept = codrl_mj.make("InvertedPendulum-v5", arguments, allow_unstable=True)
+        unchanged = codrl_mj.make("InvertedPendulum-v5", arguments, allow_unstable=True)
     assert caught[0].filename == __file__
-    replaced, plain = again.make(), kept.unwrapped.model
+    replaced, plain = again.make(), unchanged.unwrapped.model
     slider = plain.joint("slider").dofadr[0]
     assert plain.dof_damping[slider] == 1.0
     assert replaced.unwrapped.model.dof_damping[slider] == 0.0
-    # a hinge without a motor keeps its own
+    # A hinge without a motor keeps its damping.
     assert replaced.unwrapped.model.dof_damping[1 - slider] == plain.dof_damping[1 - slider] == 1.0
-    for env in (kept, replaced):
+    for env in (unchanged, replaced):
         env.close()
 
 
-def test_configurations_without_it_are_what_they_were():
+def test_configurations_without_joint_dynamics_are_unchanged():
     """Names of runs are hashes of the mapping."""
     assert "joint_dynamics" not in codrl_mj.EnvConfig("HalfCheetah-v5").as_mapping()
     assert "joint_dynamics" not in codrl_mj.EnvConfig("pendulum").as_mapping()
@@ -185,7 +189,7 @@ def test_configurations_without_it_are_what_they_were():
         ("pendulum", "replace", "joint_dynamics = 'replace': pendulum has none"),
     ],
 )
-def test_values_that_it_cannot_have_are_refused(task, value, message):
+def test_invalid_joint_dynamics_raise(task, value, message):
     with pytest.raises(ValueError, match=message):
         codrl_mj.EnvConfig(task, joint_dynamics=value)
     with pytest.raises(ValueError, match="joint_dynamics = 'both'"):
@@ -204,10 +208,10 @@ def _legs(count, gravcomp=False):
     )
 
 
-def test_several_supplies_that_sag_are_said_to_be_several():
+def test_several_supplies_with_resistance_cause_a_warning():
     weak = MOTOR.replaced({"supply.resistance": 0.5})
     with pytest.warns(
-        MotorWarning, match=r"supply\.resistance: each of the motors m0, m1 has a supply of its own"
+        MotorWarning, match=r"supply\.resistance: each of the motors m0, m1 has a separate supply"
     ):
         codrl_mj.add_motors(_legs(3), {"m[01]": weak, "m2": MOTOR})
     with warnings.catch_warnings():
@@ -215,7 +219,7 @@ def test_several_supplies_that_sag_are_said_to_be_several():
         codrl_mj.add_motors(_legs(2), {"m0": weak, "m1": MOTOR})
 
 
-def test_gravity_compensation_goes_past_a_motor():
+def test_gravity_compensation_past_a_motor_causes_a_warning():
     with pytest.warns(
         MotorWarning,
         match="joint j0: actuatorgravcomp: its gravity compensation passes through no motor",
@@ -227,7 +231,7 @@ def test_gravity_compensation_goes_past_a_motor():
     assert data.qfrc_actuator[0] == pytest.approx(-0.2 * 9.81)
 
 
-def test_a_reduction_that_brings_no_rotor_leaves_the_model_s():
+def test_a_gear_without_a_rotor_keeps_the_models_armature():
     bare = MOTOR.replaced({"motor.rotor_inertia": 0.0})
     model = codrl_mj.add_motors(_arm(), {"shoulder": bare}, joint_dynamics="replace").compile()
     assert model.dof_armature[0] == 0.03

@@ -1,4 +1,4 @@
-"""The plugin itself: registered once, when the package is imported, into a structure that was checked."""
+"""The plugin is registered once, at the import of the package, into a checked structure."""
 
 import ctypes
 import importlib
@@ -15,7 +15,7 @@ from codrl_mj.engine.families import load_family
 from tests.add_motors.models import Signals, Worn, arm
 
 
-def test_there_is_one_plugin_of_ours_and_it_stays_where_it_is():
+def test_the_plugin_is_registered_once_and_keeps_its_slot():
     slot, structure = plugin.registered()[plugin.NAME]
     count = plugin.library().mjp_pluginCount()
     plugin.register()
@@ -26,8 +26,8 @@ def test_there_is_one_plugin_of_ours_and_it_stays_where_it_is():
     assert [structure.attributes[index] for index in range(structure.nattribute)] == [b"family"]
 
 
-def test_importing_registers_and_compiles_nothing_and_a_second_copy_is_refused():
-    """MuJoCo itself would end the process."""
+def test_an_import_compiles_nothing_and_a_second_copy_raises():
+    """Without the check, MuJoCo would end the process."""
     code = (
         "import sys, codrl_mj; from codrl_mj import plugin; assert 'numba' not in"
         " sys.modules\nprint(list(plugin.registered())[-1])\nfor name in [name for name in"
@@ -55,7 +55,7 @@ def test_importing_registers_and_compiles_nothing_and_a_second_copy_is_refused()
         {"nattribute": 10**6},
     ],
 )
-def test_a_structure_that_is_another_is_refused(change):
+def test_another_structure_raises(change):
     slot, original = plugin.registered()["mujoco.pid"]
     structure = plugin.Plugin()
     ctypes.pointer(structure)[0] = original
@@ -67,7 +67,7 @@ def test_a_structure_that_is_another_is_refused(change):
             plugin.check_structure(registered)
 
 
-def test_a_family_defined_anew_takes_the_place_of_the_one_before_if_models_can_go_on():
+def test_a_redefined_family_replaces_the_previous_one_if_models_stay_valid():
     def family(factor, **more):
         shown = (0.0,) * len(more.get("Signals", Signals)._fields)
 
@@ -75,7 +75,7 @@ def test_a_family_defined_anew_takes_the_place_of_the_one_before_if_models_can_g
             return state, factor * inputs.desired_torque, shown
 
         return type(
-            "Anew", (Worn,), {"__module__": __name__, "advance": staticmethod(advance), **more}
+            "Redefined", (Worn,), {"__module__": __name__, "advance": staticmethod(advance), **more}
         )
 
     spec, forces = arm(), []
@@ -89,6 +89,6 @@ def test_a_family_defined_anew_takes_the_place_of_the_one_before_if_models_can_g
     assert forces == [1.0, 1.5]
     with pytest.raises(
         ValueError,
-        match=r"Anew has .* states, signals and parameters, and .* when it was loaded before",
+        match=r"Redefined has .* states, signals and parameters, and .* when it was loaded before",
     ):
         load_family(family(2.0, Signals=Nothing))

@@ -1,4 +1,4 @@
-"""Reading motors and their signals from models and data, at both doors at once."""
+"""Motors and signals are read from models and data with both backends."""
 
 import re
 
@@ -17,7 +17,7 @@ LINE = TorqueSpeed(stall_torque=0.8, no_load_speed=3.0, max_torque=0.3)
 
 
 def _mixed():
-    """A model with a motor at each door, and an actuator that is nobody's."""
+    """Return a model with a motor in each backend, and an actuator without a motor."""
     spec = arm()
     spec.add_actuator(name="plain", target="lower", trntype=mujoco.mjtTrn.mjTRN_JOINT)
     drive(spec.actuator("one"), LOOP, 1.0)
@@ -26,43 +26,43 @@ def _mixed():
     return model
 
 
-def test_motors_of_both_doors_are_found_and_of_none_nothing():
+def test_motors_returns_those_of_both_backends_or_none():
     assert codrl_mj.engine.motors(_mixed()) == {0: LOOP, 1: LINE}
     plain = arm().compile()
     assert codrl_mj.engine.motors(plain) == {}
-    found = codrl_mj.signals(plain, mujoco.MjData(plain))
-    assert {name: values.shape for name, values in found.items()} == {
+    signals = codrl_mj.signals(plain, mujoco.MjData(plain))
+    assert {name: values.shape for name, values in signals.items()} == {
         "desired_force": (0,),
         "actual_force": (0,),
     }
 
 
-def test_signals_of_both_doors_are_read():
+def test_signals_of_both_backends_are_read():
     model = _mixed()
     data = mujoco.MjData(model)
     data.ctrl[:] = 0.15, 0.5, 0.1
     mujoco.mj_step(model, data, 3)
     mujoco.mj_forward(model, data)
-    found = codrl_mj.signals(model, data)
+    signals = codrl_mj.signals(model, data)
     gear = 1 / LOOP.arm_radius
-    assert list(found) == [
+    assert list(signals) == [
         *("desired_force", "actual_force", "current", "reference_current", "voltage", "saturated"),
         *("lower_limit", "upper_limit"),
     ]
-    np.testing.assert_allclose(found["desired_force"], [0.15 * gear, 0.5], rtol=1e-15)
+    np.testing.assert_allclose(signals["desired_force"], [0.15 * gear, 0.5], rtol=1e-15)
     kt = LOOP.motor.torque_constant
     np.testing.assert_allclose(
-        found["actual_force"], [kt * found["current"][0] * gear, 0.3], rtol=1e-15
+        signals["actual_force"], [kt * signals["current"][0] * gear, 0.3], rtol=1e-15
     )
-    np.testing.assert_allclose(found["reference_current"], [0.15 / kt, np.nan])
-    np.testing.assert_array_equal(found["saturated"], [0.0, 1.0])
-    np.testing.assert_array_equal(found["upper_limit"], [np.nan, 0.3])
-    assert found["voltage"][0] != 0.0
-    np.testing.assert_allclose(data.qfrc_actuator, [found["actual_force"][0], 0.3 + 0.1])
+    np.testing.assert_allclose(signals["reference_current"], [0.15 / kt, np.nan])
+    np.testing.assert_array_equal(signals["saturated"], [0.0, 1.0])
+    np.testing.assert_array_equal(signals["upper_limit"], [np.nan, 0.3])
+    assert signals["voltage"][0] != 0.0
+    np.testing.assert_allclose(data.qfrc_actuator, [signals["actual_force"][0], 0.3 + 0.1])
 
 
-def test_controls_beyond_their_range_are_what_the_model_makes_of_them():
-    """A source without lag delivers what is desired, so the engine's own force says what that is."""
+def test_desired_forces_use_clipped_controls():
+    """A source without lag delivers the desired force, so the engine's force tells it."""
     source = Lag(time_constant=0.0)
     for build in (behind_callback, behind_plugin):
         model = build(arm(), {"one": source, "two": source})
@@ -75,9 +75,9 @@ def test_controls_beyond_their_range_are_what_the_model_makes_of_them():
         ):
             model.opt.disableflags = flags
             mujoco.mj_step(model, data)
-            found = readout(data)
-            np.testing.assert_array_equal(found["desired_force"], expected)
-            np.testing.assert_array_equal(found["actual_force"], expected)
+            signals = readout(data)
+            np.testing.assert_array_equal(signals["desired_force"], expected)
+            np.testing.assert_array_equal(signals["actual_force"], expected)
 
 
 def test_desired_and_actual_force_are_before_the_models_own_gear():
@@ -95,7 +95,7 @@ def test_desired_and_actual_force_are_before_the_models_own_gear():
 
 
 @pytest.mark.parametrize("key", [-1, 1.5, 2**53, np.nan, np.inf, "7", None])
-def test_clearing_motors_at_both_doors_brings_them_to_rest_and_a_key_that_is_none_changes_nothing(
+def test_clear_motors_brings_both_backends_to_rest_and_an_invalid_key_changes_nothing(
     key,
 ):
     model = _mixed()
@@ -108,7 +108,7 @@ def test_clearing_motors_at_both_doors_brings_them_to_rest_and_a_key_that_is_non
     message = f"noise_keys[1] = {key!r}: must be a whole number from 0 to 2**53 - 1"
     with pytest.raises(ValueError, match=re.escape(message)):
         codrl_mj.engine.clear_motors(data, [3, key])
-    with pytest.raises(ValueError, match="there are 1, must be 2, one for each motor"):
+    with pytest.raises(ValueError, match="got 1 keys, must be 2: one for each motor"):
         codrl_mj.engine.clear_motors(data, 7)
     np.testing.assert_array_equal(np.concatenate((data.act, data.plugin_state)), before)
     codrl_mj.engine.clear_motors(data)

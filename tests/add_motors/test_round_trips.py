@@ -1,4 +1,4 @@
-"""Motors in models that are copied, saved and loaded: the same motor, or a clear error."""
+"""Models that are copied, saved and loaded have the same motors, or give a clear error."""
 
 import copy
 import itertools
@@ -29,11 +29,10 @@ from tests.add_motors.models import (
     own_controls,
     trajectory,
 )
-from tests.matrix import but
+from tests.matrix import matrix_params
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::UserWarning"
-)  # deprecated attributes in other people's models
+# Third-party models have deprecated attributes.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
 TWO = {"one": NOISY, "two": Worn()}
 
@@ -52,17 +51,17 @@ RELOADED = {
 }
 
 
-@pytest.mark.parametrize("how", RELOADED)
-def test_a_model_keeps_its_motors(how, tmp_path):
+@pytest.mark.parametrize("method", RELOADED)
+def test_a_model_keeps_its_motors(method, tmp_path):
     model, inputs = behind_plugin(arm(), TWO), controls(100, 2)
-    again = RELOADED[how](model, tmp_path)
+    again = RELOADED[method](model, tmp_path)
     assert codrl_mj.engine.motors(again) == {0: NOISY, 1: Worn()}
     np.testing.assert_array_equal(trajectory(again, inputs), trajectory(model, inputs))
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_an_xml_file_keeps_motors_to_its_six_digits(integrator, tmp_path):
-    """Numbers of at most six digits survive, and with them the actuator, its gain and its bias."""
+    """Numbers with at most six digits are kept, and so are the actuator, its gain and its bias."""
     spec = arm(integrator)
     spec.actuator("two").set_to_position(kp=7.25, kv=0.5)
     motors_added = codrl_mj.add_motors(spec, {"one": NOISY, "two": "lag"})
@@ -77,8 +76,8 @@ def test_an_xml_file_keeps_motors_to_its_six_digits(integrator, tmp_path):
     assert codrl_mj.engine.motors(again)[0].motor.resistance == 1.33333
 
 
-def test_gain_and_bias_are_in_the_xml_every_time():
-    """What is not initialised in MuJoCo is a matter of luck."""
+def test_gain_and_bias_are_always_in_the_xml():
+    """MuJoCo does not initialize some fields, so that one run is not enough."""
     for _ in range(40):
         spec = arm().copy()
         spec.actuator("two").set_to_position(kp=7.25, kv=0.5)
@@ -92,10 +91,12 @@ ROBOTS = [*itertools.product([*GYMNASIUM, *SUITE], INTEGRATORS)]
 
 
 @pytest.mark.parametrize(
-    ("path", "integrator"), but(HUMANOID, ROBOTS), ids=lambda one: getattr(one, "stem", one)
+    ("path", "integrator"),
+    matrix_params(HUMANOID, ROBOTS),
+    ids=lambda value: getattr(value, "stem", value),
 )
-def test_robots_saved_and_loaded_are_as_before(path, integrator):
-    """Ideal actuators saved and loaded are what the model without them is, saved and loaded."""
+def test_saved_and_loaded_robots_are_unchanged(path, integrator):
+    """A saved and loaded model behaves the same with ideal actuators and without them."""
     spec = mujoco.MjSpec.from_file(str(path))
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     spec.meshdir, spec.texturedir = (
@@ -122,23 +123,23 @@ def final(model):
         mujoco.mj_step(model, data)
     print(*data.qpos.tolist())
 try:
-    mujoco.MjModel.from_xml_path("somebody.xml")
+    mujoco.MjModel.from_xml_path("custom.xml")
 except ValueError as error:
     print(repr(str(error)))
 final(mujoco.MjModel.from_binary_path("model.mjb"))
 final(mujoco.MjModel.from_xml_path("model.xml"))
 from tests.add_motors.models import Worn
 codrl_mj.engine.load_family(Worn)
-final(mujoco.MjModel.from_xml_path("somebody.xml"))
+final(mujoco.MjModel.from_xml_path("custom.xml"))
 """
 
 
-def test_another_process_has_the_same_motors_and_imports_no_code_because_a_model_says_so(tmp_path):
+def test_another_process_has_the_same_motors_and_a_model_cannot_import_code(tmp_path):
     inputs = 0.1 * (np.arange(50) % 7)[:, np.newaxis] * np.ones(2)
     ours = codrl_mj.add_motors(arm(), {"one": LOOP, "two": "torque_speed"})
-    somebodys = codrl_mj.add_motors(arm(), {"one": Worn()})
+    custom = codrl_mj.add_motors(arm(), {"one": Worn()})
     (tmp_path / "model.xml").write_text(ours.to_xml())
-    (tmp_path / "somebody.xml").write_text(somebodys.to_xml())
+    (tmp_path / "custom.xml").write_text(custom.to_xml())
     mujoco.mj_saveModel(ours.compile(), str(tmp_path / "model.mjb"), None)
     options = {
         "cwd": tmp_path,
@@ -148,18 +149,18 @@ def test_another_process_has_the_same_motors_and_imports_no_code_because_a_model
     command = [sys.executable, "-c", _ANOTHER_PROCESS]
     result = subprocess.run(command, **options, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
-    without, refused, *found = result.stdout.splitlines()
+    without, refused, *outputs = result.stdout.splitlines()
     assert "plugin codrl_mj.actuator not found" in without
     assert (
-        "its family 'tests.add_motors.models:Worn' is not loaded, and is not imported because a"
-        " model" in refused
+        "its family 'tests.add_motors.models:Worn' is not loaded, and a model cannot have"
+        " it imported" in refused
     )
     expected = []
-    for model in (ours.compile(), ours.compile(), somebodys.compile()):
+    for model in (ours.compile(), ours.compile(), custom.compile()):
         data = mujoco.MjData(model)
         trajectory(model, inputs, data)
         expected.append(" ".join(map(repr, data.qpos.tolist())))
-    assert found == expected
+    assert outputs == expected
 
 
 @pytest.mark.parametrize(
@@ -167,11 +168,15 @@ def test_another_process_has_the_same_motors_and_imports_no_code_because_a_model
     [
         ("250700 ", "2507 ", "user data do not begin with codrl_mj's signature"),
         (reference(Lag), reference(type(LOOP)), "name different families"),
-        (reference(Lag), "codrl_mj.actuators:Nobody", "'codrl_mj.actuators:Nobody' is not loaded"),
+        (
+            reference(Lag),
+            "codrl_mj.actuators:Missing",
+            "'codrl_mj.actuators:Missing' is not loaded",
+        ),
         (" 0.3 0.007", "", "fewer numbers than the family has parameters"),
     ],
 )
-def test_what_does_not_agree_is_refused_when_it_is_loaded(old, new, reason):
+def test_inconsistent_models_raise_when_they_are_loaded(old, new, reason):
     text = codrl_mj.add_motors(arm(), {"one": Lag(time_constant=0.3, delay=0.007)}).to_xml()
     text = re.sub(
         r'<size nuser_actuator="\d+"/>', "", text
@@ -206,7 +211,7 @@ def register_anew(model):
     [
         (register_anew, f"plugin slot = 0: a motor of codrl_mj needs {registered()[NAME][0]}"),
         (set_user(0, 1.0), "its actuator's user data do not begin with codrl_mj's signature"),
-        (swap_families, "family = 'codrl_mj.actuators.current_loop:Actuator' of its plugin"),
+        (swap_families, "family = 'codrl_mj.actuators.current_loop:DCMotorActuator' of its plugin"),
         (set_user(2, 123.0), "family 123 is not known in this process: import its module and call"),
         (set_user(4, -1.0), r"Motor\.resistance = -1\.0: must be"),
     ],

@@ -1,4 +1,4 @@
-"""One motor behind several actuators of a joint: `<position>` and `<velocity>` are a servo with a speed target."""
+"""One motor behind several actuators of a joint, such as `<position>` and `<velocity>`."""
 
 import copy
 
@@ -68,8 +68,8 @@ def _run(model, controls, data=None):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("name", MOTORS)
-def test_it_makes_the_force_of_both(name, integrator):
-    """The same joint driven by one actuator whose control and bias are the sums of theirs."""
+def test_a_shared_motor_delivers_the_sum_of_both_forces(name, integrator):
+    """Compare with a single actuator whose control and bias are the sums of the two."""
     targets = _targets()
     both = codrl_mj.add_motors(_pair(integrator=integrator), {TOGETHER: MOTORS[name]}).compile()
     single = codrl_mj.add_motors(_leg(SUM, integrator), {"hip": MOTORS[name]}).compile()
@@ -80,7 +80,7 @@ def test_it_makes_the_force_of_both(name, integrator):
     np.testing.assert_allclose(_run(both, targets), _run(single, summed), rtol=0, atol=1e-11)
 
 
-def test_what_is_asked_is_the_closed_form():
+def test_the_desired_force_equals_the_closed_form():
     model = codrl_mj.add_motors(_pair(), {"hip_p & hip_v": Lag(time_constant=0.01)}).compile()
     data = mujoco.MjData(model)
     data.qpos[0], data.qvel[0], data.ctrl[:] = 0.2, -0.7, (0.5, 1.5)
@@ -90,7 +90,7 @@ def test_what_is_asked_is_the_closed_form():
     assert list(motors(model)) == [0]
 
 
-def test_ideally_it_is_the_plain_pair():
+def test_an_ideal_shared_motor_equals_the_plain_pair():
     targets = _targets()
     ours = codrl_mj.add_motors(_pair(), {TOGETHER: "ideal"}).compile()
     np.testing.assert_allclose(
@@ -98,7 +98,7 @@ def test_ideally_it_is_the_plain_pair():
     )
 
 
-def test_each_joint_gets_one():
+def test_each_joint_gets_one_shared_motor():
     spec = _pair(
         also=(
             '<position name="knee_p" joint="knee" kp="9"/><velocity name="knee_v" joint="knee"'
@@ -110,7 +110,7 @@ def test_each_joint_gets_one():
     assert model.nu == 4
 
 
-def test_saved_copied_and_attached_models_keep_it():
+def test_saved_copied_and_attached_models_keep_a_shared_motor():
     targets, lag = _targets(), {"hip_p & hip_v": Lag(time_constant=0.01)}
     spec = codrl_mj.add_motors(_pair(), lag)
     expected = _run(spec.compile(), targets)
@@ -130,16 +130,16 @@ def test_saved_copied_and_attached_models_keep_it():
     np.testing.assert_array_equal(_run(model, targets[200:], copy.copy(halfway)), expected[200:])
 
 
-def test_the_certificate_passes_it_and_leaves_nothing_out():
+def test_the_certificate_passes_a_shared_motor_without_omissions():
     certificate = validate_model(
         codrl_mj.add_motors(_pair(), {TOGETHER: "lag"}).compile(), quick=True
     )
     assert certificate.passed
-    assert not [one for one in certificate.skipped if "not motors" in one.reason]
+    assert not [check for check in certificate.skipped if "not motors" in check.reason]
 
 
-def test_a_range_of_the_force_of_one_is_kept_and_limits_no_motor():
-    """Clipped as MuJoCo clips it, before the motor is asked for the sum."""
+def test_an_actuators_forcerange_is_kept_and_does_not_limit_the_motor():
+    """The force of each actuator is clipped as in MuJoCo before the sum becomes the command."""
     limited = 'forcelimited="true" forcerange="-3 3"'
     model = codrl_mj.add_motors(_pair(limited), {TOGETHER: "ideal"}).compile()
     data = mujoco.MjData(model)
@@ -149,14 +149,14 @@ def test_a_range_of_the_force_of_one_is_kept_and_limits_no_motor():
 
 
 REFUSED = [
-    ((), TOGETHER, Servo(), "a Servo is asked for one motion"),
+    ((), TOGETHER, Servo(), "the command of a Servo is one motion"),
     (('gear="2"', ""), TOGETHER, "lag", "whose gear differs"),
     (('group="2"', ""), TOGETHER, "lag", "whose group differs"),
     (
         ('forcelimited="true" forcerange="-3 3"',) * 2,
         TOGETHER,
         "lag",
-        "limit the joint, actuatorfrcrange",
+        "limit the joint instead, with actuatorfrcrange",
     ),
     ((), ("hip_p", "knee"), "lag", "'hip_p & knee' matches actuator hip_p of hip alone"),
     ((), ("hip_p", "hip_w"), "lag", "'hip_w': no actuator has such a name"),
@@ -165,13 +165,13 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("attributes", "pattern", "actuator", "message"), REFUSED)
-def test_what_cannot_be_one_motor_is_refused(attributes, pattern, actuator, message):
+def test_actuators_that_cannot_share_a_motor_raise(attributes, pattern, actuator, message):
     spec = _pair(*attributes, also=KNEE)
     with pytest.raises(ValueError, match=message):
         codrl_mj.add_motors(spec, {pattern: actuator})
 
 
-def test_an_actuator_beside_a_motor_is_said_to_go_past_it():
+def test_an_actuator_past_a_motor_causes_a_warning():
     with pytest.warns(
         MotorWarning,
         match="actuator hip_v drives the joint of hip_p past its motor: 'hip_p & hip_v'",
@@ -179,13 +179,13 @@ def test_an_actuator_beside_a_motor_is_said_to_go_past_it():
         codrl_mj.add_motors(_pair(), {"hip_p": "lag"})
 
 
-def test_a_task_s_motors_are_each_their_own():
+def test_a_tasks_motors_are_separate():
     with pytest.raises(ValueError, match="pendulum has a motor at each of its joints"):
         codrl_mj.EnvConfig("pendulum", {"motor & motor": "lag"})
 
 
 class Leg(gymnasium.Env):
-    """An environment of the pair and a motor at the knee."""
+    """Environment of the pair and a motor at the knee."""
 
     metadata = {"render_modes": []}  # noqa: RUF012
     render_mode = None
@@ -217,7 +217,7 @@ def _make(**options):
     return codrl_mj.make(Leg, ACTUATORS, disable_env_checker=True, max_episode_steps=100, **options)
 
 
-def test_an_environment_has_one_motor_for_it():
+def test_an_environment_has_one_motor_for_the_pair():
     env = _make(randomize={"hip_p & hip_v:time_constant": "uniform(0.02, 0.03)"})
     _, info = env.reset(seed=1)
     assert env.recorder.motor_names == ("hip_p & hip_v", "knee")
@@ -228,7 +228,7 @@ def test_an_environment_has_one_motor_for_it():
     assert info["desired_force"].shape == (2,)
 
 
-def test_an_evaluation_that_changes_others_leaves_it_whole(monkeypatch):
+def test_evaluation_variants_keep_a_shared_motor(monkeypatch):
     monkeypatch.setitem(
         gymnasium.registry, "Leg-v0", gymnasium.envs.registration.EnvSpec("Leg-v0", Leg)
     )
@@ -241,7 +241,7 @@ def test_an_evaluation_that_changes_others_leaves_it_whole(monkeypatch):
     assert codrl_mj.EnvConfig.from_mapping(config.as_mapping()) == config
 
 
-def test_both_commands_are_late_and_loads_act_once():
+def test_both_commands_are_delayed_and_loads_act_once():
     env = _make(disturbances={"command_delay": 0.02})
     env.reset(seed=1)
     env.step(np.array([0.5, 0.25, 0.75], dtype=np.float32))
@@ -257,14 +257,14 @@ def test_both_commands_are_late_and_loads_act_once():
     assert np.abs(loads).max(axis=0) == pytest.approx([2.0, 2.0])
 
 
-def test_currents_are_no_command_of_two():
+def test_a_shared_motor_refuses_current_commands():
     with pytest.raises(ValueError, match="hip_p: is no plain motor of its own"):
         codrl_mj.make(Leg, {"hip_p & hip_v": MAXON}, action="current", disable_env_checker=True)
 
 
 @pytest.mark.parametrize(("limit", "fits"), [(1.0, False), (1000.0, True)])
-def test_a_force_range_that_would_cut_a_voltage_is_refused(limit, fits):
-    """24 V stand for the torque at standstill, 24/R*kT*100: of 24 V 1.4 V would arrive."""
+def test_a_forcerange_that_would_limit_a_voltage_raises(limit, fits):
+    """24 V stand for the stall torque 24/R*kT*100; with the range, 1.4 V of 24 V would arrive."""
     knee = f'<motor name="knee" joint="knee" forcelimited="true" forcerange="-{limit} {limit}"/>'
     options = {"action": "voltage", "knee": knee, "disable_env_checker": True}
     if fits:
@@ -280,8 +280,8 @@ def test_a_force_range_that_would_cut_a_voltage_is_refused(limit, fits):
             codrl_mj.make(Leg, {"knee": MAXON}, **options)
 
 
-def test_what_was_chosen_for_it_is_for_both():
-    """`codrl-mj motor choose` writes a file of patterns by the names of motors."""
+def test_a_chosen_motor_is_for_both_actuators():
+    """`codrl-mj motor choose` writes a file of patterns that are motors' names."""
 
     class Choice:
         name = "any"

@@ -1,4 +1,4 @@
-"""Agents small enough to train in a test, and how to train them."""
+"""Agents that are small enough for training in a test, and their training."""
 
 import gymnasium
 import numpy as np
@@ -35,28 +35,28 @@ SMALL = {
 
 
 def make_envs(task, num_envs=1, **arguments):
-    """Environments of a task for Stable-Baselines3."""
+    """Create environments of a task for Stable-Baselines3."""
     return make_sb3_vec_env(TASKS[task].env_id, num_envs, **arguments)
 
 
 def make_model(config, task, seed=0, num_envs=1, **arguments):
-    """An agent's model on a task."""
+    """Create an agent's model on a task."""
     torch.set_num_threads(1)
     return config.make_model(make_envs(task, num_envs, **arguments), seed)
 
 
 def weights(module):
-    """Copies of a module's tensors by name."""
+    """Return copies of a module's tensors by name."""
     return {name: tensor.clone() for name, tensor in module.state_dict().items()}
 
 
 def differing(before, after, by=0.0):
-    """Names of the tensors that are not the same bits, or that differ by more than `by`."""
+    """Return names of tensors with different bits, or with a difference above `by`."""
     return {name for name in before if (before[name] - after[name]).abs().max() > by}
 
 
 class Sampled(gymnasium.Env):
-    """Observations at random from a space; takes none but its own actions."""
+    """Environment with random observations from a space, which accepts only its own actions."""
 
     def __init__(self, observation_space, action_space):
         """Take the spaces."""

@@ -1,4 +1,4 @@
-"""Exploration: noise against its recursion, epsilon against its definition."""
+"""Exploration: noise equals its recursion, epsilon its definition."""
 
 import numpy as np
 import pytest
@@ -17,17 +17,19 @@ from tests.agents.small import make_model
         (DDPGConfig, 0.4, 1.5, 1.0),
     ],
 )
-def test_the_noise_is_its_recursion(agent, sigma, theta, dt):
+def test_the_noise_follows_its_recursion(agent, sigma, theta, dt):
     """X' = (1 - theta dt) x + sigma sqrt(dt) N(0, 1), from 0, with the numbers that it draws."""
     noise = make_model(
         agent(noise_sigma=sigma, noise_theta=theta, noise_dt=dt), "pendulum"
     ).action_noise
-    np.random.seed(1)  # the generator that the noise draws from
+    # The noise draws from this generator.
+    np.random.seed(1)
     drawn = np.array([noise()[0] for _ in range(200)], dtype=float)
     np.random.seed(1)
     before = np.append(0.0, drawn[:-1])
     expected = (1 - theta * dt) * before + sigma * np.sqrt(dt) * np.random.normal(size=200)
-    np.testing.assert_allclose(drawn, expected, rtol=0, atol=1e-6)  # it is kept in float32
+    # The noise is stored in float32.
+    np.testing.assert_allclose(drawn, expected, rtol=0, atol=1e-6)
 
 
 def test_the_noise_starts_at_zero_in_every_episode_and_can_be_left_out():
@@ -42,7 +44,7 @@ def test_the_noise_starts_at_zero_in_every_episode_and_can_be_left_out():
 
 
 class Epsilons(BaseCallback):
-    """Episode and epsilon, at every step."""
+    """Callback that records episode and epsilon at every step."""
 
     def _on_training_start(self):
         self.seen = []
@@ -60,10 +62,10 @@ def epsilons(steps, max_episode_steps=None, **settings):
     return watched.seen
 
 
-def test_epsilon_shrinks_by_its_factor_with_every_episode_down_to_its_end():
+def test_epsilon_is_multiplied_by_its_factor_down_to_its_minimum():
     settings = {"exploration_start": 0.8, "exploration_decay": 0.5, "exploration_end": 0.1}
-    seen = epsilons(25, 5, **settings)
-    assert set(seen) == {(0, 0.8), (1, 0.4), (2, 0.2), (3, 0.1), (4, 0.1)}
+    recorded = epsilons(25, 5, **settings)
+    assert set(recorded) == {(0, 0.8), (1, 0.4), (2, 0.2), (3, 0.1), (4, 0.1)}
 
 
 def test_epsilon_falls_linearly_over_its_share_of_the_steps():

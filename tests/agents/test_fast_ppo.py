@@ -1,4 +1,4 @@
-"""PPO's arithmetic written out, against Stable-Baselines3's own."""
+"""The explicit computations of PPO equal those of Stable-Baselines3."""
 
 import copy
 
@@ -52,7 +52,7 @@ FILLED = (
 
 
 def pair(case):
-    """A model of ours with a rollout, and Stable-Baselines3's own of the same settings and weights."""
+    """Return our model with a rollout, and Stable-Baselines3's with the same weights."""
     task, settings = CASES[case]
     envs = make_sb3_vec_env(f"codrl_mj/{task}-v0", 4, max_episode_steps=20)
     config = PPOConfig(rollout_steps=256, batch_size=64, epochs=3, **settings)
@@ -86,7 +86,7 @@ def collect(model):
 
 
 def learn_alike(rollout, *models):
-    """What each has learned by an update from the same rollout, in the same minibatches."""
+    """Return the results of an update of each model from the same rollout and minibatches."""
     for model in models:
         model.set_logger(Logger(None, []))
         model.rollout_buffer = copy.deepcopy(rollout)
@@ -107,7 +107,7 @@ def test_learns_what_stable_baselines3_learns_from_the_same_rollout(case):
 
 
 class Replayed:
-    """Stands in for a policy's `forward`: acts as in a rollout, values and judges as the policy does."""
+    """Replacement of a policy's `forward` with recorded actions and the policy's evaluations."""
 
     def __init__(self, policy, actions):
         """Take the actions (steps, envs, ...)."""
@@ -122,9 +122,8 @@ class Replayed:
 
 @pytest.mark.parametrize("case", ["discrete", "in units", "state-dependent"])
 def test_fills_the_buffer_as_stable_baselines3_does_for_the_same_actions(case):
-    ours, theirs, _ = pair(
-        case
-    )  # their environments are the same object, and begin anew with the model's seed
+    # Both have the same environments, which restart with the model's seed.
+    ours, theirs, _ = pair(case)
     collect(ours)
     mine = ours.rollout_buffer
     theirs.policy.forward = Replayed(theirs.policy, mine.actions)
@@ -138,31 +137,31 @@ def test_fills_the_buffer_as_stable_baselines3_does_for_the_same_actions(case):
 
 @pytest.mark.parametrize("case", ["discrete", "in units", "state-dependent"])
 def test_explores_with_the_probabilities_of_its_policy(case):
-    """Means and deviations of 20 000 actions in one state, against the policy's own distribution."""
+    """Compare mean and deviation of 20 000 actions in a state with the policy's distribution."""
     ours, _, envs = pair(case)
     torch.manual_seed(0)
     count = 20_000
     observation = envs.reset()[:1]
     with torch.no_grad():
-        acted = ours._networks.act(ours._features(np.repeat(observation, count, axis=0)))
-        draws = ours._exploration.draws(1, count, ours._networks.outputs)
-        actions = ours._exploration.actions(*acted, draws[0]).double().numpy()
-        wanted = ours.policy.get_distribution(torch.as_tensor(observation)).distribution
-    mean = float(wanted.probs[0, 1] if case == "discrete" else wanted.mean)
-    deviation = (mean * (1 - mean)) ** 0.5 if case == "discrete" else float(wanted.stddev)
+        layers = ours._networks.act(ours._features(np.repeat(observation, count, axis=0)))
+        noise = ours._exploration.draw_noise(1, count, ours._networks.outputs)
+        actions = ours._exploration.actions(*layers, noise[0]).double().numpy()
+        distribution = ours.policy.get_distribution(torch.as_tensor(observation)).distribution
+    mean = float(distribution.probs[0, 1] if case == "discrete" else distribution.mean)
+    deviation = (mean * (1 - mean)) ** 0.5 if case == "discrete" else float(distribution.stddev)
     assert actions.mean() == pytest.approx(mean, abs=4 * deviation / count**0.5)
     assert actions.std() == pytest.approx(deviation, rel=0.03)
 
 
 def test_state_dependent_noise_lasts_for_its_steps():
-    """Drawn every four steps: the noise is one linear function of the hidden units until then."""
+    """For four steps the noise is the same linear function of the hidden units."""
     explores = pair("state-dependent")[0]._exploration
-    assert explores.draws(64, 4, 1).shape == (16, 4, 8, 1)
+    assert explores.draw_noise(64, 4, 1).shape == (16, 4, 8, 1)
 
 
 @pytest.mark.parametrize("case", ["discrete", "state-dependent"])
-def test_a_saved_model_goes_on_in_stable_baselines3_and_theirs_here(case, tmp_path):
-    """Weights and Adam's moments are in the file: the next update is the same."""
+def test_saved_models_continue_in_stable_baselines3_and_the_reverse(case, tmp_path):
+    """The file has weights and Adam's moments, so the next update is the same."""
     ours, theirs, envs = pair(case)
     collect(ours)
     rollout = ours.rollout_buffer
@@ -173,13 +172,13 @@ def test_a_saved_model_goes_on_in_stable_baselines3_and_theirs_here(case, tmp_pa
         torch.testing.assert_close(*learn_alike(rollout, read, saved), rtol=0, atol=1e-5)
 
 
-def test_moments_of_other_networks_are_refused():
+def test_moments_of_other_networks_raise():
     ours, _, _ = pair("discrete")
-    other, _, _ = pair("state-dependent")
+    different, _, _ = pair("state-dependent")
     with pytest.raises(
-        ValueError, match=r"12 parameters are optimised: must be 13|13 .* must be 12"
+        ValueError, match=r"12 parameters are optimized: must be 13|13 .* must be 12"
     ):
-        ours.policy.optimizer.load_state_dict(other.policy.optimizer.state_dict())
+        ours.policy.optimizer.load_state_dict(different.policy.optimizer.state_dict())
 
 
 def box(*shape, dtype=np.float32):
@@ -214,7 +213,7 @@ def test_learns_in_spaces_that_stable_baselines3_learns_in(observations, actions
     assert all((tensor != before[name]).any() for name, tensor in model.policy.state_dict().items())
 
 
-def test_a_copy_that_would_not_learn_says_so():
+def test_learning_with_a_deep_copy_raises():
     model = copy.deepcopy(small(box(3), box(1)))
     with pytest.raises(RuntimeError, match="save and load"):
         model.learn(64)
@@ -234,7 +233,7 @@ def test_a_copy_that_would_not_learn_says_so():
         ),
     ],
 )
-def test_what_it_would_learn_wrongly_is_refused(name, observations, settings):
+def test_unsupported_settings_raise(name, observations, settings):
     with pytest.raises(ValueError, match=name):
         FastPPO(
             ActorCriticPolicy,

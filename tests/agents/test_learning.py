@@ -10,7 +10,7 @@ import pytest
 
 from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, SARSAConfig, TD3Config
 from tests.agents.small import make_envs, make_model
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 _FAST = {"learning_rate": 3e-3, "gamma": 0.95, "tau": 0.02, "train_every": None}
 _REPLAY = {"batch_size": 64, "learning_starts": 200}
@@ -27,7 +27,7 @@ _DQN = {
 }
 _EPSILON = {"exploration_decay": None, "exploration_fraction": 0.4, "exploration_end": 0.04}
 
-# agent -> (settings, task, environments, steps, least return)
+# Agent -> (settings, task, environments, steps, minimum return).
 LEARNERS = {
     "ppo": (PPOConfig(rollout_steps=1024, batch_size=128, epochs=8), "cartpole", 8, 10_240, 130),
     "ppo, actor and critic apart": (
@@ -55,7 +55,7 @@ LEARNERS = {
 
 
 def mean_return(policy, task, episodes=20):
-    """Mean return of episodes side by side, the policy taking its most likely actions."""
+    """Return the mean return of parallel episodes with the policy's most likely actions."""
     envs = make_envs(task, episodes)
     envs.seed(1000)
     observations, returns = envs.reset(), {}
@@ -68,10 +68,10 @@ def mean_return(policy, task, episodes=20):
     return np.mean(list(returns.values()))
 
 
-@pytest.mark.parametrize("agent", but([], LEARNERS))
+@pytest.mark.parametrize("agent", matrix_params([], LEARNERS))
 def test_an_agent_learns(agent):
-    config, task, num_envs, steps, least = LEARNERS[agent]
+    config, task, num_envs, steps, min_return = LEARNERS[agent]
     model = make_model(config, task, seed=2, num_envs=num_envs)
-    assert mean_return(model.policy, task) < least, "an untrained policy must not pass"
+    assert mean_return(model.policy, task) < min_return, "an untrained policy must not pass"
     model.learn(steps)
-    assert mean_return(model.policy, task) > least
+    assert mean_return(model.policy, task) > min_return

@@ -1,4 +1,4 @@
-"""The networks have the paper's layers, and nothing else about a policy depends on how it was made."""
+"""The networks have the paper's layers, and a policy does not depend on how it was created."""
 
 import operator
 
@@ -9,11 +9,11 @@ import torch
 from torch import nn
 
 from codrl_mj.agents import AGENTS, DDPGConfig, PPOConfig
-from codrl_mj.agents.presets import ELSEWHERE, PRESETS, find_preset
+from codrl_mj.agents.presets import OTHER_ENV, PRESETS, find_preset
 from tests.agents.small import make_envs, make_model
 
 EVERY = [
-    (agent, task, name) for (agent, task), of in PRESETS.items() for name in of if task != ELSEWHERE
+    (agent, task, name) for (agent, task), of in PRESETS.items() for name in of if task != OTHER_ENV
 ]
 
 
@@ -27,7 +27,7 @@ def paper(agent, task):
 
 
 def layers(module):
-    """In their order: (inputs, outputs) of the linear ones, names of the others."""
+    """Return (inputs, outputs) of linear layers and names of other layers, in order."""
     return [
         (
             (layer.in_features, layer.out_features)
@@ -86,8 +86,8 @@ ACTOR = [(64, 64), "ReLU", (64, 1), "Tanh"]
         ),
     ],
 )
-def test_layers_are_those_printed_or_asked_for(config, task, part, expected):
-    """(inputs, outputs) of the linear ones; of two streams the state's, the action's, the joint ones."""
+def test_layers_are_those_of_the_paper_or_the_settings(config, task, part, expected):
+    """Compare (inputs, outputs) of linear layers; of two streams those of state, action, joint."""
     assert layers(operator.attrgetter(part)(policy_of(config, task))) == expected
 
 
@@ -120,42 +120,45 @@ def test_ddpg_acts_within_the_range_that_tanh_spans(task, limit):
 
 
 @pytest.mark.parametrize("agent", ["ppo", "ddpg", "td3", "sac"])
-def test_factors_on_the_input_are_those_on_the_observation(agent):
-    """A network with factors, on observations, is the network without them on observations times the factors."""
+def test_input_scale_multiplies_the_observation(agent):
+    """A network with factors equals the one without factors on observations times the factors."""
     task, factors = CAR, (0.5, 10.0)
     plain, scaled = (policy_of(AGENTS[agent](input_scale=scale), task) for scale in (None, factors))
     scaled.load_state_dict(plain.state_dict())
-    seen = observations(task)
-    times = seen * np.array(factors, np.float32)
+    inputs = observations(task)
+    times = inputs * np.array(factors, np.float32)
     ours, theirs = (
-        one.predict(seen, deterministic=True)[0] for one, seen in ((scaled, seen), (plain, times))
+        policy.predict(values, deterministic=True)[0]
+        for policy, values in ((scaled, inputs), (plain, times))
     )
     np.testing.assert_array_equal(ours, theirs)
     if agent != "ppo":  # critics too
-        actions = torch.zeros(len(seen), 1)
+        actions = torch.zeros(len(inputs), 1)
         ours, theirs = (
-            scaled.critic(torch.tensor(seen), actions),
+            scaled.critic(torch.tensor(inputs), actions),
             plain.critic(torch.tensor(times), actions),
         )
         assert all(map(torch.equal, ours, theirs))
 
 
-def test_entries_without_a_factor_stay_as_they_are():
-    """With the actuator observed, an observation has more entries than the settings have factors."""
+def test_entries_without_a_factor_are_not_scaled():
+    """An observation with the actuator's signals has more entries than there are factors."""
     policy = policy_of(DDPGConfig(input_scale=(1.0, 10.0)), CAR, observe_actuator=True)
     assert policy.actor.features_extractor.factors.tolist() == [1, 10, 1, 1]
 
 
 @pytest.mark.matrix
 @pytest.mark.parametrize(("command", "largest"), [("force", 0.084), ("voltage", 18.0)])
-def test_unit_actions_are_those_of_a_plain_actor_times_the_largest(command, largest):
-    configs = (PPOConfig(log_std_init=-0.5, unit_actions=given) for given in (False, True))
+def test_unit_actions_are_multiplied_by_the_largest_action(command, largest):
+    configs = (
+        PPOConfig(log_std_init=-0.5, unit_actions=unit_actions) for unit_actions in (False, True)
+    )
     plain, units = (policy_of(config, "furuta", action=command) for config in configs)
     units.load_state_dict(plain.state_dict())
-    seen = torch.as_tensor(observations("furuta"))
+    inputs = torch.as_tensor(observations("furuta"))
     ours, theirs = (
-        units.get_distribution(seen).distribution,
-        plain.get_distribution(seen).distribution,
+        units.get_distribution(inputs).distribution,
+        plain.get_distribution(inputs).distribution,
     )
     torch.testing.assert_close(ours.mean, largest * theirs.mean)
     torch.testing.assert_close(ours.stddev, torch.full_like(ours.stddev, largest * np.exp(-0.5)))
@@ -171,12 +174,13 @@ def test_the_largest_action_may_be_a_negative_one():
 
 
 @pytest.mark.parametrize(("agent", "task", "settings"), EVERY)
-def test_weights_make_the_same_policy_again(agent, task, settings):
+def test_weights_restore_the_same_policy(agent, task, settings):
     preset = find_preset(agent, task, settings)
     model = make_model(preset.agent, task, seed=3, num_envs=preset.num_envs)
     policy = preset.agent.make_policy(model.observation_space, model.action_space)
-    policy.load_state_dict(model.policy.state_dict())  # all have the same names and shapes
+    # This raises an error unless all names and shapes are the same.
+    policy.load_state_dict(model.policy.state_dict())
     ours, theirs = (
-        one.predict(observations(task), deterministic=True)[0] for one in (policy, model.policy)
+        each.predict(observations(task), deterministic=True)[0] for each in (policy, model.policy)
     )
     np.testing.assert_array_equal(ours, theirs)

@@ -1,11 +1,11 @@
-"""Every agent has settings for every task it can do, and the paper's are the paper's."""
+"""Every agent has settings for every task that it can learn; `paper` has the paper's."""
 
 import re
 
 import pytest
 
 from codrl_mj.agents import AGENTS
-from codrl_mj.agents.presets import ELSEWHERE, PRESETS, SETTINGS, find_preset
+from codrl_mj.agents.presets import OTHER_ENV, PRESETS, SETTINGS, find_preset
 from codrl_mj.tasks import TASKS, find_task
 from codrl_mj.training import TrainConfig
 from tests.tasks.faces import every_rebuilt
@@ -33,7 +33,7 @@ SARSA = (
     "trace_decay",
     "initial_value",
 )
-# what the paper prints (Experimental Results): episodes or steps, and values of the names above
+# The paper's values (Experimental Results): episodes or steps, and values of the names above.
 PRINTED = [
     (
         "ddpg",
@@ -65,7 +65,7 @@ PRINTED = [
 
 
 @pytest.mark.parametrize(("agent", "task", "episodes", "steps", "names", "values"), PRINTED)
-def test_the_papers_settings_are_those_printed(agent, task, episodes, steps, names, values):
+def test_the_papers_settings_are_as_printed(agent, task, episodes, steps, names, values):
     preset = find_preset(agent, task, "paper")
     assert (preset.total_episodes, preset.total_steps) == (episodes, steps)
     assert tuple(getattr(preset.agent, name) for name in names) == values
@@ -89,8 +89,8 @@ def test_furutas_small_torques_are_commanded_in_units():
     assert find_preset("ppo", "furuta").agent.unit_actions
 
 
-def test_settings_have_the_names_that_are_known_and_one_budget():
-    assert {task for _, task in PRESETS} == {*TASKS, ELSEWHERE}
+def test_settings_have_known_names_and_one_budget():
+    assert {task for _, task in PRESETS} == {*TASKS, OTHER_ENV}
     for (agent, _), named in PRESETS.items():
         assert {"default"} <= set(named) <= set(SETTINGS)
         for name, preset in named.items():
@@ -117,6 +117,6 @@ def test_settings_have_the_names_that_are_known_and_one_budget():
         ),
     ],
 )
-def test_unknown_settings_are_answered_with_those_that_exist(names, message):
+def test_unknown_settings_raise_and_name_the_available_ones(names, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         find_preset(*names)

@@ -1,4 +1,4 @@
-"""SARSA against Sutton and Barto's box computed by hand, and as an algorithm of Stable-Baselines3."""
+"""SARSA equals Sutton and Barto's algorithm, and works as an algorithm of Stable-Baselines3."""
 
 import gymnasium
 import numpy as np
@@ -18,15 +18,16 @@ from stable_baselines3.common.logger import configure
 import codrl_mj
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.agents.sarsa import SARSAConfig
-from codrl_mj.agents.sarsa_algorithm import FORGOTTEN, SARSA
+from codrl_mj.agents.sarsa_algorithm import MIN_ELIGIBILITY, SARSA
 from codrl_mj.physics.base import SimulationDivergedError
 from codrl_mj.tasks import find_task
 
-TABLE = {"tilings": 1, "intervals": (2,)}  # of a chain of 3 states: one tile for each
+# One tile for each of the chain's 3 states.
+TABLE = {"tilings": 1, "intervals": (2,)}
 
 
 class Chain(gymnasium.Env):
-    """States 0, 1, 2: action 1 moves on and, from the last, out; action 0 stays. -1 a step."""
+    """Chain of states 0, 1, 2: action 1 moves on and out of the last, action 0 stays; -1 a step."""
 
     observation_space = spaces.Box(0.0, 2.0, (1,))
 
@@ -50,41 +51,42 @@ def _table(model):
     return model.policy.state_dict()["weights"].numpy().copy()
 
 
-# -- the updates ----------------------------------------------------------------------------------------------
+# -- the updates -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("trace_decay", [0.0, 0.8])
-def test_it_does_what_the_box_says(trace_decay):
-    """The weights are those that the box (10.1; 12.7 with replacing traces) computes from what was done."""
+def test_weights_equal_those_of_sutton_and_bartos_algorithm(trace_decay):
+    """Compute the weights from the history by the box (10.1; 12.7 with replacing traces)."""
     step_size, gamma, env = 0.3, 0.9, Chain()
     config = SARSAConfig(
         step_size=step_size, gamma=gamma, epsilon=0.5, trace_decay=trace_decay, **TABLE
     )
     model = config.make_model(env, 3).learn(60)
     values = np.zeros((3, 2))
-    for episode in env.history[:-1]:  # the last one was only begun
+    # The last episode has only started.
+    for episode in env.history[:-1]:
         traces = np.zeros((3, 2))
-        for done, then in zip(episode, [*episode[1:], None], strict=True):
-            target = -1.0 + (0.0 if then is None else gamma * values[then])
-            error = target - values[done]
+        for pair, next_pair in zip(episode, [*episode[1:], None], strict=True):
+            target = -1.0 + (0.0 if next_pair is None else gamma * values[next_pair])
+            error = target - values[pair]
             traces *= gamma * trace_decay
-            traces[traces < FORGOTTEN] = 0.0
-            traces[done] = 1.0
+            traces[traces < MIN_ELIGIBILITY] = 0.0
+            traces[pair] = 1.0
             values += step_size * error * traces
     assert len(env.history) > 5
     np.testing.assert_allclose(_table(model), values, rtol=1e-12)
 
 
 @pytest.mark.parametrize("limit", [1, 3])
-def test_a_time_limit_is_no_end(limit):
-    """Staying for ever is worth -1/(1 - gamma), however short the episodes."""
+def test_a_time_limit_does_not_terminate_the_return(limit):
+    """The value of staying forever is -1/(1 - gamma), also in short episodes."""
     env = TimeLimit(Chain(), limit)
     env.action_space = spaces.Discrete(1)
     model = SARSAConfig(step_size=0.5, gamma=0.9, **TABLE).make_model(env, 0).learn(600)
     assert _table(model)[0, 0] == pytest.approx(-10.0)
 
 
-def test_every_weight_starts_at_its_share_of_the_initial_value():
+def test_weights_start_at_the_initial_value_divided_by_tilings():
     car = find_task("mountain_car")
     policy = SARSAConfig(initial_value=40.0).make_policy(car.observation_space, car.action_space)
     np.testing.assert_array_equal(policy.table, np.full((648, 3), 5.0))
@@ -112,7 +114,7 @@ def test_epsilon_is_the_share_of_random_actions():
     assert abs((actions == 0).mean() - 0.15) < 5 * np.sqrt(0.15 * 0.85 / 20_000)
 
 
-# -- as an algorithm of Stable-Baselines3 -----------------------------------------------------------------------
+# -- as an algorithm of Stable-Baselines3 ----------------------------------------------------------
 
 
 def _car(seed_of_env=None, **arguments):
@@ -131,7 +133,7 @@ def _model(config=SARSAConfig(epsilon=0.2), compiled=True, **arguments):  # noqa
 
 
 class Watched(BaseCallback):
-    """What a callback is shown: steps and epsilon when an episode begins, and the locals of every step."""
+    """Callback that records steps and epsilon at starts of episodes, and each step's locals."""
 
     def _init_callback(self):
         self.begun, self.steps = [], []
@@ -145,13 +147,13 @@ class Watched(BaseCallback):
         return True
 
 
-def test_the_agents_draws_are_not_the_environments():
+def test_agent_and_environment_draw_different_numbers():
     model = SARSAConfig().make_model(_car(), 0)
     model.env.reset()
     assert model.snapshot()["generator"].tolist() != model.env.snapshot()["streams"][0].tolist()
 
 
-def test_a_loaded_model_acts_and_learns_on_like_the_one_saved(tmp_path):
+def test_a_loaded_model_acts_and_learns_like_the_saved_one(tmp_path):
     model = SARSAConfig(trace_decay=0.5).make_model(_car(), 0).learn(500)
     model.save(tmp_path / "model")
     loaded = SARSA.load(tmp_path / "model", env=_car())
@@ -163,7 +165,7 @@ def test_a_loaded_model_acts_and_learns_on_like_the_one_saved(tmp_path):
     np.testing.assert_array_equal(_table(loaded), _table(model))
 
 
-def test_many_predictions_are_each_the_one():
+def test_batched_predictions_equal_single_ones():
     model = SARSAConfig().make_model(_car(), 0).learn(2000)
     space = model.observation_space
     observations = (
@@ -171,13 +173,15 @@ def test_many_predictions_are_each_the_one():
     )
     actions = model.predict(observations, deterministic=True)[0].tolist()
     assert set(actions) == {0, 1, 2}
-    assert [model.predict(one, deterministic=True)[0].item() for one in observations] == actions
+    assert [model.predict(row, deterministic=True)[0].item() for row in observations] == actions
 
 
-def test_no_evaluation_changes_the_training():
-    model, alone = (SARSAConfig().make_model(_car(), 0) for _ in range(2))
+def test_evaluations_do_not_change_the_training():
+    model, unevaluated = (SARSAConfig().make_model(_car(), 0) for _ in range(2))
     evaluate = EvalCallback(_car(), n_eval_episodes=2, eval_freq=2, deterministic=False, verbose=0)
-    np.testing.assert_array_equal(_table(model.learn(1000, evaluate)), _table(alone.learn(1000)))
+    np.testing.assert_array_equal(
+        _table(model.learn(1000, evaluate)), _table(unevaluated.learn(1000))
+    )
     assert evaluate.last_mean_reward == -200.0
 
 
@@ -203,7 +207,7 @@ def test_learning_ends_with_an_episode_and_goes_on_with_the_next():
     assert model.learn(1, reset_num_timesteps=False).num_timesteps == 150
 
 
-# -- whole episodes in compiled code ----------------------------------------------------------------------------
+# -- whole episodes in compiled code ---------------------------------------------------------------
 
 NOISY = {"controller": {"ki": 1.0, "kd": 0.01, "current_noise": 0.05}}
 DISTURBED = {
@@ -230,8 +234,8 @@ LEVELS = {
     ],
     ids=["motor", "with traces", "currents", "disturbed"],
 )
-def test_compiled_episodes_are_those_taken_step_by_step(settings, arguments):
-    states, seen = [], []
+def test_compiled_episodes_equal_those_taken_step_by_step(settings, arguments):
+    states, recorded = [], []
     for compiled in (False, True):
         model, watched = (
             _model(SARSAConfig(epsilon=0.2, **settings), compiled, **arguments),
@@ -239,22 +243,28 @@ def test_compiled_episodes_are_those_taken_step_by_step(settings, arguments):
         )
         model.learn(10**9, [StopTrainingOnMaxEpisodes(5), watched])
         signals = {f"signals.{name}": values for name, values in model.env.signals.items()}
-        own = {"table": _table(model), "observation": model._last_obs, "steps": model.num_timesteps}
-        states.append({**own, **model.snapshot(), **model.env.snapshot(), **signals})
-        seen.append(watched.steps)
+        results = {
+            "table": _table(model),
+            "observation": model._last_obs,
+            "steps": model.num_timesteps,
+        }
+        states.append({**results, **model.snapshot(), **model.env.snapshot(), **signals})
+        recorded.append(watched.steps)
     assert [*states[0]] == [*states[1]]
     for name, values in states[0].items():
         np.testing.assert_array_equal(values, states[1][name], err_msg=name)
-    steps, episodes = seen
+    steps, episodes = recorded
     assert len(steps) == states[0]["steps"]
     assert len(episodes) == 5
     ended = [step for step in steps if step["dones"][0]]
     for step, episode in zip(ended, episodes, strict=True):
         assert episode["dones"].tolist() == [True]
-        (one,), (other,) = step["infos"], episode["infos"]
-        np.testing.assert_array_equal(one["terminal_observation"], other["terminal_observation"])
-        assert one["TimeLimit.truncated"] == other["TimeLimit.truncated"]
-        assert one["episode"] | {"t": 0} == other["episode"] | {"t": 0}
+        (step_info,), (episode_info,) = step["infos"], episode["infos"]
+        np.testing.assert_array_equal(
+            step_info["terminal_observation"], episode_info["terminal_observation"]
+        )
+        assert step_info["TimeLimit.truncated"] == episode_info["TimeLimit.truncated"]
+        assert step_info["episode"] | {"t": 0} == episode_info["episode"] | {"t": 0}
     for signal in (
         "desired_force",
         "actual_force",
@@ -264,11 +274,11 @@ def test_compiled_episodes_are_those_taken_step_by_step(settings, arguments):
         "saturated",
     ):
         np.testing.assert_array_equal(
-            *(np.concatenate([s["signals"][signal] for s in each]) for each in seen)
+            *(np.concatenate([s["signals"][signal] for s in each]) for each in recorded)
         )
 
 
-def test_episodes_on_a_hill_that_was_rewritten_are_not_those_of_a_simulation_of_its_own():
+def test_changed_attributes_disable_compiled_episodes():
     tables = []
     for compiled in (False, True):
         model = _model(compiled=compiled, max_episode_steps=300)
@@ -277,7 +287,7 @@ def test_episodes_on_a_hill_that_was_rewritten_are_not_those_of_a_simulation_of_
     np.testing.assert_array_equal(*tables)
 
 
-def test_an_episode_that_was_left_is_finished_step_by_step():
+def test_an_interrupted_episode_is_finished_step_by_step():
     models = [_model(compiled=False) for _ in range(2)]
     for model in models:
         model.learn(10**9, lambda locals_, _: locals_["self"].num_timesteps < 50)
@@ -296,7 +306,7 @@ def test_a_diverging_simulation_is_an_error(compiled):
         _model(compiled=compiled, actuator=actuator, allow_unstable=True).learn(10_000)
 
 
-# -- refusals -----------------------------------------------------------------------------------------------------
+# -- refusals --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -306,7 +316,7 @@ def test_a_diverging_simulation_is_an_error(compiled):
         (
             "MountainCar",
             SARSAConfig(intervals=(8, 8, 8)),
-            "of 3 observation entries, but there are 2",
+            "need 3 observation entries, but there are 2",
         ),
         ("Acrobot", SARSAConfig(intervals=(8, 8), angles=3), "angles = 3: must be from 0"),
         ("CartPole", SARSAConfig(intervals=(4, 4, 4, 4)), "axis 1 from -inf to inf"),
@@ -314,7 +324,7 @@ def test_a_diverging_simulation_is_an_error(compiled):
         ("MountainCar", SARSAConfig(low=(0.0,)), r"low = \(0.0,\): must have 2 numbers"),
     ],
 )
-def test_what_cannot_be_tiled_is_refused(task, config, message):
+def test_spaces_that_cannot_be_tiled_raise(task, config, message):
     env = codrl_mj.make_sb3_vec_env(f"codrl_mj/{task}-v0", num_envs=1)
     with pytest.raises(ValueError, match=message):
         config.make_model(env, 0)
@@ -322,16 +332,16 @@ def test_what_cannot_be_tiled_is_refused(task, config, message):
         config.make_policy(env.observation_space, env.action_space)
 
 
-def test_more_than_one_environment_is_refused():
+def test_several_environments_raise():
     env = codrl_mj.make_sb3_vec_env("codrl_mj/MountainCar-v0", num_envs=2)
     with pytest.raises(ValueError, match="num_envs = 2: SARSA learns from one environment"):
         SARSAConfig().make_model(env, 0)
 
 
-# -- other observations and actions ---------------------------------------------------------------------------
+# -- other observations and actions ----------------------------------------------------------------
 
 
-def test_the_actuators_currents_are_ignored_or_tiled_as_the_intervals_say():
+def test_the_intervals_select_whether_currents_are_tiled():
     env = _car(actuator="paper", observe_actuator=True)
     space = env.observation_space
     assert SARSAConfig().make_model(env, 0).policy.table.shape == (648, 3)

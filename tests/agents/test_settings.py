@@ -1,4 +1,4 @@
-"""Settings know their bounds and what they go with, and name themselves when they are wrong."""
+"""Settings are accepted within their bounds, and errors name the setting."""
 
 import math
 import re
@@ -30,14 +30,14 @@ def beyond(value, way):
     return math.nextafter(value, way)
 
 
-# what is taken, what is refused, and the words for it
+# Accepted values, refused values, and the words of the message.
 NO = (math.nan, math.inf, -math.inf, -3.0)
 SHARE = (beyond(0, 1), 0.5, 1), (0, beyond(1, 2), *NO), "a finite number > 0 and <= 1"
 PART = (0, 0.5, 1), (beyond(0, -1), beyond(1, 2), *NO), "a finite number >= 0 and <= 1"
 ABOVE_0 = (beyond(0, 1), 3), (0, *NO), "a finite number > 0"
 FROM_0 = (0, 3), (beyond(0, -1), *NO), "a finite number >= 0"
 COUNTS = [
-    ((least,), (least - 1, float(least), True, "2"), f"an integer >= {least}") for least in range(3)
+    ((bound,), (bound - 1, float(bound), True, "2"), f"an integer >= {bound}") for bound in range(3)
 ]
 UNITS = ((3, 5),), ((0,), (2.0,), 64, (True,)), "a tuple of integers >= 1"
 FACTORS = (
@@ -46,7 +46,8 @@ FACTORS = (
     "a tuple of finite numbers > 0",
 )
 
-FIELDS = {  # field -> (agents, values, those of the agents that take None as well)
+# Field -> (agents, values, agents that accept None as well).
+FIELDS = {
     "learning_rate": (DEEP, SHARE, ()),
     "gamma": (EVERY, SHARE, ()),
     "critic_learning_rate": ((PPOConfig, *CONTINUOUS), SHARE, (PPOConfig, *CONTINUOUS)),
@@ -87,13 +88,14 @@ FIELDS = {  # field -> (agents, values, those of the agents that take None as we
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_a_setting_is_taken_exactly_within_its_bounds(field):
-    agents, (taken, refused, words), optional = FIELDS[field]
+def test_a_setting_is_accepted_exactly_within_its_bounds(field):
+    agents, (accepted, refused, words), optional = FIELDS[field]
     for agent in agents:
         nothing = (None,)
-        for value in (*taken, *(nothing if agent in optional else ())):
-            given = list(value) if isinstance(value, tuple) else value  # as JSON has it
-            assert getattr(agent(**{field: given}), field) == value
+        for value in (*accepted, *(nothing if agent in optional else ())):
+            # JSON has lists instead of tuples.
+            argument = list(value) if isinstance(value, tuple) else value
+            assert getattr(agent(**{field: argument}), field) == value
         for value in (*refused, *(() if agent in optional else nothing)):
             message = (
                 rf"^{agent.__name__}\.{field} = {re.escape(repr(value))}: must be"
@@ -151,13 +153,13 @@ UNSTABLE = "noise_theta = 4.0: noise_theta * noise_dt must be < 2, and noise_dt 
         (lambda: find_agent(f"{__name__}:re"), "is no subclass of codrl_mj's AgentConfig"),
     ],
 )
-def test_settings_that_do_not_go_together_are_refused(make, message):
+def test_contradictory_settings_raise(make, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         make()
 
 
 @pytest.mark.parametrize("agent", CONTINUOUS)
-def test_noise_that_dies_out_is_taken(agent):
+def test_stable_noise_is_accepted(agent):
     assert agent(noise_theta=1.99, noise_dt=1.0).noise_theta == 1.99
 
 
@@ -170,7 +172,7 @@ def test_noise_that_dies_out_is_taken(agent):
         ("td3", "mountain_car", "Discrete"),
     ],
 )
-def test_an_agent_that_cannot_act_in_a_task_is_refused_with_those_that_can(agent, task, kind):
+def test_an_agent_that_cannot_act_in_a_task_raises_and_names_those_that_can(agent, task, kind):
     with pytest.raises(
         ValueError, match=rf"agent = '{agent}': cannot act in the {kind} actions of {task}"
     ) as refusal:

@@ -1,4 +1,4 @@
-"""Tiles against their geometry, computed without rounding, and against the displacements of Sutton's tiles3."""
+"""Tiles against their exact geometry, and against the displacements of Sutton's tiles3."""
 
 import itertools
 import math
@@ -17,7 +17,8 @@ SPACE = find_task("mountain_car").observation_space
 PAPER = make_coder(SPACE.low, SPACE.high, 8, (8, 8))
 INTERVALS = (3, 5, 2)
 COUNTS = tuple(count + 1 for count in INTERVALS)
-EXACT = make_coder((0, 0, 0), INTERVALS, 16, INTERVALS)  # tiles of width 1: nothing is rounded
+# Tiles have the width 1, so that nothing is rounded.
+EXACT = make_coder((0, 0, 0), INTERVALS, 16, INTERVALS)
 
 
 def _tiles(coder, observation, dtype=np.float64):
@@ -39,17 +40,17 @@ def test_a_point_lies_in_one_tile_of_each_displaced_grid(point):
 
 
 def test_the_papers_table_has_1944_weights_and_every_one_is_used():
-    """The ninth tiles of the first grid hold the upper bounds alone."""
+    """The ninth tiles of the first grid contain only the upper bounds."""
     eighths = [*((np.arange(64) + 0.5) / 64), 2.0]
     used = set()
-    for place in itertools.product(eighths, eighths):
-        used.update(_tiles(PAPER, SPACE.low + np.array(place) * (SPACE.high - SPACE.low)))
+    for point in itertools.product(eighths, eighths):
+        used.update(_tiles(PAPER, SPACE.low + np.array(point) * (SPACE.high - SPACE.low)))
     assert used == set(range(PAPER.size))
     assert PAPER.size * 3 == 1944
 
 
 def test_two_states_share_a_tile_exactly_if_they_do_in_suttons_tiles3():
-    """There, coordinate j of tiling t is (floor(n x) + t (1 + 2 j)) // n, for x in units of tiles."""
+    """In tiles3 coordinate j of tiling t is (floor(n x) + t (1 + 2 j)) // n, for x in tiles."""
     generator = np.random.default_rng(0)
     ours, theirs = {}, {}
     for point in generator.uniform(0, 1, (2000, 2)):
@@ -83,30 +84,32 @@ def test_float32_observations_have_the_tiles_of_their_float64_values():
         assert _tiles(PAPER, point, np.float32) == _tiles(PAPER, point.astype(np.float64))
 
 
-def _seen(angle):
+def _cos_sin(angle):
     return math.cos(angle), math.sin(angle)
 
 
 @given(st.floats(-math.pi, math.pi))
-def test_an_angle_is_tiled_as_the_number_that_it_is(angle):
+def test_an_angle_has_the_tiles_of_its_value(angle):
     wrapping = make_coder((), (), 8, (4,), angles=1)
     plain = make_coder((-math.pi,), (math.pi,), 8, (4,))
-    angle = math.atan2(math.sin(angle), math.cos(angle))  # as it comes back
-    expected = [
-        tile % 5 % 4 + tile // 5 * 4 for tile in _tiles(plain, [angle])
-    ]  # the fifth tile is the first again
-    assert _tiles(wrapping, _seen(angle)) == expected
+    # The coder computes the angle from its sine and cosine, with the same rounding.
+    angle = math.atan2(math.sin(angle), math.cos(angle))
+    # With an angle the fifth tile is the first.
+    expected = [tile % 5 % 4 + tile // 5 * 4 for tile in _tiles(plain, [angle])]
+    assert _tiles(wrapping, _cos_sin(angle)) == expected
 
 
 def test_angles_have_no_seam():
     coder, step = make_coder((-1,), (1,), 8, (4, 2), angles=1), 2 * math.pi / 32
     assert coder.size == 8 * 4 * 3
-    for place in range(64):
-        one, other = (_tiles(coder, (*_seen((place + half) * step), 0.0)) for half in (0.5, 1.5))
-        assert sum(map(operator.eq, one, other)) == 7
+    for index in range(64):
+        tiles, next_tiles = (
+            _tiles(coder, (*_cos_sin((index + half) * step), 0.0)) for half in (0.5, 1.5)
+        )
+        assert sum(map(operator.eq, tiles, next_tiles)) == 7
 
 
-def test_entries_behind_the_last_axis_are_ignored():
+def test_entries_after_the_last_axis_are_ignored():
     assert _tiles(PAPER, (0.1, 0.02, 5.0, -7.0)) == _tiles(PAPER, (0.1, 0.02))
 
 
@@ -122,6 +125,6 @@ def test_entries_behind_the_last_axis_are_ignored():
         (((0,) * 8, (1,) * 8, 32, (9,) * 8), "must be at most 16777216; take fewer"),
     ],
 )
-def test_impossible_tilings_are_refused(arguments, message):
+def test_invalid_tilings_raise(arguments, message):
     with pytest.raises(ValueError, match=message):
         make_coder(*arguments)

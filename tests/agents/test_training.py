@@ -1,4 +1,4 @@
-"""What a training step changes, how far it goes, and that a seed repeats it."""
+"""Effects of a training step, its limits, and its repetition with a seed."""
 
 import dataclasses
 
@@ -21,8 +21,8 @@ def with_rates(config, actor, critic):
     return dataclasses.replace(config, learning_rate=actor, critic_learning_rate=critic)
 
 
-def apart(**settings):
-    """PPO with separate passes, one rollout long."""
+def separate_passes(**settings):
+    """Return settings of PPO with separate passes and a single rollout."""
     defaults = {
         "rollout_steps": 128,
         "batch_size": None,
@@ -35,8 +35,8 @@ def apart(**settings):
 @pytest.mark.parametrize(
     ("config", "task"),
     [
-        *((config, "pendulum") for config in (*ACTOR_CRITIC.values(), apart())),
-        (apart(), "cartpole"),
+        *((config, "pendulum") for config in (*ACTOR_CRITIC.values(), separate_passes())),
+        (separate_passes(), "cartpole"),
     ],
     ids=lambda value: getattr(value, "name", value),
 )
@@ -69,13 +69,13 @@ def test_the_critics_learning_rate_is_the_agents_unless_it_has_one(agent):
 
 
 def steps_taken(model):
-    """Adam's own counts: of the first tensor of the actor, and of the critic."""
+    """Return Adam's step counts of the first tensor of the actor and of the critic."""
     optimizer = model.policy.optimizer
     return [int(optimizer.state[group["params"][0]]["step"]) for group in optimizer.param_groups]
 
 
 @pytest.mark.parametrize(
-    ("settings", "steps", "taken"),
+    ("settings", "steps", "expected"),
     [
         ({"epochs": 3, "critic_epochs": 5, "target_kl": None}, 256, [2 * 3, 2 * 5]),  # two rollouts
         ({"epochs": 3, "batch_size": 32, "target_kl": None}, 128, [3 * 4, 3 * 4]),  # in minibatches
@@ -84,19 +84,19 @@ def steps_taken(model):
         ({"epochs": 7, "target_kl": 1e-12, "learning_rate": LARGE}, 128, [1, 7]),
     ],
 )
-def test_ppo_takes_its_passes_but_after_too_large_a_move_of_the_actor_the_critics_alone(
-    settings, steps, taken
+def test_the_actor_stops_after_too_large_a_divergence_and_the_critic_continues(
+    settings, steps, expected
 ):
-    model = make_model(apart(**settings), "cartpole")
+    model = make_model(separate_passes(**settings), "cartpole")
     model.learn(steps)
-    assert steps_taken(model) == taken
+    assert steps_taken(model) == expected
 
 
 @pytest.mark.parametrize("target_kl", [0.003, 0.006, 0.012])
 def test_the_actor_stops_at_one_and_a_half_times_the_bound(target_kl):
-    """The divergence is computed here from probabilities, before every pass of an actor without a bound."""
+    """Compute the divergence from probabilities before each pass of an actor without a bound."""
     settings = {"learning_rate": LARGE, "critic_learning_rate": TINY, "epochs": 25}
-    free = make_model(apart(**settings, target_kl=None), "pendulum")
+    free = make_model(separate_passes(**settings, target_kl=None), "pendulum")
     moves, improve = [], free._improve_actor
 
     def watched():
@@ -110,17 +110,18 @@ def test_the_actor_stops_at_one_and_a_half_times_the_bound(target_kl):
     free._improve_actor = watched
     free.learn(128)
     expected = next(index for index, move in enumerate(moves) if move > 1.5 * target_kl)
-    bound = make_model(apart(**settings, target_kl=target_kl), "pendulum")
+    bound = make_model(separate_passes(**settings, target_kl=target_kl), "pendulum")
     bound.learn(128)
     assert 1 < expected < 25
     assert steps_taken(bound)[0] == expected
 
 
-def test_separate_passes_are_the_clipped_loss_and_the_squared_error_stepped_by_two_optimisers():
+def test_separate_passes_equal_two_optimizers_of_clipped_loss_and_squared_error():
     model = make_model(
-        apart(learning_rate=3e-4, critic_learning_rate=1e-3, epochs=4, target_kl=None), "cartpole"
+        separate_passes(learning_rate=3e-4, critic_learning_rate=1e-3, epochs=4, target_kl=None),
+        "cartpole",
     )
-    reference = make_model(apart(learning_rate=3e-4), "cartpole").policy
+    reference = make_model(separate_passes(learning_rate=3e-4), "cartpole").policy
     reference.load_state_dict(model.policy.state_dict())
     model.learn(128)
     critic = [*reference.mlp_extractor.value_net.parameters(), *reference.value_net.parameters()]
@@ -158,9 +159,9 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not(agent):
         model.learn(64)
         return weights(model.policy)
 
-    first, again, other = train(5), train(5), train(6)
+    first, again, different = train(5), train(5), train(6)
     assert not differing(first, again)
-    assert differing(first, other)
+    assert differing(first, different)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +176,9 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not(agent):
         ("dqn", {"train_every": 8, "gradient_steps": 3}, lambda steps: steps / 8 * 3),
     ],
 )
-def test_gradient_steps_and_their_frequency_are_as_asked(agent, settings, steps_of_gradient):
+def test_gradient_steps_and_their_frequency_are_those_of_the_settings(
+    agent, settings, steps_of_gradient
+):
     config, task = SMALL[agent]
     model = make_model(
         dataclasses.replace(config, learning_starts=0, **settings), task, max_episode_steps=20

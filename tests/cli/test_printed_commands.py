@@ -66,7 +66,7 @@ def test_a_run_is_continued_by_what_is_printed_and_evaluated_with_trust_where_it
     assert following == ["train", "--resume", "half a run"]
     text = (half / "config.json").read_text()
     (half / "config.json").write_text(text.replace('"task": "cartpole"', '"task": "nobodys:TASK"'))
-    assert printed(folder.resuming(half)) == [["train", "--resume", "half a run", "--trust"]]
+    assert printed(folder.resume_command(half)) == [["train", "--resume", "half a run", "--trust"]]
 
 
 def test_commands_with_paths_in_them_are_made_in_one_place():

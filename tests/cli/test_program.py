@@ -9,7 +9,7 @@ import pytest
 
 import codrl_mj
 from tests.cli.lines import TINY
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 PROGRAM = Path(sys.executable).with_name("codrl-mj")
 
@@ -21,7 +21,7 @@ def program(*words, **options):
 
 
 @pytest.mark.parametrize(
-    "missing", but(["torch"], ["torch", "stable_baselines3", "safetensors", "matplotlib"])
+    "missing", matrix_params(["torch"], ["torch", "stable_baselines3", "safetensors", "matplotlib"])
 )
 def test_a_missing_extra_is_named_before_anything_is_written(tmp_path, missing):
     """In a process of its own, where nothing has been imported yet."""

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import NAMED, CurrentLoop, Motor, Supply
-from codrl_mj.agents.presets import ELSEWHERE, PRESETS
+from codrl_mj.agents.presets import OTHER_ENV, PRESETS
 from codrl_mj.cli import VERBS, find_verb, main
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.worlds import find_world
@@ -84,7 +84,7 @@ def test_the_help_explains_every_named_actuator_and_every_field_with_its_unit(ca
 @pytest.mark.parametrize(
     ("agent", "task", "settings"),
     [
-        (agent, task if task != ELSEWHERE else "InvertedPendulum-v5", name)
+        (agent, task if task != OTHER_ENV else "InvertedPendulum-v5", name)
         for (agent, task), named in PRESETS.items()
         for name in named
     ],

@@ -33,7 +33,7 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.tasks import TASKS
 from tests.deploy.test_export import trained
 from tests.deploy.test_run import with_sensors
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 pytestmark = pytest.mark.skipif(
     bool(missing_tools("host")), reason="NOT RUN: no C compiler: apt-get install gcc"
@@ -109,7 +109,7 @@ def test_a_weight_changed_in_the_c_changes_what_the_simulation_does(folder, tmp_
     assert not np.array_equal(done.on_board[0].action, done.in_python[0].action)
 
 
-@pytest.mark.parametrize("folder", but(["furuta"], AGENTS), indirect=True)
+@pytest.mark.parametrize("folder", matrix_params(["furuta"], AGENTS), indirect=True)
 def test_a_gain_changed_in_the_c_changes_what_the_motor_does(folder, tmp_path):
     off = []
     for where in (folder, spoilt(folder, tmp_path, "  const real asked = ", "0.001f * ")):

@@ -19,7 +19,7 @@ from codrl_mj.deploy.c_code import c_files, check_board
 from codrl_mj.deploy.loops import current_loop
 from codrl_mj.envs.config import EnvConfig
 from tests.deploy.test_export import EACH, observed, trained
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-Wconversion", "-Wpedantic")
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
@@ -29,7 +29,7 @@ KINDS = {False: ctypes.c_float, True: ctypes.c_double}
 
 def each(names, in_float):
     """All names in double and one in float; all others in float are parts of the full matrix."""
-    return but(
+    return matrix_params(
         [(in_float, False), *((name, True) for name in names)], itertools.product(names, KINDS)
     )
 

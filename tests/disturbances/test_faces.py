@@ -8,7 +8,7 @@ from codrl_mj.tasks import TASKS
 from tests.disturbances.everything import MOST, RUBBED, imperfect
 from tests.envs.faces import plain, run
 from tests.envs.vectors import assert_same
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 WEAK = {"controller": {"kp": 1.0, "ki": 0.5, "max_voltage": 3.0}}
 EACH = {
@@ -19,7 +19,7 @@ EACH = {
     "current_bias": {"actuator": {"controller": {**WEAK["controller"], "current_bias": -0.02}}},
     "supply": {"actuator": {**WEAK, "supply": {"resistance": 0.7}}},
 }
-two_tasks = pytest.mark.parametrize("task", but(["pendulum", "cartpole"], TASKS))
+two_tasks = pytest.mark.parametrize("task", matrix_params(["pendulum", "cartpole"], TASKS))
 
 
 def _env(task, **arguments):

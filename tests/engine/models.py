@@ -1,4 +1,4 @@
-"""Small models that hold our motors."""
+"""Small models with our motors."""
 
 import dataclasses
 
@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
-from codrl_mj.engine.families import SLOT, Slot, signals_at
+from codrl_mj.engine.families import SLOT_HEADER_SIZE, SlotHeader, signals_offset
 from codrl_mj.physics.mjcf import drive
 from codrl_mj.user_code import asset_path
 
@@ -25,19 +25,19 @@ FULL = DCMotorActuator(
         derivative_time_constant=0.01,
     ),
 )
-"""An actuator with every feature in use."""
+"""Actuator that uses every feature."""
 
 
-TICK = Slot._fields.index("tick")
+TICK = SlotHeader._fields.index("tick")
 _SIZE = len(DCMotorActuator.State._fields)
-STATE = [SLOT + _SIZE + entry for entry in range(_SIZE)]
-"""Where a current loop's state of the last step is in `data.act`: current, integral, error."""
+STATE = [SLOT_HEADER_SIZE + _SIZE + entry for entry in range(_SIZE)]
+"""Entries of `data.act` with a current loop's state of the last step: current, integral, error."""
 CURRENT = STATE[0]
-VOLTAGE = signals_at(DCMotorActuator) + DCMotorActuator.Signals._fields.index("voltage")
+VOLTAGE = signals_offset(DCMotorActuator) + DCMotorActuator.Signals._fields.index("voltage")
 
 
 def changed(actuator, **fields):
-    """The actuator with some fields of its motor or controller changed."""
+    """Return the actuator with other values of some fields of its motor or controller."""
     motor = {name: value for name, value in fields.items() if hasattr(actuator.motor, name)}
     loop = {name: value for name, value in fields.items() if name not in motor}
     return DCMotorActuator(
@@ -61,14 +61,14 @@ _ROTOR = """
 
 
 def add_motor(spec, joint, actuator, max_force=None, **fields):
-    """Drive a joint of the spec by our motor."""
+    """Add our motor to a joint of the spec."""
     driver = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint, **fields)
     drive(driver, actuator, max_force)
     return driver
 
 
 def rotor_spec(actuator=FULL, *, max_force=None, integrator="Euler"):
-    """The spec of an eccentric rotor on a hinge under gravity, driven by our motor."""
+    """Return the spec of an eccentric rotor on a hinge under gravity, with our motor."""
     spec = mujoco.MjSpec.from_string(_ROTOR)
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     add_motor(spec, "hinge", actuator, max_force, name="motor")
@@ -76,12 +76,12 @@ def rotor_spec(actuator=FULL, *, max_force=None, integrator="Euler"):
 
 
 def rotor(*arguments, **options):
-    """`rotor_spec`, compiled."""
+    """Return the compiled `rotor_spec`."""
     return rotor_spec(*arguments, **options).compile()
 
 
 def cartpole(actuator, *, integrator="Euler"):
-    """The cart-pole asset with another actuator or integrator."""
+    """Return the model of the cart-pole asset with another actuator or integrator."""
     spec = mujoco.MjSpec.from_file(str(asset_path("cartpole.xml")))
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     drive(spec.actuator("motor"), actuator, 10.0)
@@ -89,20 +89,23 @@ def cartpole(actuator, *, integrator="Euler"):
 
 
 def controls(steps, nu=1, seed=0, size=1.0):
-    """Random controls, each held for five steps."""
+    """Return random controls, each held for five steps."""
     generator = np.random.default_rng(seed)
     return np.repeat(generator.uniform(-size, size, (steps // 5 + 1, nu)), 5, axis=0)[:steps]
 
 
 def full_state(model, data):
-    """Time, positions, velocities and activations: everything that an episode is continued from."""
+    """Return time, positions, velocities and activations: the state of an episode."""
     state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     return state
 
 
 def trajectory(model, inputs, data=None, before_step=None):
-    """The full state after each step under the given controls; `before_step(data, index)` may interfere."""
+    """Return the full state after each step with given controls.
+
+    `before_step(data, index)` is called before each step.
+    """
     data = mujoco.MjData(model) if data is None else data
     states = []
     for index, ctrl in enumerate(inputs):

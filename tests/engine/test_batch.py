@@ -1,4 +1,4 @@
-"""Batches: bit for bit what a loop over single simulations gives, at any number of threads."""
+"""Batches give the bits of a loop over single simulations, with any number of threads."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import pytest
 from mujoco.batch import Batch
 
 from codrl_mj import engine
-from codrl_mj.engine.families import HEAD
+from codrl_mj.engine.families import USER_HEADER_SIZE
 from tests.engine.models import CURRENT, FULL, cartpole, changed, controls, full_state, rotor
 from tests.engine.test_families import SPRINGS, Spring
 from tests.engine.test_several_actuators import model_of_several
@@ -21,9 +21,10 @@ LOOPS = [
     changed(FULL, kp=kp, resistance=resistance, inductance=inductance)
     for kp, resistance, inductance in DRAWS
 ]
-FAMILIES = {  # name: the motor of each simulation
+# Name of the family -> the motor of each simulation.
+FAMILIES = {
     "current loops": LOOPS,
-    "somebody's": [
+    "custom": [
         dataclasses.replace(SPRINGS[index % 3], arm_radius=0.4 + 0.01 * index)
         for index in range(24)
     ],
@@ -35,7 +36,7 @@ def inputs_of(model):
 
 
 def serial(models):
-    """The final state of each simulation, one after the other."""
+    """Return the final state of each simulation, run one after the other."""
     rows = []
     for model, inputs in zip(models, np.moveaxis(inputs_of(models[0]), 1, 0), strict=True):
         data = mujoco.MjData(model)
@@ -46,7 +47,7 @@ def serial(models):
 
 
 def batched(batch, model):
-    """The same, in a batch."""
+    """Return the final state of each simulation, run in a batch."""
     ctrl = batch.bind("ctrl").reshape(SIMULATIONS, -1)
     for ctrl[:] in inputs_of(model):
         batch.step()
@@ -60,23 +61,24 @@ def batched(batch, model):
 @pytest.mark.parametrize("build", [cartpole, model_of_several])
 def test_a_batch_is_a_serial_loop_bit_for_bit(build, integrator, nthread):
     model = build(FULL, integrator=integrator)
-    found = batched(Batch(model, nsim=SIMULATIONS, nthread=nthread), model)
-    np.testing.assert_array_equal(found, serial([model] * SIMULATIONS))
-    assert len(np.unique(found[:, CURRENT - model.na])) == SIMULATIONS  # each its own current
+    states = batched(Batch(model, nsim=SIMULATIONS, nthread=nthread), model)
+    np.testing.assert_array_equal(states, serial([model] * SIMULATIONS))
+    # Each simulation has a different current.
+    assert len(np.unique(states[:, CURRENT - model.na])) == SIMULATIONS
 
 
 @pytest.mark.parametrize("nthread", [1, 2])
 @pytest.mark.parametrize("name", FAMILIES)
 def test_each_simulation_of_a_batch_may_have_its_own_motor(name, nthread):
     engine.load_family(Spring)
-    motors, models = FAMILIES[name], [rotor(one) for one in FAMILIES[name]]
+    motors, models = FAMILIES[name], [rotor(motor) for motor in FAMILIES[name]]
     batch = Batch(models[0], nsim=SIMULATIONS, nthread=nthread)
-    batch.expand("actuator_user")[:, 0, HEAD:] = [one.numbers for one in motors]
-    batch.expand("actuator_gear")[:, 0, 0] = [1.0 / one.arm_radius for one in motors]
+    batch.expand("actuator_user")[:, 0, USER_HEADER_SIZE:] = [motor.numbers for motor in motors]
+    batch.expand("actuator_gear")[:, 0, 0] = [1.0 / motor.arm_radius for motor in motors]
     np.testing.assert_array_equal(batched(batch, models[0]), serial(models))
 
 
-def test_a_simulation_taken_out_of_a_batch_continues_as_in_it():
+def test_a_simulation_continues_outside_its_batch_as_inside():
     model = rotor(integrator="RK4")
     batch = Batch(model, nsim=SIMULATIONS, nthread=2)
     batched(batch, model)

@@ -1,4 +1,4 @@
-"""The control callback: the current loop of the reference, and a pure function of model and data."""
+"""The control callback runs the reference's current loop, as a pure function of model and data."""
 
 import copy
 
@@ -34,7 +34,7 @@ every_integrator = pytest.mark.parametrize(
 
 
 def follow(model, data, reference, inputs):
-    """Step, and compare the motor with a reference that is fed with the simulated velocity."""
+    """Step, and compare the motor with a reference that gets the simulated velocity."""
     arm = FULL.motor.arm_radius
     for (ctrl,) in inputs:
         data.ctrl[0] = ctrl
@@ -52,25 +52,25 @@ def test_the_motor_is_the_reference_in_every_integrator(integrator):
     assert abs(reference.current) > 0.01
 
 
-def test_the_cartpole_asset_runs_as_it_lies_on_disk():
+def test_the_cartpole_asset_runs_unchanged_from_its_file():
     as_is = mujoco.MjModel.from_xml_path(str(asset_path("cartpole.xml")))
     ours = trajectory(cartpole(TASKS["cartpole"].paper[0]), INPUTS)
     np.testing.assert_allclose(trajectory(as_is, INPUTS), ours, rtol=1e-12, atol=1e-12)
 
 
-# -- a pure function of model and data ----------------------------------------------------------------------
+# -- a pure function of model and data -------------------------------------------------------------
 
 
 @every_integrator
-def test_forward_calls_under_any_control_change_nothing_between_steps(integrator):
+def test_forward_calls_with_any_control_change_nothing_between_steps(integrator):
     model, counts = rotor(integrator=integrator), np.random.default_rng(1).integers(0, 5, STEPS)
 
     def forward(data, index):
-        wanted = data.ctrl.copy()
-        for control in (-3.0, *[wanted] * counts[index]):
+        desired = data.ctrl.copy()
+        for control in (-3.0, *[desired] * counts[index]):
             data.ctrl[:] = control
             mujoco.mj_forward(model, data)
-        data.ctrl[:] = wanted
+        data.ctrl[:] = desired
 
     np.testing.assert_array_equal(
         trajectory(model, INPUTS), trajectory(model, INPUTS, before_step=forward)
@@ -117,8 +117,8 @@ def of_keyframe(model, data):
 @pytest.mark.parametrize(
     "carried", [lambda _, data: copy.copy(data), of_state, went_back, of_keyframe]
 )
-def test_what_has_the_state_goes_on_bit_for_bit(carried, integrator):
-    """A copy, fresh data with the state vector, data that went elsewhere and back, and a keyframe."""
+def test_a_restored_state_continues_bit_for_bit(carried, integrator):
+    """Check a copy, new data with the state vector, data that was set back, and a keyframe."""
     model = rotor(integrator=integrator)
     data = mujoco.MjData(model)
     trajectory(model, INPUTS[:40], data)
@@ -134,12 +134,12 @@ def test_setting_the_clock_back_or_forward_changes_neither_motor_nor_motion(shif
     trajectory(model, INPUTS[:40], data)
     twin = copy.copy(data)
     twin.time += shift
-    rest, shifted = (trajectory(model, INPUTS[40:], one) for one in (data, twin))
+    rest, shifted = (trajectory(model, INPUTS[40:], start) for start in (data, twin))
     np.testing.assert_array_equal(rest[:, 1:3], shifted[:, 1:3])  # position, velocity
     np.testing.assert_array_equal(rest[:, 4:], shifted[:, 4:])  # motor state but for its tick
 
 
-def test_the_tick_is_the_time_at_which_the_last_step_began_and_a_reset_puts_the_motor_at_rest():
+def test_the_tick_is_the_start_of_the_last_step_and_a_reset_brings_the_motor_to_rest():
     model = rotor()
     data = mujoco.MjData(model)
     first = trajectory(model, INPUTS[:7], data)
@@ -151,15 +151,15 @@ def test_the_tick_is_the_time_at_which_the_last_step_began_and_a_reset_puts_the_
     np.testing.assert_array_equal(first, trajectory(model, INPUTS[:7], data))
 
 
-def test_two_data_of_one_model_do_not_share_a_motor():
+def test_two_simulations_of_a_model_have_separate_motors():
     model = rotor()
-    alone, other = trajectory(model, INPUTS), mujoco.MjData(model)
+    expected, second = trajectory(model, INPUTS), mujoco.MjData(model)
 
     def step_the_other(data, _):
-        other.ctrl[:] = -2.0 * data.ctrl
-        mujoco.mj_step(model, other)
+        second.ctrl[:] = -2.0 * data.ctrl
+        mujoco.mj_step(model, second)
 
-    np.testing.assert_array_equal(alone, trajectory(model, INPUTS, before_step=step_the_other))
+    np.testing.assert_array_equal(expected, trajectory(model, INPUTS, before_step=step_the_other))
 
 
 def test_parameters_are_read_from_the_model_at_every_step():
@@ -169,7 +169,7 @@ def test_parameters_are_read_from_the_model_at_every_step():
     np.testing.assert_array_equal(trajectory(model, INPUTS, data), trajectory(weaker, INPUTS))
 
 
-# -- the control as the engine uses it ----------------------------------------------------------------------
+# -- the control as the engine uses it -------------------------------------------------------------
 
 
 def test_control_is_clamped_to_its_range_unless_clamping_is_disabled():
@@ -183,7 +183,7 @@ def test_control_is_clamped_to_its_range_unless_clamping_is_disabled():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e11])
-def test_a_control_that_is_not_a_number_counts_as_zero(bad, tmp_path, monkeypatch):
+def test_a_nan_control_counts_as_zero(bad, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # the engine writes a log
     model, inputs, zeroed = rotor(), INPUTS.copy(), INPUTS.copy()
     inputs[50:60], zeroed[50:60] = bad, 0.0
@@ -208,7 +208,7 @@ def remove_callbacks(_, off):
 @pytest.mark.parametrize(
     "switch", [disable_group(3), disable_group(0), disable_actuation, remove_callbacks]
 )
-def test_what_is_switched_off_has_no_force_and_holds_its_state_to_go_on_from(switch):
+def test_a_disabled_motor_has_no_force_and_holds_its_state(switch):
     model, reference = rotor(), MotorSimulation(FULL)
     data = mujoco.MjData(model)
     trajectory(model, INPUTS[:30], data)
@@ -223,7 +223,7 @@ def test_what_is_switched_off_has_no_force_and_holds_its_state_to_go_on_from(swi
 
 
 @pytest.mark.parametrize("group", [0, 2, 5, 7, -1, 31])
-def test_disabling_other_groups_leaves_a_motor_alone(group):
+def test_disabling_other_groups_does_not_affect_a_motor(group):
     model = rotor()
     expected = trajectory(model, INPUTS)
     model.actuator_group[0] = group

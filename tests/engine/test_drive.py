@@ -1,8 +1,8 @@
-"""The drive on a hinge: MuJoCo's own `<dcmotor>` as an oracle of its mean torque, and the envelope that mjlab expects.
+"""The drive on a hinge, against the mean torque of MuJoCo's `<dcmotor>` and mjlab's envelope.
 
 Against `<dcmotor>` the loop is off: a gain is so small that only the reference counts, u =
 kp*(i_ref - i), kp = 1e-9 V/A. Over a step the winding's equation integrates to mean(i) = (u -
-kE*omega)/R - L/(R*h)*(i_after - i_before), whatever happens within.
+kE*omega)/R - L/(R*h)*(i_after - i_before), for any current within the step.
 """
 
 import math
@@ -43,7 +43,7 @@ def ours(timestep, samples, inertia=HELD):
 
 
 def run(model, voltages, speed, unit=1.0):
-    """Speed, force and the first state of the actuator after each step under voltages [V]; shape (steps, 3)."""
+    """Return speed, force and first actuator state, (steps, 3), after steps with voltages [V]."""
     data, rows = mujoco.MjData(model), []
     data.qvel[:] = speed
     for voltage in voltages:
@@ -59,29 +59,29 @@ def run(model, voltages, speed, unit=1.0):
     "timestep", [0.0005, 0.005, 0.05]
 )  # the electrical time constant is 0.01 s
 def test_the_mean_torque_is_that_of_mujoco_s_current(timestep, speed, samples):
-    """At a speed that is kept; then a voltage that stays, which ends at K*(V - K*omega)/R."""
+    """Check it at a constant speed, and its end value K*(V - K*omega)/R at a constant voltage."""
     voltages = np.concatenate(
         [np.random.default_rng(0).uniform(-12.0, 12.0, 200), np.full(400, 9.0)]
     )
     theirs = run(native(timestep), voltages, speed)
     current = np.append(0.0, theirs[:, 2])
     expected = K * ((voltages - K * speed) / R - L / (R * timestep) * np.diff(current))
-    found = run(ours(timestep, samples), voltages, speed, K / KP)[:, 1]
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
-    assert found[-1] == pytest.approx(K * (9.0 - K * speed) / R, rel=1e-6)
-    assert theirs[-1, 1] == pytest.approx(found[-1], rel=1e-6)
+    actual = run(ours(timestep, samples), voltages, speed, K / KP)[:, 1]
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-8)
+    assert actual[-1] == pytest.approx(K * (9.0 - K * speed) / R, rel=1e-6)
+    assert theirs[-1, 1] == pytest.approx(actual[-1], rel=1e-6)
 
 
-def test_a_free_hinge_comes_up_to_the_same_speed_on_the_same_way_as_the_step_shrinks():
-    """The one delivers the mean of a step, the other its end: the ways differ at first order."""
+def test_a_free_hinge_accelerates_alike_as_the_step_shrinks():
+    """The drive delivers the mean of a step, `<dcmotor>` its end, so they differ at first order."""
     timesteps, errors = np.array([4e-3, 2e-3, 1e-3, 5e-4]), []
     for timestep in timesteps:
         voltages = np.full(round(0.2 / timestep), 9.0)
-        theirs, found = (
+        theirs, actual = (
             run(native(timestep, 0.01), voltages, 0.0),
             run(ours(timestep, 1, 0.01), voltages, 0.0, K / KP),
         )
-        errors.append(np.abs(theirs - found)[:, 0].max())
+        errors.append(np.abs(theirs - actual)[:, 0].max())
     assert np.polyfit(np.log(timesteps), np.log(errors), 1)[0] == pytest.approx(1.0, abs=0.15)
     assert run(ours(1e-3, 1, 0.01), np.full(2000, 9.0), 0.0, K / KP)[-1, 0] == pytest.approx(
         9.0 / K, rel=1e-6
@@ -93,7 +93,8 @@ def test_a_free_hinge_comes_up_to_the_same_speed_on_the_same_way_as_the_step_shr
 VOLTAGE, STALL, NO_LOAD = 24.0, 2.0, 100.0
 LIMIT = 0.25 * STALL * NO_LOAD / VOLTAGE
 """A drive's largest current [A]: a quarter of the stall current, and so of the stall torque."""
-CASES = {  # name: demand, speed, largest current, gear, expected
+# Name -> demand, speed, largest current, gear, expected torque.
+CASES = {
     "stall": (50.0, 0.0, math.inf, 1.0, STALL),
     "no load": (50.0, NO_LOAD, math.inf, 1.0, 0.0),
     "half way": (50.0, 0.5 * NO_LOAD, math.inf, 1.0, 0.5 * STALL),
@@ -113,12 +114,12 @@ CASES = {  # name: demand, speed, largest current, gear, expected
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("case", CASES)
 def test_the_torque_is_within_the_line_and_the_limit(case, sign):
-    demand, speed, most, gear, expected = CASES[case]
+    demand, speed, max_current, gear, expected = CASES[case]
     constant = VOLTAGE / NO_LOAD
     motor = GearMotor(
         constant * VOLTAGE / STALL, 1e-3, constant, constant, rotor_inertia=0.0, gear_ratio=gear
     )
-    drive = Drive(motor, SampledLoop(20e3, max_current=most), Supply(VOLTAGE))
+    drive = Drive(motor, SampledLoop(20e3, max_current=max_current), Supply(VOLTAGE))
     model = codrl_mj.add_motors(hinge(0.002)[0], {"hinge": drive}).compile()
     torque = run(model, [sign * demand] * 50, sign * speed)[-1, 1]
     assert torque == pytest.approx(sign * expected, rel=1e-6, abs=1e-9)

@@ -1,4 +1,4 @@
-"""Families in the callback: anybody's runs there bit for bit as it does in Python."""
+"""Families in the callback: built-in and custom ones give the bits of their Python functions."""
 
 import dataclasses
 import math
@@ -24,7 +24,14 @@ from codrl_mj.actuators import (
     parameters_type,
 )
 from codrl_mj.actuators.noise import standard_normal
-from codrl_mj.engine.families import SLOT, Slot, loaded_families, signals_at, slot_size, user_head
+from codrl_mj.engine.families import (
+    SLOT_HEADER_SIZE,
+    SlotHeader,
+    loaded_families,
+    signals_offset,
+    slot_size,
+    user_header,
+)
 from codrl_mj.fields import flag, integer, part, real
 from codrl_mj.physics import (
     AnalyticPhysics,
@@ -42,14 +49,14 @@ KEY = 2.0**52 + 12345.0
 
 
 class Memory(NamedTuple):
-    """What a spring remembers."""
+    """State of a spring."""
 
     filtered: float
     steps: float
 
 
 class Seen(NamedTuple):
-    """What a spring shows."""
+    """Signals of a spring."""
 
     heat: float
     draw: float
@@ -58,7 +65,7 @@ class Seen(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Coil:
-    """A part of a spring."""
+    """Part of a spring."""
 
     stiffness: float = real(0.7, least=0.0)
     turns: int = integer(3, least=1)
@@ -66,7 +73,7 @@ class Coil:
 
 @dataclasses.dataclass(frozen=True)
 class Brake:
-    """A part that a spring may lack."""
+    """Optional part of a spring."""
 
     drag: float = real(0.0, least=0.0)
 
@@ -77,11 +84,11 @@ def _softened(torque, limit):
 
 def _advance(parameters, timestep, state, inputs):
     draw = standard_normal(inputs.noise_key, int(inputs.time / timestep + 0.5), 7)
-    wanted = (
+    target = (
         inputs.desired_torque - parameters.stiffness * math.sin(inputs.position) * parameters.turns
     )
-    wanted = wanted - parameters.brake_drag * inputs.speed * abs(inputs.speed) + 0.01 * draw
-    filtered = state.filtered + (wanted - state.filtered) * timestep / (timestep + 0.03)
+    target = target - parameters.brake_drag * inputs.speed * abs(inputs.speed) + 0.01 * draw
+    filtered = state.filtered + (target - state.filtered) * timestep / (timestep + 0.03)
     if parameters.soft:
         torque = _softened(filtered, parameters.limit)
     else:
@@ -92,7 +99,7 @@ def _advance(parameters, timestep, state, inputs):
 
 @dataclasses.dataclass(frozen=True)
 class Spring(ActuatorModel):
-    """Somebody's own: with parts, flags, whole numbers, noise, a helper, and every input used."""
+    """Custom family with parts, flags, integers, noise, a helper, and all inputs in use."""
 
     family = "spring"
     State = Memory
@@ -108,7 +115,7 @@ class Spring(ActuatorModel):
 
 @dataclasses.dataclass(frozen=True)
 class Bare(ActuatorModel):
-    """The least that a family can be: no fields, no states, no signals."""
+    """Smallest possible family: without fields, states and signals."""
 
     @staticmethod
     def advance(parameters, timestep, state, inputs):  # noqa: ARG004
@@ -116,14 +123,14 @@ class Bare(ActuatorModel):
 
 
 class Endless(NamedTuple):
-    """A signal that is no finite number; the engine multiplies the last one by a gain of 0."""
+    """Signal that is infinite; the engine multiplies the last one by a gain of 0."""
 
     limit: float
 
 
 @dataclasses.dataclass(frozen=True)
 class Boundless(Bare):
-    """A family that shows what is infinite."""
+    """Family with an infinite signal."""
 
     Signals = Endless
 
@@ -191,7 +198,7 @@ STEPS = 80
 
 @pytest.fixture
 def _families(installed):
-    for family in {type(one) for one in ALL}:
+    for family in {type(actuator) for actuator in ALL}:
         engine.load_family(family)
 
 
@@ -199,12 +206,12 @@ pytestmark = pytest.mark.usefixtures("_families")
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
-@pytest.mark.parametrize("actuator", ALL, ids=lambda one: type(one).__name__)
+@pytest.mark.parametrize("actuator", ALL, ids=lambda actuator: type(actuator).__name__)
 def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integrator):
     model, family = rotor(actuator, integrator=integrator), type(actuator)
     data, parameters = mujoco.MjData(model), parameters_type(family)(*actuator.numbers)
-    states, shown = len(family.State._fields), signals_at(family)
-    data.act[Slot._fields.index("noise_key")] = KEY
+    states, shown = len(family.State._fields), signals_offset(family)
+    data.act[SlotHeader._fields.index("noise_key")] = KEY
     state, timestep, gear = (
         family.State(*[0.0] * states),
         model.opt.timestep,
@@ -219,10 +226,10 @@ def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integr
         data.ctrl[:] = ctrl
         mujoco.mj_step(model, data)
         state, torque, signals = family.advance(parameters, timestep, state, inputs)
-        candidate = data.act[SLOT + states : shown]
+        candidate = data.act[SLOT_HEADER_SIZE + states : shown]
         np.testing.assert_array_equal(candidate, state)
         np.testing.assert_array_equal(data.act[shown:], [*signals, 0.0])
-        assert data.act[Slot._fields.index("torque")] == torque
+        assert data.act[SlotHeader._fields.index("torque")] == torque
         assert data.actuator_force[0] == torque
         torques.append(torque)
     assert np.ptp(torques) > 0.05
@@ -240,30 +247,30 @@ def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integr
         {"arm_radius": 0.8},
     ],
 )
-def test_every_field_of_a_family_of_ones_own_acts(change):
+def test_every_field_of_a_custom_family_has_an_effect(change):
     ends = [
-        trajectory(rotor(dataclasses.replace(Spring(), **one)), controls(STEPS, size=0.6))[-1]
-        for one in ({}, change)
+        trajectory(rotor(dataclasses.replace(Spring(), **values)), controls(STEPS, size=0.6))[-1]
+        for values in ({}, change)
     ]
     assert np.abs(ends[1][1:3] - ends[0][1:3]).max() > 1e-6
 
 
-@pytest.mark.parametrize("actuator", ALL, ids=lambda one: type(one).__name__)
-def test_it_is_read_back_from_the_model_as_it_was_written(actuator):
-    ((index, found),) = motors(rotor(actuator)).items()
+@pytest.mark.parametrize("actuator", ALL, ids=lambda actuator: type(actuator).__name__)
+def test_a_motor_is_read_back_from_the_model_unchanged(actuator):
+    ((index, motor),) = motors(rotor(actuator)).items()
     assert index == 0
-    assert type(found) is type(actuator)
-    assert found.numbers == actuator.numbers
-    assert found.arm_radius == pytest.approx(actuator.arm_radius, rel=1e-15)
+    assert type(motor) is type(actuator)
+    assert motor.numbers == actuator.numbers
+    assert motor.arm_radius == pytest.approx(actuator.arm_radius, rel=1e-15)
 
 
 def hinges(*actuators):
-    """A model of a hinge for each actuator, none of which touches another."""
+    """Return a model with a separate hinge for each actuator."""
     spec = mujoco.MjSpec.from_string(
         "<mujoco><option timestep='0.01'><flag contact='disable'/></option><worldbody>"
         + "".join(
-            f"<body><joint name='{at}'/><geom size='.1' pos='.2 0 .1'/></body>"
-            for at in range(len(actuators))
+            f"<body><joint name='{index}'/><geom size='.1' pos='.2 0 .1'/></body>"
+            for index in range(len(actuators))
         )
         + "</worldbody></mujoco>"
     )
@@ -274,21 +281,23 @@ def hinges(*actuators):
     return spec.compile()
 
 
-def test_families_beside_each_other_are_each_as_alone():
+def test_families_in_a_model_do_not_affect_each_other():
     together, inputs = hinges(*ALL), controls(STEPS, len(ALL), size=0.6)
     assert list(motors(together)) == list(range(len(ALL)))
     data = mujoco.MjData(together)
     trajectory(together, inputs, data)
     for index, actuator in enumerate(ALL):
         model = hinges(actuator)
-        alone, own = mujoco.MjData(model), together.actuator_actadr[index]
-        trajectory(model, inputs[:, [index]], alone)
-        np.testing.assert_allclose(data.act[own : own + model.na], alone.act, rtol=1e-9, atol=1e-12)
+        single, start = mujoco.MjData(model), together.actuator_actadr[index]
+        trajectory(model, inputs[:, [index]], single)
+        np.testing.assert_allclose(
+            data.act[start : start + model.na], single.act, rtol=1e-9, atol=1e-12
+        )
 
 
 @every_rebuilt
-def test_both_physics_give_it_the_same_inputs(task):
-    """Position, speed and time are what the spring's torque is made of."""
+def test_both_physics_give_a_family_the_same_inputs(task):
+    """The spring's torque depends on position, speed and time."""
     definition = TASKS[task]
     actuators = [dataclasses.replace(SPRINGS[1], limit=10.0)]
     start = np.full(len(definition.state_names), 0.05)
@@ -302,7 +311,7 @@ def test_both_physics_give_it_the_same_inputs(task):
     np.testing.assert_allclose(*rows, rtol=0, atol=1e-9)
 
 
-# -- the table ----------------------------------------------------------------------------------------------
+# -- the table -------------------------------------------------------------------------------------
 
 
 def test_a_model_compiles_its_families_on_installation():
@@ -322,14 +331,14 @@ def test_a_model_compiles_its_families_on_installation():
     data = mujoco.MjData(model)
     data.ctrl[:] = 0.25
     mujoco.mj_step(model, data)
-    assert data.actuator_force[0] == 0.0  # nobody's
+    assert data.actuator_force[0] == 0.0
     engine.load_family(Late)
     install_callbacks(model)
     mujoco.mj_step(model, data)
     assert data.actuator_force[0] == 0.5
 
 
-def test_two_families_of_one_number_are_refused_and_the_first_stays(monkeypatch):
+def test_load_family_raises_if_two_families_have_the_same_number(monkeypatch):
     @dataclasses.dataclass(frozen=True)
     class Other(Spring):
         pass
@@ -346,17 +355,18 @@ def test_two_families_of_one_number_are_refused_and_the_first_stays(monkeypatch)
     before = loaded_families()
     assert Spring in before
     assert Other not in before
-    engine.load_family(Spring)  # again: nothing changes
+    # A repeated call changes nothing.
+    engine.load_family(Spring)
     assert loaded_families() == before
 
 
-def test_a_familys_number_is_its_own_and_survives_an_xml_file(tmp_path):
-    numbers = [family_number(type(one)) for one in ALL]
-    assert len(set(numbers)) == len({type(one) for one in ALL})
-    assert user_head(Spring)[2] == family_number(Spring)
+def test_a_familys_number_is_unique_and_survives_an_xml_file(tmp_path):
+    numbers = [family_number(type(actuator)) for actuator in ALL]
+    assert len(set(numbers)) == len({type(actuator) for actuator in ALL})
+    assert user_header(Spring)[2] == family_number(Spring)
     spec = rotor_spec(Spring())
     spec.compile()
     path = tmp_path / "model.xml"
     path.write_text(spec.to_xml())
-    (found,) = motors(mujoco.MjModel.from_xml_path(str(path))).values()
-    assert found == Spring()
+    (motor,) = motors(mujoco.MjModel.from_xml_path(str(path))).values()
+    assert motor == Spring()

@@ -1,4 +1,4 @@
-"""Models that are not ours behave as if our callbacks were not there."""
+"""Models that are not ours behave as if our callbacks were not installed."""
 
 import mujoco
 import numpy as np
@@ -6,19 +6,19 @@ import pytest
 
 from codrl_mj import engine
 from codrl_mj.actuators import DCMotorActuator
-from codrl_mj.engine.families import slot_size, user_head
+from codrl_mj.engine.families import slot_size, user_header
 from tests.engine.models import controls, rotor_spec, trajectory
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
 
-HEAD, SIZE = user_head(DCMotorActuator), slot_size(DCMotorActuator)
+USER_HEADER, SIZE = user_header(DCMotorActuator), slot_size(DCMotorActuator)
 
 
-OURS = (*HEAD, *DCMotorActuator().numbers)
+OURS = (*USER_HEADER, *DCMotorActuator().numbers)
 
 
 def general(user=(), actdim=SIZE, **kinds):
-    """An actuator with user dynamics and bias, or other kinds, and user data."""
+    """Return an actuator element with user dynamics, user bias or other kinds, and user data."""
     kinds = {
         "dyntype": "user",
         "biastype": "user",
@@ -34,18 +34,24 @@ def general(user=(), actdim=SIZE, **kinds):
 FOREIGN = {
     "user dynamics and bias without user data": general(actdim=3),
     "as many activations and no user data": general(),
-    "as many activations and other user data": general((HEAD[0], HEAD[1] + 1, *OURS[2:])),
-    "our signature and a family that nobody loaded": general(
-        (*HEAD[:2], (HEAD[2] + 1) % 10**6, *OURS[3:])
+    "as many activations and other user data": general(
+        (USER_HEADER[0], USER_HEADER[1] + 1, *OURS[2:])
     ),
-    "our signature and a number that is no family's": general((*HEAD[:2], -1.0, *OURS[3:])),
-    "short user data": general(HEAD[:2]),
+    "our signature and a family that is not loaded": general(
+        (*USER_HEADER[:2], (USER_HEADER[2] + 1) % 10**6, *OURS[3:])
+    ),
+    "our signature and a number that is no family's": general((*USER_HEADER[:2], -1.0, *OURS[3:])),
+    "short user data": general(USER_HEADER[:2]),
     "our user data on a plain motor": general(OURS, actdim=0, dyntype="", biastype=""),
     "our user data on another dynamics": general(OURS, actdim=0, dyntype="filter", dynprm="0.1"),
     "our user data on another bias": general(OURS, biastype="affine", biasprm="1 2 3"),
     "our user data with another number of activations": general(OURS, actdim=SIZE - 1),
     "user gain": general(
-        (HEAD[0], HEAD[1] + 1), actdim=0, dyntype="", biastype="", gaintype="user"
+        (USER_HEADER[0], USER_HEADER[1] + 1),
+        actdim=0,
+        dyntype="",
+        biastype="",
+        gaintype="user",
     ),
     "integrator": '<general joint="a" dyntype="integrator"/>',
     "muscle": '<muscle joint="a" lengthrange="-1 1" force="1"/>',
@@ -77,7 +83,7 @@ def _start(model):
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4"])
 @pytest.mark.parametrize("kind", FOREIGN)
-def test_a_foreign_model_moves_as_without_us(kind, integrator):
+def test_other_models_move_as_without_the_callbacks(kind, integrator):
     model = mujoco.MjModel.from_xml_string(_xml(FOREIGN[kind]))
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     inputs = controls(50, model.nu)
@@ -91,7 +97,7 @@ def test_a_foreign_model_moves_as_without_us(kind, integrator):
 @pytest.mark.parametrize(
     "build", [rotor_spec, lambda: mujoco.MjSpec.from_string(_xml(FOREIGN["muscle"]))]
 )
-def test_models_compile_alike_while_installed(build):
+def test_models_compile_the_same_while_the_callbacks_are_installed(build):
     blobs = []
     for _ in range(2):
         model = build().compile()
@@ -101,7 +107,7 @@ def test_models_compile_alike_while_installed(build):
     np.testing.assert_array_equal(*blobs)
 
 
-def test_a_spec_is_recompiled_mid_episode_while_installed():
+def test_a_spec_is_recompiled_in_an_episode_while_the_callbacks_are_installed():
     engine.load_family(DCMotorActuator)
     engine.install()
     spec = rotor_spec()

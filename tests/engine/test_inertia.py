@@ -1,4 +1,4 @@
-"""The inertia at a shaft, against MuJoCo's own solution with its inertia matrix."""
+"""The inertia at a shaft equals MuJoCo's solution with its inertia matrix."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from codrl_mj.engine.doors import MOST_ON_STACK, shaft_inertia
+from codrl_mj.engine.model_access import MAX_STACK_DOFS, shaft_inertia
 
 MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
@@ -15,7 +15,7 @@ MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 @pytest.mark.parametrize(
     "name", ["humanoid.xml", "half_cheetah.xml", "ant.xml", "reacher.xml", "pusher_v5.xml"]
 )
-def test_it_is_one_over_the_moment_through_the_inverse_inertia_matrix(name):
+def test_the_inertia_is_one_over_m_inverse_m(name):
     model = mujoco.MjModel.from_xml_path(str(MODELS / name))
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     for _ in range(3):
@@ -32,12 +32,12 @@ def test_it_is_one_over_the_moment_through_the_inverse_inertia_matrix(name):
         solved = np.zeros_like(moments)
         mujoco.mj_solveM(model, data, solved, moments)
         expected = 1.0 / np.einsum("ij,ij->i", moments, solved)
-        found = [shaft_inertia(model, data, output, 3.0) for output in range(model.nu)]
-        np.testing.assert_allclose(found, expected / 9.0, rtol=1e-12)
+        inertias = [shaft_inertia(model, data, output, 3.0) for output in range(model.nu)]
+        np.testing.assert_allclose(inertias, expected / 9.0, rtol=1e-12)
 
 
-@pytest.mark.parametrize("count", [3, MOST_ON_STACK + 1])
-def test_a_slide_of_many_that_are_not_connected_has_its_bodys_mass(count):
+@pytest.mark.parametrize("count", [3, MAX_STACK_DOFS + 1])
+def test_a_separate_slide_joint_has_the_mass_of_its_body(count):
     spec = mujoco.MjSpec()
     for index in range(count):
         body = spec.worldbody.add_body(
@@ -54,7 +54,7 @@ def test_a_slide_of_many_that_are_not_connected_has_its_bodys_mass(count):
         )
 
 
-def test_what_moves_nothing_has_no_end_of_inertia():
+def test_an_actuator_that_moves_nothing_has_infinite_inertia():
     spec = mujoco.MjSpec.from_string(
         "<mujoco><worldbody><body><joint name='a'/><geom size='1'/></body></worldbody></mujoco>"
     )

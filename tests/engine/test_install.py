@@ -1,4 +1,4 @@
-"""Installation: idempotent, and never at the cost of somebody else's callback."""
+"""Installation is idempotent, and does not replace callbacks of other libraries."""
 
 import mujoco
 import pytest
@@ -48,20 +48,20 @@ def test_install_and_uninstall_are_idempotent():
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_a_foreign_callback_is_neither_replaced_nor_removed(name):
+def test_callbacks_of_other_libraries_are_neither_replaced_nor_removed(name):
     _set(name, FOREIGN[name])
     with pytest.raises(
         engine.CallbackInUseError, match=f"mjcb_{name} is already set.*set_mjcb_{name}.None."
     ):
         engine.install()
-    alone = {"control": None, "act_bias": None, name: FOREIGN[name]}
-    assert _present() == alone
+    expected = {"control": None, "act_bias": None, name: FOREIGN[name]}
+    assert _present() == expected
     assert not engine.installed()
     _set(name, None)
     engine.install()
     _set(name, FOREIGN[name])
     engine.uninstall()
-    assert _present() == alone
+    assert _present() == expected
 
 
 @pytest.mark.parametrize("name", FOREIGN)
@@ -73,12 +73,12 @@ def test_installed_is_false_while_one_callback_is_missing(name):
     assert engine.installed()
 
 
-def test_an_unknown_part_is_refused():
+def test_install_raises_for_an_unknown_group():
     with pytest.raises(ValueError, match="callbacks 'engine': must be one of motor"):
         engine.install("engine")
 
 
-def test_a_simulation_whose_callback_was_replaced_says_so_and_works_again_at_the_next_episode_without_it():
+def test_a_step_raises_if_the_callback_was_replaced_and_works_after_a_reset_without_it():
     physics = MujocoPhysics(SimulationConfig(TASKS["cartpole"], [DCMotorActuator()], 1, "euler"))
     mujoco.set_mjcb_control(FOREIGN["control"])
     with pytest.raises(engine.CallbackInUseError):

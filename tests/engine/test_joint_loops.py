@@ -1,4 +1,4 @@
-"""Loops over positions and speeds, with the mechanical step and the joints: closed forms, and simulated chatter."""
+"""Loops over positions and speeds with the mechanical step: closed forms and oscillations."""
 
 import dataclasses
 import math
@@ -41,7 +41,7 @@ def pendulum(actuator, **more):
 
 
 def hinge(inertia, timestep=0.01):
-    """The spec of a hinge without gravity."""
+    """Return the spec of a hinge without gravity."""
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.gravity, body = timestep, [0.0] * 3, spec.worldbody.add_body()
     body.explicitinertial, body.mass, body.inertia = True, 1.0, [inertia] * 3
@@ -51,7 +51,7 @@ def hinge(inertia, timestep=0.01):
 
 
 def held(env, steps=100):
-    """Deviations [rad] and currents [A] of the last second where a servo is asked to stay where the episode starts."""
+    """Return the start [rad], and deviations [rad] and currents [A] in the last second there."""
     env.reset(seed=3)
     start, rows = env.unwrapped.state[0], []
     for _ in range(steps):
@@ -61,8 +61,8 @@ def held(env, steps=100):
 
 
 @pytest.mark.parametrize("timestep", [None, 0.01])
-def test_a_servo_holds_a_rod_at_the_task_s_own_step(timestep):
-    """The rod sags by its weight's torque over position_gain*velocity_gain, and the current carries that torque."""
+def test_a_servo_holds_a_rod_at_the_tasks_default_step(timestep):
+    """The rod sags by its weight's torque/(position_gain*velocity_gain)."""
     more = {} if timestep is None else {"timestep": timestep}
     start, (off, current) = held(pendulum(servo(velocity_gain=12.0), **more))
     weight = 5.0 * math.sin(start + off[-1])
@@ -70,8 +70,8 @@ def test_a_servo_holds_a_rod_at_the_task_s_own_step(timestep):
     assert current == pytest.approx(-weight / (20.0 * 0.05), abs=2e-3)
 
 
-def test_a_servo_that_is_too_slow_for_its_gain_is_refused_with_a_step_that_does():
-    """Sampled with the steps, the bound of 2 for velocity_gain*h/J is passed at 0.05 s with the position's share."""
+def test_a_servo_too_slow_for_its_gain_raises_and_names_a_stable_step():
+    """At 0.05 s velocity_gain*h/J plus the position's share exceeds its bound of 2."""
     slow = servo(velocity_gain=14.0, servo_rate=20.0)
     with pytest.raises(
         UnstableError, match=r"^motor: the outer loops are .* A shorter step does not help; or pass"
@@ -89,7 +89,7 @@ def test_a_servo_that_is_too_slow_for_its_gain_is_refused_with_a_step_that_does(
 
 @dataclasses.dataclass(frozen=True)
 class Spring(ActuatorModel):
-    """A family of somebody's, which closes a loop over position and speed without saying so."""
+    """Custom family that closes a loop over position and speed without declaring it."""
 
     stiffness: float = real(1.0, least=0.0)
     damping: float = real(0.0, least=0.0)
@@ -106,27 +106,27 @@ class Spring(ActuatorModel):
 
 
 @pytest.mark.parametrize("shares", [(4.0, 0.0), (0.0, 2.0), (2.0, 1.0)])
-def test_a_family_of_somebody_s_is_refused_where_jury_says_so(shares):
+def test_a_custom_family_raises_exactly_if_the_jury_criterion_fails(shares):
     """Held over steps of semi-implicit Euler, h^2*k/J + 2*h*d/J must be below 4."""
     inertia, timestep = 0.02, 0.01
     stiffness, damping = shares[0] * inertia / timestep**2, shares[1] * inertia / timestep
     for factor, refused in ((0.98, False), (1.02, True)):
-        one = Spring(stiffness=factor * stiffness, damping=factor * damping)
+        spring = Spring(stiffness=factor * stiffness, damping=factor * damping)
         if refused:
             with pytest.raises(
                 UnstableError, match=r"moves 0\.02 kg\*m\^2 .* Or shorten the step to 0\.005 s"
             ):
-                codrl_mj.add_motors(hinge(inertia), {"it": one})
+                codrl_mj.add_motors(hinge(inertia), {"it": spring})
         else:
-            codrl_mj.add_motors(hinge(inertia), {"it": one})
+            codrl_mj.add_motors(hinge(inertia), {"it": spring})
 
 
-def test_dry_friction_of_somebody_s_is_no_loop():
+def test_dry_friction_of_a_custom_family_is_not_a_loop():
     codrl_mj.add_motors(hinge(0.02), {"it": Spring(stiffness=1.0, dry=0.5)})
 
 
 def test_a_torque_speed_line_that_overshoots_is_refused():
-    """The speed swings between 0 and twice as much as the no-load speed and more, or reaches the no-load speed."""
+    """The speed swings from 0 to over twice the no-load speed, or reaches the no-load speed."""
     line = TorqueSpeed(stall_torque=1.0, no_load_speed=10.0, max_torque=1.0)
     for inertia, swings in ((0.01 * 0.1 / 1.9, False), (0.01 * 0.1 / 2.1, True)):
         data = mujoco.MjData(
@@ -149,8 +149,8 @@ def test_a_torque_speed_line_that_overshoots_is_refused():
 @pytest.mark.parametrize(
     "draws", [{"loop.velocity_gain": "uniform(3, 14)"}, {"model.mass.rod": "uniform(0.5, 2)"}]
 )
-def test_draws_that_reach_what_is_unstable_are_refused(draws):
-    """Each extreme alone, and the worst of several together: a gain of 9 on half the mass."""
+def test_randomization_raises_if_its_range_includes_unstable_motors(draws):
+    """Check each extreme value alone, and the worst combination: a gain of 9 on half the mass."""
     slow = servo(velocity_gain=9.0, servo_rate=20.0)
     with pytest.raises(
         ValueError, match=r"^randomize: .* = \S+: motor: the outer loops .* narrow the bounds"
@@ -167,7 +167,7 @@ def test_draws_that_reach_what_is_unstable_are_refused(draws):
 
 
 @pytest.mark.filterwarnings("ignore:motor.rotor_inertia")
-def test_draws_for_motors_of_somebody_s_model_are_checked_too():
+def test_randomization_of_motors_in_custom_models_is_checked():
     with pytest.raises(ValueError, match=r"^randomize: loop\.velocity_gain = 0\.5: "):
         codrl_mj.make(
             "InvertedPendulum-v5",
@@ -177,8 +177,8 @@ def test_draws_for_motors_of_somebody_s_model_are_checked_too():
         )
 
 
-def test_a_position_loop_within_a_step_is_warned_of():
-    """It is at its target late: the pole is not exp(-1.5), but 1 - 1.5*exp(-1.5)."""
+def test_a_position_loop_faster_than_a_step_causes_a_warning():
+    """The target is reached late: the pole is 1 - 1.5*exp(-1.5) instead of exp(-1.5)."""
     with pytest.warns(UserWarning, match=r"position_gain = 30: .* Shorten the step to 0\.0333 s"):
         pendulum(
             dataclasses.replace(

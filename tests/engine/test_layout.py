@@ -1,4 +1,4 @@
-"""Structure offsets: against the addresses of live objects, and that a wrong layout is never used."""
+"""Structure offsets agree with live objects, and a wrong layout is never used."""
 
 import ctypes
 import re
@@ -16,9 +16,9 @@ OWNERS = {"MODEL": "mjModel", "DATA": "mjData"}
 USED = sorted(
     {(OWNERS[owner], field) for owner, field in re.findall(r"\b(MODEL|DATA)\.([\w.]+)\(", SOURCE)}
 )
-"""Whatever compiled code reads or writes."""
+"""Fields that compiled code reads or writes."""
 STACK = [("mjData", field) for field in ("narena", "nbuffer", "pstack", "maxuse_stack")]
-"""Around `pbase`, which the bindings do not show."""
+"""Fields around `pbase`, which the bindings do not expose."""
 CASES = [
     ("mjOption", field[4:]) if field.startswith("opt.") else (owner, field) for owner, field in USED
 ]
@@ -31,12 +31,12 @@ INDISTINGUISHABLE = {
 
 
 def _is_pointer(struct_name, field):
-    """Two pointers are never equal, so only scalars need a probe that gives them different values."""
+    """Return True for a pointer, whose values always differ; only scalars need a special probe."""
     return dict(layout.struct(struct_name)._fields_)[field] is ctypes.c_void_p
 
 
 @pytest.mark.parametrize("struct_name", ["mjModel", "mjData"])
-def test_every_array_of_a_live_object_lies_where_its_offset_says(struct_name):
+def test_every_array_has_the_offset_of_the_layout(struct_name):
     model = mujoco.MjSpec.from_string(layout._PROBE).compile()
     owner = model if struct_name == "mjModel" else mujoco.MjData(model)
     checked = 0
@@ -48,16 +48,17 @@ def test_every_array_of_a_live_object_lies_where_its_offset_says(struct_name):
             and isinstance(field.type, layout.ast_nodes.PointerType)
         ):
             continue
-        found = ctypes.c_void_p.from_address(
+        pointer = ctypes.c_void_p.from_address(
             owner._address + layout.offset(struct_name, field.name)
         ).value
-        if found is not None:  # else it lives in the arena, which nothing has used yet
-            assert found == live.ctypes.data, field.name
+        # A null pointer belongs to the arena, which has not been used yet.
+        if pointer is not None:
+            assert pointer == live.ctypes.data, field.name
             checked += 1
     assert checked > 50
 
 
-def test_scalars_of_nested_structures_too_are_read_and_written_where_their_offset_says():
+def test_scalars_of_nested_structures_are_read_and_written_at_their_offsets():
     model = mujoco.MjSpec.from_string(layout._PROBE).compile()
     data = mujoco.MjData(model)
     count = ctypes.c_int64.from_address(model._address + layout.offset("mjModel", "nactuator"))
@@ -74,13 +75,19 @@ def test_scalars_of_nested_structures_too_are_read_and_written_where_their_offse
     assert (model.opt.timestep, data.time) == (0.25, 7.5)
 
 
-def test_the_hidden_stack_frame_lies_between_its_checked_neighbours():
+def test_the_hidden_stack_frame_is_between_checked_neighbors():
     order = [name for name, _ in layout.struct("mjData")._fields_]
-    at = {name: order.index(name) for name in ("pbase", *(field for _, field in STACK))}
-    assert at["narena"] < at["nbuffer"] < at["pstack"] < at["pbase"] < at["maxuse_stack"]
+    indices = {name: order.index(name) for name in ("pbase", *(field for _, field in STACK))}
+    assert (
+        indices["narena"]
+        < indices["nbuffer"]
+        < indices["pstack"]
+        < indices["pbase"]
+        < indices["maxuse_stack"]
+    )
 
 
-def test_unknown_fields_and_types_are_refused():
+def test_offset_raises_for_unknown_fields_and_types():
     with pytest.raises(
         LayoutError, match=f"MuJoCo {mujoco.__version__}: mjModel has no field 'no_such_thing'"
     ):
@@ -99,7 +106,7 @@ def _check(*first):
 
 
 def _corrupt(monkeypatch, struct_name, members):
-    """Let the layout of one structure be the given (name, type) members."""
+    """Replace the layout of a structure by given (name, type) members."""
     true = layout.struct
     bad = type(struct_name, (ctypes.Structure,), {"_fields_": members})
     replaced = {struct_name: bad}
@@ -114,13 +121,13 @@ def test_the_installed_layout_is_accepted():
 
 
 @pytest.mark.parametrize(("struct_name", "field"), CASES)
-def test_a_field_that_has_moved_is_refused(struct_name, field, monkeypatch):
+def test_check_field_raises_for_a_field_at_another_offset(struct_name, field, monkeypatch):
     members = list(layout.struct(struct_name)._fields_)
-    place = [name for name, _ in members].index(field)
+    index = [name for name, _ in members].index(field)
     _corrupt(
         monkeypatch,
         struct_name,
-        [*members[:place], ("added_by_a_new_version", ctypes.c_int64), *members[place:]],
+        [*members[:index], ("added_by_a_new_version", ctypes.c_int64), *members[index:]],
     )
     with pytest.raises(LayoutError, match="where its layout says, expected"):
         _check()
@@ -129,19 +136,19 @@ def test_a_field_that_has_moved_is_refused(struct_name, field, monkeypatch):
 @pytest.mark.parametrize(
     ("struct_name", "field"), [case for case in CASES if not _is_pointer(*case)]
 )
-def test_a_scalar_that_changed_places_with_another_is_refused(struct_name, field, monkeypatch):
+def test_check_field_raises_for_two_exchanged_scalars(struct_name, field, monkeypatch):
     members = list(layout.struct(struct_name)._fields_)
-    place = [name for name, _ in members].index(field)
+    index = [name for name, _ in members].index(field)
     most_likely = ("mjModel", f"opt.{field}") if struct_name == "mjOption" else (struct_name, field)
-    for other_place, (other, kind) in enumerate(members):
+    for other_place, (other_name, kind) in enumerate(members):
         if (
-            other == field
-            or kind is not members[place][1]
-            or other in INDISTINGUISHABLE.get(field, ())
+            other_name == field
+            or kind is not members[index][1]
+            or other_name in INDISTINGUISHABLE.get(field, ())
         ):
             continue
         swapped = list(members)
-        swapped[place], swapped[other_place] = (other, kind), (field, kind)
+        swapped[index], swapped[other_place] = (other_name, kind), (field, kind)
         with monkeypatch.context() as patch:
             _corrupt(patch, struct_name, swapped)
             with pytest.raises(LayoutError):
@@ -149,13 +156,13 @@ def test_a_scalar_that_changed_places_with_another_is_refused(struct_name, field
 
 
 @pytest.mark.parametrize("owner", ["mjModel", "mjData"])
-def test_nothing_is_compiled_from_a_wrong_layout(owner, monkeypatch):
+def test_a_wrong_layout_is_not_compiled(owner, monkeypatch):
     _corrupt(
         monkeypatch,
         owner,
         [("added_by_a_new_version", ctypes.c_int64), *layout.struct(owner)._fields_],
     )
-    fields, name = layout.Fields(owner), "nactuator" if owner == "mjModel" else "time"
+    fields, name = layout.StructFields(owner), "nactuator" if owner == "mjModel" else "time"
 
     @numba.njit
     def read(address):

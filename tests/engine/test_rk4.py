@@ -1,4 +1,4 @@
-"""RK4: the motor advances once a step and its force is held over the four stages."""
+"""With RK4 the motor advances once a step, and its force is held over the four stages."""
 
 import mujoco
 import numpy as np
@@ -20,9 +20,7 @@ HANGING = [(0.1, 0.2, np.pi - 0.3, 0.4), (-0.5, 0.0, np.pi + 0.2, -1.0), (0.0, -
 )
 @pytest.mark.parametrize("actuator", [TASKS["cartpole"].paper[0], changed(FULL, max_voltage=24.0)])
 @pytest.mark.parametrize("seed", range(3))
-def test_rk4_is_the_hand_written_integration_with_the_motor_advanced_once_a_step(
-    actuator, seed, moved
-):
+def test_rk4_equals_a_manual_integration_that_advances_the_motor_once_a_step(actuator, seed, moved):
     model, motor, state = (
         cartpole(actuator, integrator="RK4"),
         MotorSimulation(actuator),

@@ -1,4 +1,4 @@
-"""Our motors beside each other and beside foreign actuators: everything is found by its own address."""
+"""Several of our motors with other actuators: each is found by its own address."""
 
 import mujoco
 import numpy as np
@@ -32,7 +32,7 @@ TIMESTEP = 0.01
 
 
 def _spec(with_ours=True):
-    """Foreign actuators of every shape, with our motors between them."""
+    """Return a spec with actuators of all kinds, and our motors among them."""
 
     def ours(name):
         return f'<general name="{name}" joint="{name}"/>' if with_ours else ""
@@ -64,13 +64,13 @@ def _spec(with_ours=True):
 
 
 def model_of_several(_=None, integrator="Euler", with_ours=True):
-    """The spec, compiled."""
+    """Return the compiled spec."""
     model = _spec(with_ours).compile()
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     return model
 
 
-def test_the_counts_of_controls_outputs_activations_and_actuators_differ():
+def test_the_numbers_of_controls_outputs_activations_and_actuators_differ():
     model = model_of_several()
     assert len({model.nu, model.nout, model.na, model.nactuator}) == 4
     for name in ("second", "third"):
@@ -81,7 +81,7 @@ def test_the_counts_of_controls_outputs_activations_and_actuators_differ():
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4"])
-def test_every_motor_is_its_own_reference(integrator):
+def test_every_motor_equals_its_reference(integrator):
     model = model_of_several(integrator=integrator)
     data, references = (
         mujoco.MjData(model),
@@ -90,12 +90,12 @@ def test_every_motor_is_its_own_reference(integrator):
     for data.ctrl[:] in controls(100, model.nu):
         forces = {}
         for name, reference in references.items():
-            wanted = (
+            expected = (
                 data.ctrl[model.actuator_ctrladr[model.actuator(name).id]]
                 / OURS[name].motor.arm_radius
             )
-            wanted = np.clip(wanted, -0.5, 0.5) if name == "third" else wanted
-            forces[name] = reference.step(TIMESTEP, wanted, data.joint(name).qvel[0])
+            expected = np.clip(expected, -0.5, 0.5) if name == "third" else expected
+            forces[name] = reference.step(TIMESTEP, expected, data.joint(name).qvel[0])
         mujoco.mj_step(model, data)
         for name, reference in references.items():
             actuator, close = model.actuator(name).id, {"rel": 1e-10, "abs": 1e-11}
@@ -108,9 +108,13 @@ def test_every_motor_is_its_own_reference(integrator):
             assert data.joint(name).qfrc_actuator[0] == pytest.approx(forces[name], **close)
 
 
-def test_foreign_actuators_act_as_without_ours():
+def test_other_actuators_are_not_affected_by_ours():
     model, bare = model_of_several(), model_of_several(with_ours=False)
-    inputs, data, alone = controls(100, model.nu), mujoco.MjData(model), mujoco.MjData(bare)
+    inputs, data, without_motors = (
+        controls(100, model.nu),
+        mujoco.MjData(model),
+        mujoco.MjData(bare),
+    )
     foreign = [index for index in range(model.nactuator) if index not in motors(model)]
     starts, counts = model.actuator_ctrladr, model.actuator_ctrlnum
     chosen = np.concatenate(
@@ -118,16 +122,16 @@ def test_foreign_actuators_act_as_without_ours():
     )
     trajectory(model, inputs, data)
     uninstall()
-    trajectory(bare, inputs[:, chosen], alone)
-    assert np.any(alone.act != 0.0)
+    trajectory(bare, inputs[:, chosen], without_motors)
+    assert np.any(without_motors.act != 0.0)
     for name in ("ball", "pid", "dc"):
         np.testing.assert_allclose(
-            data.joint(name).qpos, alone.joint(name).qpos, rtol=1e-12, atol=1e-12
+            data.joint(name).qpos, without_motors.joint(name).qpos, rtol=1e-12, atol=1e-12
         )
         assert np.any(data.joint(name).qfrc_actuator != 0.0)
 
 
-def test_a_disabled_group_silences_one_motor_of_several():
+def test_a_disabled_group_disables_only_its_motor():
     model = model_of_several()
     model.opt.disableactuator = 1 << 2
     data = mujoco.MjData(model)
@@ -140,9 +144,7 @@ def test_a_disabled_group_silences_one_motor_of_several():
 
 
 @pytest.mark.parametrize("index", [0, 1, -1])
-def test_a_bad_control_anywhere_counts_as_zero_everywhere_as_in_the_engine(
-    index, tmp_path, monkeypatch
-):
+def test_a_bad_control_sets_all_controls_to_zero_as_in_the_engine(index, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # the engine writes a log
     model = model_of_several()
     inputs = controls(40, model.nu)

@@ -132,7 +132,7 @@ def winding(motor, dt, substeps, max_voltage, current, voltage, speed):
 @every_physics
 def test_a_voltage_drives_the_winding_and_that_the_task(task, physics):
     """One environment step at a time from the state reached: winding and unmodified Gymnasium, by hand."""
-    env, driver = make(task, "voltage", physics=physics), TASKS[task].twin()
+    env, driver = make(task, "voltage", physics=physics), TASKS[task].reference_env()
     motor, loop = MOTOR.motor, MOTOR.controller
     inner, current = env.task.motor_inner_steps, 0.0
     dt = env.task.step_duration / inner

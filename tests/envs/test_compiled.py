@@ -11,11 +11,11 @@ import pytest
 
 from codrl_mj import Uniform
 from codrl_mj.actuators import IDEAL, DCMotorActuator, actuator_over
-from codrl_mj.engine.families import signals_at
+from codrl_mj.engine.families import signals_offset
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.compiled import compiled_env
 from codrl_mj.tasks import TASKS, named_actuator
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.tasks.faces import REBUILT, actions, desired_force, every_rebuilt, random_states
 
 every_task = pytest.mark.parametrize("task", TASKS)
@@ -37,7 +37,7 @@ SETUPS = {
 }
 KEPT = [("pendulum", "motor"), ("cartpole", "disturbed")]
 every_setup = pytest.mark.parametrize(
-    ("task", "kind"), but(KEPT, itertools.product(REBUILT, SETUPS))
+    ("task", "kind"), matrix_params(KEPT, itertools.product(REBUILT, SETUPS))
 )
 
 
@@ -71,7 +71,7 @@ def _plain_step(env, task, state, force):
             data.qpos[:], data.qvel[:] = state[positions], state[velocities]
     if env.actuator == IDEAL:
         return state, force
-    return state, env.actuator.motor.torque_constant * data.act[signals_at(DCMotorActuator)] / arm
+    return state, env.actuator.motor.torque_constant * data.act[signals_offset(DCMotorActuator)] / arm
 
 
 @every_rebuilt

@@ -13,7 +13,7 @@ from codrl_mj.envs import ActuatedEnv
 from codrl_mj.physics import PHYSICS
 from codrl_mj.tasks import TASKS
 from tests.envs.faces import SETUPS, arguments
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.tasks.faces import REBUILT, actions, every_rebuilt
 
 every_physics = pytest.mark.parametrize("physics", PHYSICS)
@@ -67,7 +67,7 @@ def test_the_checkers_complain_about_nothing_but_the_spaces(check, task, physics
     assert _complaints(check, env, skip_render_check=True) <= of_spaces
 
 
-@pytest.mark.parametrize("task", but(["pendulum"], REBUILT))
+@pytest.mark.parametrize("task", matrix_params(["pendulum"], REBUILT))
 def test_gymnasiums_checker_has_no_complaint_about_rendering(task, monkeypatch):
     monkeypatch.setattr(
         "codrl_mj.envs.single.Window", unittest.mock.Mock()

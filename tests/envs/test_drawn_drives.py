@@ -23,7 +23,7 @@ from codrl_mj.envs import ActuatedEnv
 from codrl_mj.validation.motor_catalogue import Bench, Mechanics
 from tests.envs.faces import run
 from tests.envs.vectors import assert_equal_episodes, assert_same, batched, looped
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.tasks.faces import actions
 
 # every field counts: 60 turns make the rod light for its motor, so that its speed changes within a
@@ -121,7 +121,7 @@ IN_TURN = [
 ]
 
 
-@pytest.mark.parametrize("name", but(IN_TURN, ["everything", *NOMINAL]))
+@pytest.mark.parametrize("name", matrix_params(IN_TURN, ["everything", *NOMINAL]))
 def test_a_drawn_field_is_drawn_in_a_batch_as_alone_and_brought_back(name):
     randomize = DRAWN if name == "everything" else {name: DRAWN[name]}
     arguments = {"actuator": ONE, "randomize": randomize, "max_episode_steps": 5}
@@ -173,7 +173,7 @@ def test_everything_drawn_moves_as_the_equations_say(task, seed):
     env = ActuatedEnv(task, nominal, randomize=ranges)
     env.reset(seed=seed)
     one, definition, state = env.actuator, env.task, env.state
-    timestep, at = definition.step_duration, definition.speeds[0]
+    timestep, at = definition.step_duration, definition.speed_indices[0]
     bench, mechanics = (
         Bench(one, timestep),
         Mechanics(definition, one, timestep, definition.integrators[0]),

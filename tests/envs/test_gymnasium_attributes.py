@@ -261,7 +261,7 @@ def test_a_physics_of_ones_own_without_a_model_says_that_it_has_no_such_number(m
 
         def __init__(self, *arguments, **options):
             super().__init__(*arguments, **options)
-            self.twin = lambda state, *_: state
+            self.reference_env = lambda state, *_: state
 
     monkeypatch.setitem(PHYSICS, "still", Still)
     env = _pair("cartpole", physics="still")[0]

@@ -18,7 +18,7 @@ from codrl_mj.actuators import (
     spectral_radius,
 )
 from codrl_mj.actuators.stability import spectral_radii, stability_radii
-from codrl_mj.engine.families import HEAD
+from codrl_mj.engine.families import USER_HEADER_SIZE
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.tasks import named_actuator
 from tests.envs.faces import DRIVE, plain, scales
@@ -127,7 +127,7 @@ def test_the_drawn_actuator_is_what_acts(task, physics):
             )
         ends.add(tuple(ours.state))
         if physics == "mujoco":
-            assert tuple(ours.model.actuator_user[0, HEAD:]) == actuator.numbers
+            assert tuple(ours.model.actuator_user[0, USER_HEADER_SIZE:]) == actuator.numbers
     assert len(ends) == 4
 
 

@@ -427,7 +427,7 @@ NO_CHOICE = [4, 1.0, np.array([0.0])]
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("command", ["force", "current", "voltage"])
-def test_what_is_no_action_is_refused_and_changes_nothing(task, command):
+def test_an_invalid_action_raises_and_changes_nothing(task, command):
     env = ActuatedEnv(task, **commanded(task, command))
     env.reset(seed=0)
     before = env.snapshot()

@@ -26,11 +26,11 @@ from codrl_mj.actuators import (
     VoltageDrive,
 )
 from codrl_mj.catalogue import motor_entry
-from codrl_mj.engine.reading import slots
+from codrl_mj.engine.reading import motor_slots
 from codrl_mj.envs.config import EnvConfig
 from tests.add_motors.models import full_state
 from tests.external_envs.models import ARM, V5, ArmEnv, BareEnv, actions, assert_same, run
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::UserWarning"
@@ -38,7 +38,7 @@ pytestmark = pytest.mark.filterwarnings(
 IDEAL, MAXON = {".*": "ideal"}, {".*": "maxon-ec45-flat-50w"}
 BACK, FRONT = ("bthigh", "bshin", "bfoot"), ("fthigh", "fshin", "ffoot")
 KEPT = ("HalfCheetah-v5", "InvertedPendulum-v5")  # several motors and RK4 with an early end: one
-every_v5 = pytest.mark.parametrize("env_id", but(KEPT, V5))
+every_v5 = pytest.mark.parametrize("env_id", matrix_params(KEPT, V5))
 CHEETAH, ARM_ID, BARE_ID = "HalfCheetah-v5", "ForeignArm-v0", "ForeignBare-v0"
 NOISY = DCMotorActuator(
     Motor(resistance=1.0, inductance=0.05, torque_constant=0.8, back_emf_constant=0.01),
@@ -149,7 +149,7 @@ def _everything(env_id):
 
 
 @pytest.mark.parametrize(
-    "env_id", but((*KEPT, "Ant-v5"), V5)
+    "env_id", matrix_params((*KEPT, "Ant-v5"), V5)
 )  # Ant's rewards come from poses that lag a step
 def test_a_snapshot_continues_bit_for_bit_in_a_fresh_environment(env_id):
     env, other = _everything(env_id), _everything(env_id)
@@ -211,7 +211,7 @@ def test_resets_bring_motors_to_rest(env_id, actuator):
 
 def test_every_motor_has_noise_of_its_own_in_every_episode():
     env = codrl_mj.make(CHEETAH, {"b.*": NOISY, "f.*": "lag"}, allow_unstable=True)
-    views, keys = slots(env.unwrapped.data, env.motors), []
+    views, keys = motor_slots(env.unwrapped.data, env.motors), []
     for seed in (7, None, 7):
         env.reset(seed=seed)
         keys.append([view[1] for view in views.values()])

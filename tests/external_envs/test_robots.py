@@ -12,7 +12,7 @@ import codrl_mj
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from tests.add_motors.models import MENAGERIE
 from tests.external_envs.models import actions, assert_same, run
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::UserWarning"
@@ -50,7 +50,7 @@ def robot():
     gym.registry.pop("ForeignRobot-v0", None)
 
 
-@pytest.mark.parametrize("path", but(MENAGERIE[5:6], MENAGERIE), ids=lambda path: path.parent.name)
+@pytest.mark.parametrize("path", matrix_params(MENAGERIE[5:6], MENAGERIE), ids=lambda path: path.parent.name)
 def test_ideal_motors_change_no_bit_of_robots_that_one_can_buy(path, robot):
     env_id = robot(path)
     plain, ours = gym.make(env_id), codrl_mj.make(env_id, IDEAL)
@@ -88,7 +88,7 @@ def test_motors_of_ours_stand_beside_a_muscle_and_a_plugin_of_others(robot, tmp_
     inputs = actions(plain, 200)
     assert_same(run(ours, inputs, seed=0), run(plain, inputs, seed=0))
     assert list(ours.motors) == [0]
-    with pytest.raises(ValueError, match=r"muscle of b: cannot be motorised: .*mjDYN_MUSCLE"):
+    with pytest.raises(ValueError, match=r"muscle of b: cannot have a motor: .*mjDYN_MUSCLE"):
         codrl_mj.make(env_id, {"muscle": "ideal"})
 
 

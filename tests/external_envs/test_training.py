@@ -24,7 +24,7 @@ from codrl_mj.sizing import demand_of, demands_of
 from codrl_mj.training import TrainConfig, history, load_config, train
 from codrl_mj.training.config import read_config
 from tests.external_envs.models import BareEnv
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.training.interruptions import TERMINATE, crash, differing, interrupt, outcome, resume
 
 pytestmark = pytest.mark.filterwarnings(
@@ -179,7 +179,7 @@ def test_a_module_of_somebodys_is_not_imported_from_a_run_folder_unasked(tmp_pat
 # -- training -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", but(["reacher by currents"], CASES))
+@pytest.mark.parametrize("name", matrix_params(["reacher by currents"], CASES))
 def test_an_interrupted_training_comes_to_the_same_result(tmp_path, name):
     interrupt(CASES[name], tmp_path / "run", 70, TERMINATE)
     interrupt(CASES[name], tmp_path / "run", 70, crash)

@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 
 from codrl_mj.identify import Log, read_log
 from codrl_mj.identify.simulation import ShaftParameters, simulate_shaft
-from tests.published import folder_of
+from tests.published import published_folder
 
 PENDULUM = "time=time:s,position=position:rad,torque=torque:N*m"
 SERVO = (
@@ -21,7 +21,7 @@ LOOP = 20000.0
 
 def pendulum_log(name):
     """Return a published log of a real pendulum."""
-    return read_log(folder_of("dfki_pendulum") / f"{name}.csv", PENDULUM)
+    return read_log(published_folder("dfki_pendulum") / f"{name}.csv", PENDULUM)
 
 
 def prbs(time, random, clock=2e-3):

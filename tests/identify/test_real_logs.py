@@ -5,7 +5,7 @@ import pytest
 
 from codrl_mj.identify import identify, read_log
 from tests.identify import bench
-from tests.published import folder_of
+from tests.published import published_folder
 
 PUBLISHED = {
     "inertia": 0.0626,
@@ -17,7 +17,7 @@ PUBLISHED = {
 
 
 def servo_log(time):
-    return read_log(folder_of("bam_xl330") / f"2026-01-15_{time}.json", bench.SERVO)
+    return read_log(published_folder("bam_xl330") / f"2026-01-15_{time}.json", bench.SERVO)
 
 
 @pytest.mark.matrix

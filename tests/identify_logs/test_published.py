@@ -10,7 +10,7 @@ import pytest
 from codrl_mj.cli import main
 from codrl_mj.identify import published as module
 from codrl_mj.identify.published import fetch, published_datasets
-from tests.published import folder_of
+from tests.published import published_folder
 
 LOG = b"time,position\n0,0\n"
 
@@ -74,6 +74,6 @@ def test_data_sets_are_listed_and_an_unknown_name_raises_an_error(capsys):
 
 @pytest.mark.parametrize("name", published_datasets())
 def test_the_digests_match_the_files(name):
-    folder = folder_of(name)
+    folder = published_folder(name)
     for file, entry in published_datasets()[name]["files"].items():
         assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == entry["sha256"], file

@@ -5,7 +5,7 @@ import pytest
 from codrl_mj.identify.balances import torque_balance, velocity_lag
 from codrl_mj.identify.checks import check
 from codrl_mj.identify.reading import read_log
-from tests.published import folder_of
+from tests.published import published_folder
 
 PENDULUM = "time=time:s,position=position:rad,velocity=velocity:rad/s,torque=torque:N*m"
 SERVO = (
@@ -20,12 +20,12 @@ PLAIN = SERVO.replace("twos_complement(load, 16)", "load")
 
 def servo_log(index, columns=SERVO):
     """Return a log of a servo."""
-    return read_log(folder_of("bam_xl330") / SERVO_LOGS[index], columns)
+    return read_log(published_folder("bam_xl330") / SERVO_LOGS[index], columns)
 
 
 def pendulum_log(name, columns=PENDULUM):
     """Return a log of a pendulum."""
-    return read_log(folder_of("dfki_pendulum") / f"{name}.csv", columns)
+    return read_log(published_folder("dfki_pendulum") / f"{name}.csv", columns)
 
 
 def faults(log):

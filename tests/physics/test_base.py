@@ -17,11 +17,11 @@ FIELDS = {"body_mass": np.ones((1, 2)), "body_ipos": np.zeros((1, 2, 3))}
 def test_steps_are_the_papers_inner_loop_with_a_motor_and_gymnasiums_without_unless_they_are_given(
     task,
 ):
-    assert task.steps_within(DCMotorActuator(), None, None) == task.motor_inner_steps
-    assert task.steps_within(IDEAL, None, None) == (10 if task.name == "furuta" else 1)
+    assert task.num_inner_steps(DCMotorActuator(), None, None) == task.motor_inner_steps
+    assert task.num_inner_steps(IDEAL, None, None) == (10 if task.name == "furuta" else 1)
     for count in (1, 2, 3, 7, 10, 1000):
-        assert task.steps_within(IDEAL, None, task.step_duration / count) == count
-        assert task.steps_within(IDEAL, count, None) == count
+        assert task.num_inner_steps(IDEAL, None, task.step_duration / count) == count
+        assert task.num_inner_steps(IDEAL, count, None) == count
 
 
 @every_task
@@ -31,7 +31,7 @@ def test_a_timestep_that_does_not_divide_is_refused_with_both_numbers(task, rati
     with pytest.raises(
         ValueError, match=rf"{timestep:g} s does not divide .*{task.step_duration:g} s"
     ) as refused:
-        task.steps_within(IDEAL, None, timestep)
+        task.num_inner_steps(IDEAL, None, timestep)
     assert f"the ratio is {ratio:.6g}, must be an integer >= 1" in str(refused.value)
 
 

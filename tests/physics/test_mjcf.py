@@ -20,7 +20,7 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.disturbances import Joint
 from codrl_mj.engine import motors
-from codrl_mj.engine.families import HEAD, slot_size, user_head
+from codrl_mj.engine.families import USER_HEADER_SIZE, slot_size, user_header
 from codrl_mj.physics import MujocoPhysics, SimulationConfig
 from codrl_mj.physics.mjcf import drive, task_model
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
@@ -163,7 +163,7 @@ def test_a_motor_that_would_not_run_as_described_is_refused_by_name(
     assert len(motors(model)) == 1
     numbers = parameters_type(DCMotorActuator)._fields
     if field in numbers:
-        model.actuator_user[0, HEAD + numbers.index(field)] = value
+        model.actuator_user[0, USER_HEADER_SIZE + numbers.index(field)] = value
     elif field == "family":
         model.actuator_user[0, 2] = value
     else:
@@ -173,7 +173,7 @@ def test_a_motor_that_would_not_run_as_described_is_refused_by_name(
 
 
 def test_user_data_too_short_for_a_motor_is_refused():
-    user = " ".join(map(repr, [*user_head(DCMotorActuator), 1]))
+    user = " ".join(map(repr, [*user_header(DCMotorActuator), 1]))
     short = XML.replace(
         '<motor name="drive" joint="hinge"/>',
         f'<general name="drive" joint="hinge" dyntype="user" actdim="{SIZE}" gainprm="0"'

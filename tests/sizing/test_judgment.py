@@ -32,7 +32,7 @@ from codrl_mj.sizing import (
 )
 from codrl_mj.training import TrainConfig
 from tests.external_envs.models import ARM, ArmEnv
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 DOCS = Path(__file__).parents[2] / "docs"
 LIGHT = 1e-12
@@ -101,7 +101,7 @@ def published():
 
 @pytest.mark.parametrize(
     "task",
-    but(
+    matrix_params(
         ["pendulum"],
         ["pendulum", "cartpole", "acrobot", "furuta", "mountain_car", "mountain_car_continuous"],
     ),

@@ -32,7 +32,7 @@ from codrl_mj.study.doses import AXES, FLOORS, REAL, REFERENCE_SPEEDS, posed, su
 from codrl_mj.study.evidence import Evidence, Outcome
 from codrl_mj.tasks import find_task, named_actuator
 from codrl_mj.training import TrainConfig
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.study.pretended import pretend
 
 OWN_STEPS = {"supply": 1.0 / (2.0 * math.pi * 0.0555 * 20.0), "noise": 1.0}
@@ -41,7 +41,7 @@ samples a step; and half of what is left in each step, 1/2 + 1/4 + ...
 """
 
 
-@pytest.mark.parametrize("task", but(["furuta"], REFERENCE_SPEEDS))
+@pytest.mark.parametrize("task", matrix_params(["furuta"], REFERENCE_SPEEDS))
 @pytest.mark.parametrize("axis", ["lag", "weakness", "supply", "noise"])
 def test_the_bench_finds_every_dose_of_the_study_and_nothing_else(task, axis):
     for dose in AXES[axis].doses:

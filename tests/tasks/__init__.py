@@ -1,1 +1,1 @@
-"""Tests of the tasks, each against the installed Gymnasium."""
+"""Tests of the tasks against the installed Gymnasium."""

@@ -1,19 +1,19 @@
-"""Our environments beside Gymnasium's, for comparison."""
+"""Pairs of our environments and Gymnasium's, for comparison."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import codrl_mj  # noqa: F401 - registers the environments
-from codrl_mj.tasks import OURS, TASKS
+from codrl_mj.tasks import PAPER_TASKS, TASKS
 
-REBUILT = tuple(task.name for task in OURS)
-"""The tasks that Gymnasium and the paper have."""
+REBUILT = tuple(task.name for task in PAPER_TASKS)
+"""Names of the tasks of Gymnasium and the paper."""
 every_rebuilt = pytest.mark.parametrize("task", REBUILT)
 NEW = ("pendulum", "acrobot", "mountain_car", "mountain_car_continuous")
 WITH_HILL = ("mountain_car", "mountain_car_continuous")
 
-# task -> (least, largest) state to draw from, a little beyond the bounds that a step keeps
+# Task -> lowest and highest state to draw from, slightly beyond the bounds of a step.
 SPEED_LIMITED = {
     "pendulum": ([-10.0, -8.5], [10.0, 8.5]),
     "cartpole": ([-2.5, -3.0, -0.3, -3.0], [2.5, 3.0, 0.3, 3.0]),
@@ -24,17 +24,17 @@ SPEED_LIMITED = {
 
 
 def ours(task, **arguments):
-    """Our environment of a task, with its time limit."""
+    """Create our environment of a task, with its time limit."""
     return gym.make(TASKS[task].env_id, disable_env_checker=True, **arguments)
 
 
 def gymnasiums(task):
-    """The Gymnasium environment that the task rebuilds, with its time limit."""
+    """Create the Gymnasium environment that the task rebuilds, with its time limit."""
     return gym.make(TASKS[task].gymnasium_id, disable_env_checker=True)
 
 
 def actions(task, seed, count, dtype=np.float64):
-    """Random actions of a task; continuous ones drawn in float64, and rounded if `dtype` is float32."""
+    """Return random actions of a task; continuous ones are float64 unless `dtype` is float32."""
     generator = np.random.default_rng(seed)
     space = TASKS[task].action_space
     if isinstance(space, gym.spaces.Discrete):
@@ -43,12 +43,12 @@ def actions(task, seed, count, dtype=np.float64):
 
 
 def desired_force(task, action):
-    """The force that an action within the bounds asks for: the task's table has it, or the action is it."""
+    """Return the desired force of an action within the bounds."""
     forces = TASKS[task].forces
     return float(action[0] if forces is None else forces[action])
 
 
 def random_states(task, seed, count):
-    """States all over the task's state space, shape (count, n)."""
+    """Return states from the whole state space of a task, shape (count, n)."""
     low, high = SPEED_LIMITED[task]
     return np.random.default_rng(seed).uniform(low, high, size=(count, len(low)))

@@ -1,4 +1,4 @@
-"""What counts as an action, the force that it asks for, and what that force costs."""
+"""Valid actions, their desired forces, and the cost of these forces."""
 
 import itertools
 
@@ -12,7 +12,7 @@ LIMITS = {"pendulum": 2.0, "mountain_car_continuous": 1.0}
 LEVELS = {"cartpole": [-10, 10], "acrobot": [-1, 0, 1], "mountain_car": [-1, 0, 1]}
 BEYOND = [[-np.inf], [-3.0], [-0.5], [0.25], [3.0]]
 GIVEN = [
-    # task, actions, the forces that they ask for: levels, or the action within the limits
+    # Task, actions, and their desired forces: levels, or the action within the limits.
     *((task, np.arange(len(levels)), levels) for task, levels in LEVELS.items()),
     *(
         (task, np.array(BEYOND, dtype), [-limit, -limit, -0.5, 0.25, limit])
@@ -34,7 +34,7 @@ NONE = [
 
 
 @pytest.mark.parametrize(("task", "actions", "expected"), GIVEN)
-def test_an_action_asks_for_a_force(task, actions, expected):
+def test_an_action_has_a_desired_force(task, actions, expected):
     env = ours(task, actuator="ideal")
     forces = env.unwrapped.setup.commands.forces(actions)
     np.testing.assert_array_equal(forces, expected)
@@ -44,7 +44,7 @@ def test_an_action_asks_for_a_force(task, actions, expected):
 
 
 @pytest.mark.parametrize(("task", "space", "action"), NONE)
-def test_what_is_no_action_is_refused_and_changes_nothing(task, space, action):
+def test_an_invalid_action_raises_and_changes_nothing(task, space, action):
     env = ours(task)
     env.reset(seed=0)
     state = env.unwrapped.state
@@ -56,7 +56,7 @@ def test_what_is_no_action_is_refused_and_changes_nothing(task, space, action):
 @pytest.mark.parametrize(
     ("task", "weight"), [("pendulum", 0.001), ("mountain_car_continuous", 0.1)]
 )
-def test_the_reward_charges_the_force_that_was_delivered(task, weight):
+def test_the_reward_has_the_cost_of_the_delivered_force(task, weight):
     definition, env = TASKS[task], ours(task, actuator="weaker")
     env.reset(seed=0)
     for _ in range(3):
@@ -68,7 +68,7 @@ def test_the_reward_charges_the_force_that_was_delivered(task, weight):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_batch_of_states_is_many_single_states(task):
+def test_functions_give_the_same_for_batches_and_single_states(task):
     definition, generator = TASKS[task], np.random.default_rng(0)
     before, after = generator.uniform(-1, 1, (2, 7, len(definition.state_names)))
     forces = generator.uniform(-1, 1, 7)

@@ -1,4 +1,4 @@
-"""What a step keeps: walls in the middle of a step, and no bound that makes a lost state look like any other."""
+"""Bounds within a step: walls, and diverged states that must stay visible."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from tests.tasks.faces import NEW, WITH_HILL, random_states
 
 
 @pytest.mark.parametrize("task", NEW)
-def test_a_step_from_states_beyond_every_bound_is_gymnasiums(task):
+def test_a_step_from_beyond_all_bounds_equals_gymnasiums(task):
     definition = TASKS[task]
     arguments = definition, [IDEAL], 1, definition.integrators[0]
     pair = (
@@ -33,14 +33,18 @@ def test_a_step_from_states_beyond_every_bound_is_gymnasiums(task):
 @pytest.mark.parametrize(
     ("state", "wall", "stops"),
     [
-        ([-1.19, -0.07], -1.2, True),  # inelastic
-        ([0.59, 0.07], 0.6, False),  # the right end stops the car, not its speedometer
+        # The left wall is inelastic.
+        ([-1.19, -0.07], -1.2, True),
+        # The right end stops the car, but its speed stays.
+        ([0.59, 0.07], 0.6, False),
     ],
 )
 def test_walls(task, inner_steps, state, wall, stops):
     definition = TASKS[task]
-    one = dataclasses.replace(definition, step_duration=definition.step_duration / inner_steps)
-    physics = MujocoPhysics(SimulationConfig(one, [IDEAL], 1, "semi-implicit"))
+    short_task = dataclasses.replace(
+        definition, step_duration=definition.step_duration / inner_steps
+    )
+    physics = MujocoPhysics(SimulationConfig(short_task, [IDEAL], 1, "semi-implicit"))
     physics.reset(np.array(state))
     for _ in range(inner_steps):
         physics.step(np.sign(state[1]) * definition.max_force)
@@ -52,17 +56,18 @@ def test_walls(task, inner_steps, state, wall, stops):
 
 @pytest.mark.parametrize("value", [0.9e10, np.nan, np.inf, -np.inf, 1.01e10])
 @pytest.mark.parametrize("task", NEW)
-def test_bounds_let_a_diverged_state_through(task, value):
-    """Compiled, nothing of it passes for a state; but 0.9e10 is large and a number that the engine takes."""
+def test_bounds_do_not_hide_a_diverged_state(task, value):
+    """The compiled bounds turn it into NaN; 0.9e10 is large, but the engine accepts it."""
     definition = TASKS[task]
     order = tuple(definition.qpos), tuple(definition.qvel)
     keep = compiled_constrain(definition.constrain, definition.state_names, *order)
     for state in np.where(np.eye(len(definition.state_names)), value, 0.0):
-        kept = state[list(definition.qpos)], state[list(definition.qvel)]
-        keep(*kept, np.empty_like(state), 0.1)
-        with np.errstate(invalid="ignore"):  # inf - inf
+        bounded = state[list(definition.qpos)], state[list(definition.qvel)]
+        keep(*bounded, np.empty_like(state), 0.1)
+        # The difference inf - inf is invalid.
+        with np.errstate(invalid="ignore"):
             plain = np.array(definition.constrain(state, 0.1))
-        for found, entries in zip(kept, order, strict=True):
+        for part, entries in zip(bounded, order, strict=True):
             expected = plain[list(entries)] if value == 0.9e10 else np.full(len(entries), np.nan)
-            np.testing.assert_array_equal(found, expected)
+            np.testing.assert_array_equal(part, expected)
         assert np.isnan(plain[np.isnan(state)]).all()

@@ -1,4 +1,4 @@
-"""With the ideal actuator an environment is Gymnasium's: same starts, states, rewards and ends."""
+"""With the ideal actuator an environment equals Gymnasium's: starts, states, rewards, ends."""
 
 import gymnasium as gym
 import numpy as np
@@ -9,7 +9,7 @@ from tests.tasks.faces import actions, every_rebuilt, gymnasiums, ours, random_s
 
 
 def compare(task, seed, choose, states_to, steps=None):
-    """Both environments with the same actions to the end of Gymnasium's episode, or for some steps: how it ended."""
+    """Run both environments with the same actions; return how Gymnasium's episode ended."""
     pair = ours(task, actuator="ideal"), gymnasiums(task)
     observations = [env.reset(seed=seed)[0] for env in pair]
     np.testing.assert_allclose(*observations, rtol=0, atol=1e-7)
@@ -68,8 +68,8 @@ def test_an_episode_that_reaches_the_goal(task, states_to, seed):
 
 
 @every_rebuilt
-def test_reward_and_end_of_a_step_are_gymnasiums_all_over_the_state_space(task):
-    pair, seen = (ours(task, actuator="ideal").unwrapped, gymnasiums(task).unwrapped), []
+def test_reward_and_end_equal_gymnasiums_in_the_whole_state_space(task):
+    pair, terminations = (ours(task, actuator="ideal").unwrapped, gymnasiums(task).unwrapped), []
     for env in pair:
         env.reset(seed=0)
     for state, action in zip(random_states(task, 0, 1000), actions(task, 0, 1000), strict=True):
@@ -80,8 +80,8 @@ def test_reward_and_end_of_a_step_are_gymnasiums_all_over_the_state_space(task):
         assert reward == pytest.approx(
             expected, rel=0, abs=1e-5 if task == "mountain_car_continuous" else 1e-9
         )
-        seen.append(terminated)
-    assert task == "pendulum" or 0 < sum(seen) < len(seen)
+        terminations.append(terminated)
+    assert task == "pendulum" or 0 < sum(terminations) < len(terminations)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_reward_and_end_of_a_step_are_gymnasiums_all_over_the_state_space(task):
         ("mountain_car_continuous", {"low": -0.55}),
     ],
 )
-def test_reset_options_draw_what_gymnasium_draws(task, options):
+def test_reset_options_give_gymnasiums_initial_states(task, options):
     env, reference = ours(task), gymnasiums(task)
     for seed in range(5):
         env.reset(seed=seed, options=options)

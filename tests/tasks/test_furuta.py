@@ -1,4 +1,4 @@
-"""Furuta: its mechanics against Lagrange's equations by computer algebra, its motor, and every face of it."""
+"""Furuta: mechanics against Lagrange's equations by computer algebra, motor, and environments."""
 
 import functools
 import itertools
@@ -23,11 +23,12 @@ from codrl_mj.sizing.scripted import Scripted, state_observed
 from codrl_mj.tasks import TASKS, resolve_actuators
 from codrl_mj.tasks.furuta import MAX_TORQUE, ReferenceEnv
 from tests.envs.vectors import MODES, assert_equal_episodes, batched, looped
-from tests.matrix import but
+from tests.matrix import matrix_params
 
 TASK = TASKS["furuta"]
 ROTOR = 4e-6
-NUMBERS = {  # the manual's; the damping is quanser_robots'
+# The manual's numbers; the damping is that of quanser_robots.
+NUMBERS = {
     "arm_mass": 0.095,
     "arm_length": 0.085,
     "rod_mass": 0.024,
@@ -43,10 +44,10 @@ every_actuator = pytest.mark.parametrize("actuator", ["default", "ideal"])
 
 @functools.cache
 def lagrange():
-    """Accelerations of arm and rod, from the positions and the turning of their parts alone.
+    """Return the accelerations of arm and rod, from positions and rotations of their parts only.
 
-    The rod is integrated over its length: no theorem of parallel axes, and no moment of inertia but
-    that of its axis.
+    The rod is integrated over its length: without the theorem of parallel axes, and with no moment
+    of inertia other than that of its axis.
     """
     theta, alpha, w, v, a1, a2, torque, s = sympy.symbols("theta alpha w v a1 a2 torque s")
     arm_mass, arm, mass, rod, r, hub, c, d, g = symbols = sympy.symbols(list(NUMBERS))
@@ -87,15 +88,15 @@ def states(count, seed=0):
     return np.random.default_rng(seed).uniform([-3, -7, -30, -40], [3, 7, 30, 40], (count, 4))
 
 
-def off(found, expected):
-    return (np.abs(found - expected) / np.maximum(1.0, np.abs(expected))).max()
+def max_error(actual, expected):
+    return (np.abs(actual - expected) / np.maximum(1.0, np.abs(expected))).max()
 
 
-# -- the mechanics ------------------------------------------------------------------------------------------
+# -- the mechanics ---------------------------------------------------------------------------------
 
 
 @every_actuator
-def test_the_engines_accelerations_are_lagranges(actuator):
+def test_the_engines_accelerations_equal_lagranges(actuator):
     physics = MujocoPhysics(SimulationConfig(TASK, resolve_actuators(actuator, TASK), 10, "rk4"))
     model, data = physics.model, mujoco.MjData(physics.model)
     hub = NUMBERS["hub"] + (ROTOR if actuator == "default" else 0.0)
@@ -106,13 +107,13 @@ def test_the_engines_accelerations_are_lagranges(actuator):
         data.qpos[:], data.qvel[:] = state[:2], state[2:]
         data.qfrc_applied[0] = torque
         mujoco.mj_forward(model, data)
-        assert off(data.qacc, accelerations(state, torque, hub=hub)) < 1e-11
+        assert max_error(data.qacc, accelerations(state, torque, hub=hub)) < 1e-11
 
 
-def test_the_closed_form_is_lagranges():
+def test_the_closed_form_equals_lagranges_equations():
     twin = ReferenceEnv()
     for state in states(300, seed=2):
-        assert off(twin.derivative(state, 0.05)[2:], accelerations(state, 0.05)) < 1e-11
+        assert max_error(twin.derivative(state, 0.05)[2:], accelerations(state, 0.05)) < 1e-11
 
 
 @pytest.mark.parametrize(
@@ -125,18 +126,18 @@ def test_the_closed_form_is_lagranges():
         ("gravity", 1.62),
     ],
 )
-def test_a_number_that_is_set_is_lagranges(name, value):
+def test_accelerations_with_a_changed_number_equal_lagranges(name, value):
     env = gymnasium.make(TASK.env_id, actuator="ideal").unwrapped
     assert getattr(env, name) == pytest.approx(NUMBERS[name])
     setattr(env, name, value)
     for state in states(20, seed=3):
         env.data.qpos[:], env.data.qvel[:] = state[:2], state[2:]
         mujoco.mj_forward(env.model, env.data)
-        assert off(env.data.qacc, accelerations(state, 0.0, **{name: value})) < 1e-10
+        assert max_error(env.data.qacc, accelerations(state, 0.0, **{name: value})) < 1e-10
 
 
-def test_energy_is_kept_over_an_episode_without_damping():
-    """As `docs/environments/furuta.md` says: 1e-7 of what lifts the rod, 1 % with one integration step a step."""
+def test_energy_is_conserved_without_damping():
+    """As `docs/environments/furuta.md` states: 1e-7 of the rod's lift, 1 % with one inner step."""
     physics = {
         count: MujocoPhysics(SimulationConfig(TASK, [IDEAL], count, "rk4")) for count in (10, 1)
     }
@@ -157,10 +158,10 @@ def test_energy_is_kept_over_an_episode_without_damping():
     assert 1e-3 < lost[1] < 2e-2
 
 
-# -- its motor ----------------------------------------------------------------------------------------------
+# -- its motor -------------------------------------------------------------------------------------
 
 
-def test_its_own_actuator_is_the_motor_of_the_catalogue_at_every_door():
+def test_the_default_actuator_is_the_motor_of_the_catalog():
     motor = Drive.of(motor_entry("quanser-qube-servo-2").numbers)
     assert (motor.supply.voltage, motor.controller.max_current) == (18.0, 2.0)
     assert motor.motor.torque_constant * motor.controller.max_current == pytest.approx(MAX_TORQUE)
@@ -174,7 +175,7 @@ def test_its_own_actuator_is_the_motor_of_the_catalogue_at_every_door():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         *(
             (
@@ -190,17 +191,17 @@ def test_its_own_actuator_is_the_motor_of_the_catalogue_at_every_door():
         ),
     ],
 )
-def test_what_it_has_not_is_refused(arguments, said):
-    with pytest.raises(ValueError, match=said):
+def test_unsupported_arguments_raise(arguments, message):
+    with pytest.raises(ValueError, match=message):
         gymnasium.make(TASK.env_id, **arguments)
 
 
 @pytest.mark.parametrize(
     ("command", "unit"),
-    but([("force", 1.0)], [("force", 1.0), ("current", 0.042), ("voltage", 0.042 / 8.4)]),
+    matrix_params([("force", 1.0)], [("force", 1.0), ("current", 0.042), ("voltage", 0.042 / 8.4)]),
 )
-def test_a_command_is_delivered_or_what_its_winding_makes_of_it(command, unit):
-    """The arm is as good as locked, so that the current of a voltage is u/R after a few L/R = 0.14 ms."""
+def test_a_command_is_delivered_through_the_winding(command, unit):
+    """The arm is practically locked, so a voltage's current is u/R after a few L/R = 0.14 ms."""
     env = gymnasium.make(TASK.env_id, action=command, joint={"armature": 1e3})
     env.reset(seed=0, options={"low": 0.0, "high": 1e-12})
     action = 0.5 * env.action_space.high
@@ -209,14 +210,14 @@ def test_a_command_is_delivered_or_what_its_winding_makes_of_it(command, unit):
 
 
 def test_a_delayed_command_arrives_late():
-    """By a step, in which the motor turns so little that its back-EMF is less than a tenth of the volt."""
+    """Within a step the motor turns so little that its back-EMF is below a tenth of a volt."""
     env = gymnasium.make(TASK.env_id, action="voltage", disturbances={"command_delay": 0.02})
     env.reset(seed=0)
     forces = [env.step(np.ones(1, np.float32))[4]["actual_force"] for _ in range(2)]
     assert forces == pytest.approx([0.0, 0.042 / 8.4], rel=0.1, abs=1e-4)
 
 
-# -- the task -----------------------------------------------------------------------------------------------
+# -- the task --------------------------------------------------------------------------------------
 
 
 def test_reward_goal_and_end():
@@ -233,14 +234,14 @@ def test_reward_goal_and_end():
     ] == [0, 0, 1, 1]
 
 
-def test_it_starts_hanging_within_what_a_reset_asks_for():
+def test_episodes_start_hanging_within_the_reset_options():
     env = gymnasium.make(TASK.env_id)
-    for options, most in ((None, 0.05), ({"low": -0.5, "high": 0.5}, 0.5)):
+    for options, bound in ((None, 0.05), ({"low": -0.5, "high": 0.5}, 0.5)):
         starts = []
         for seed in range(20):
             env.reset(seed=seed, options=options)
             starts.append(env.unwrapped.state - [0.0, math.pi, 0.0, 0.0])
-        assert 0.8 * most < np.abs(starts).max() <= most
+        assert 0.8 * bound < np.abs(starts).max() <= bound
 
 
 @every_actuator
@@ -251,7 +252,7 @@ def test_the_scripted_controller_swings_up_and_balances(actuator):
     assert summarize("furuta", episodes).success.mean == 1.0
 
 
-# -- the faces ----------------------------------------------------------------------------------------------
+# -- the faces -------------------------------------------------------------------------------------
 
 
 @every_actuator
@@ -262,7 +263,7 @@ def test_the_scripted_controller_swings_up_and_balances(actuator):
         (check_env_sb3, "symmetric and normalized Box action"),
     ],
 )
-def test_checkers_say_what_they_say_of_gymnasiums_cart_pole_and_pendulum(check, allowed, actuator):
+def test_checkers_report_the_same_as_for_gymnasiums_environments(check, allowed, actuator):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", f".*{allowed}")
@@ -282,12 +283,12 @@ FACES = {
 
 @pytest.mark.parametrize(
     ("face", "mode"),
-    but(
+    matrix_params(
         [*zip(FACES, itertools.cycle(MODES)), ("torque", MODES[1]), ("torque", MODES[2])],
         itertools.product(FACES, MODES),
     ),
 )
-def test_a_batch_is_single_environments_bit_for_bit(face, mode):
+def test_a_batch_equals_single_environments_bit_for_bit(face, mode):
     arguments = FACES[face]
     ends = assert_equal_episodes(
         batched("furuta", 3, mode, **arguments), looped("furuta", 3, mode, **arguments), 60
@@ -296,7 +297,7 @@ def test_a_batch_is_single_environments_bit_for_bit(face, mode):
 
 
 def test_the_picture_follows_the_rod():
-    """Orange, in the middle of the picture: below the arm's end while the rod hangs, above it upright."""
+    """The orange rod is below the arm's end while it hangs, and above it when it is upright."""
     env = gymnasium.make(TASK.env_id, render_mode="rgb_array", width=160, height=160)
     env.reset(seed=0)
     heights = []

@@ -1,4 +1,4 @@
-"""The mountain cars' hill: its force, and the car that is drawn on it."""
+"""The mountain cars' hill: its force, and the drawing of the car on it."""
 
 import mujoco
 import numpy as np
@@ -12,7 +12,8 @@ from codrl_mj.physics import MujocoPhysics, SimulationConfig, hills, install_cal
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import WITH_HILL, ours
 
-HEIGHT, WAVENUMBER, MIDDLE = 0.45, 3.0, 0.55  # what Gymnasium draws
+# The hill as Gymnasium draws it.
+HEIGHT, WAVENUMBER, MIDDLE = 0.45, 3.0, 0.55
 
 _SLED = """
 <mujoco>
@@ -52,7 +53,7 @@ def with_hill(bare_engine):
 @pytest.mark.parametrize("task", WITH_HILL)
 @pytest.mark.parametrize("actuator", ["ideal", "paper"])
 def test_without_the_callback_there_is_no_hill(task, actuator, bare_engine):
-    """On/off pair: from rest at x = -0.2 the hill drives the car back; without it nothing does."""
+    """From rest at x = -0.2 the hill drives the car back; without the callback it stays."""
     speeds = []
     for remove in (False, True):
         env = ours(task, actuator=actuator).unwrapped
@@ -67,7 +68,7 @@ def test_without_the_callback_there_is_no_hill(task, actuator, bare_engine):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_only_models_with_a_hill_install_the_callback(task, bare_engine):
+def test_only_models_with_a_hill_install_its_callback(task, bare_engine):
     env = ours(task, actuator="ideal").unwrapped
     assert engine.installed("hill") == (task in WITH_HILL) == bool(hills(env.model))
     assert not engine.installed("motor")
@@ -88,7 +89,7 @@ def test_the_force_is_a_function_of_the_position(with_hill):
 
 @pytest.mark.parametrize("turned", ["", 'euler="20 -30 40"'])
 def test_the_bodys_geoms_ride_on_the_hill(turned, with_hill):
-    """Against the same body lifted and turned by the engine itself."""
+    """Compare with a body that the engine itself lifts and rotates."""
     model, data = _sled(turned)
     mujoco.mj_forward(model, data)
     plain, placed = _sled(turned, user="")
@@ -116,7 +117,7 @@ def test_the_bodys_geoms_ride_on_the_hill(turned, with_hill):
         (_OURS, mujoco.mjtJoint.mjJNT_HINGE),
     ],
 )
-def test_foreign_models_are_left_alone(user, kind, bare_engine):
+def test_the_hill_callback_does_not_change_other_models(user, kind, bare_engine):
     trajectories = []
     for parts in ((), ("hill", "motor")):
         if parts:
@@ -132,7 +133,7 @@ def test_foreign_models_are_left_alone(user, kind, bare_engine):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         (
             {"user": f'user="{_SIGNATURE} 1"'},
@@ -141,12 +142,12 @@ def test_foreign_models_are_left_alone(user, kind, bare_engine):
         ({"axis": 'axis="0 1 0"'}, 'a hill of codrl_mj needs type="slide" and axis="1 0 0"'),
     ],
 )
-def test_a_joint_that_misuses_the_signature_is_named(wrong, said):
-    with pytest.raises(ValueError, match=f"sled: {said}"):
+def test_a_joint_with_a_wrong_signature_raises(wrong, message):
+    with pytest.raises(ValueError, match=f"sled: {message}"):
         hills(_sled(**wrong)[0])
 
 
-def test_somebody_elses_callback_is_not_replaced(bare_engine):
+def test_callbacks_of_other_libraries_are_not_replaced(bare_engine):
     def foreign(model, data):
         pass
 
@@ -165,7 +166,7 @@ def test_somebody_elses_callback_is_not_replaced(bare_engine):
 @pytest.mark.parametrize("x", [-1.2, -np.pi / 6, -0.1, 0.3, 0.5])
 @pytest.mark.parametrize("after", ["render", "mj_forward", "mj_step"])
 def test_the_car_follows_the_hill(task, x, after):
-    """What our renders draw, and what any viewer draws after the engine's own functions."""
+    """Check our renderings, and the poses that any viewer draws after the engine's functions."""
     definition = TASKS[task]
     physics = MujocoPhysics(SimulationConfig(definition, [IDEAL], 1, "semi-implicit"))
     physics.reset(np.array([x, 0.0]))
@@ -183,7 +184,7 @@ def test_the_car_follows_the_hill(task, x, after):
 
 
 @pytest.mark.parametrize("task", WITH_HILL)
-def test_the_drawn_hill_is_the_one_the_car_follows(task):
+def test_the_drawn_hill_is_that_of_the_callback(task):
     model = MujocoPhysics(SimulationConfig(TASKS[task], [IDEAL], 1, "semi-implicit")).model
     (joint,) = hills(model)
     np.testing.assert_array_equal(model.jnt_user[joint], [*SIGNATURE, 0.0025, WAVENUMBER, HEIGHT])

@@ -1,4 +1,4 @@
-"""The stored models: each opens without us, and holds the paper's actuator where its task has one."""
+"""The stored models open without this package, and contain the paper's actuators."""
 
 import mujoco
 import numpy as np
@@ -10,7 +10,7 @@ from codrl_mj.user_code import asset_path
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_stored_model_opens_without_us_and_holds_the_papers_actuator(task, bare_engine):
+def test_a_stored_model_opens_without_the_package_and_has_the_papers_actuator(task, bare_engine):
     definition = TASKS[task]
     model = mujoco.MjModel.from_xml_path(str(asset_path(definition.asset)))
     data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""Tiny trainings of every agent, ways to end them, and what must be equal in the end."""
+"""Tiny trainings of all agents, interruptions, and results that must be equal."""
 
 import contextlib
 import functools
@@ -13,12 +13,12 @@ from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.files import sealed, write_json
 from codrl_mj.training import TrainConfig, TrainingStoppedError, train
-from codrl_mj.training.folder import admit
+from codrl_mj.training.folder import prepare_run
 from codrl_mj.training.watcher import Watcher
 
 
 def _kill_test():
-    """scripts/kill_test.py, which does the same to the program."""
+    """Import scripts/kill_test.py, which does the same with the program."""
     path = Path(__file__).parents[2] / "scripts" / "kill_test.py"
     spec = importlib.util.spec_from_file_location("kill_test", path)
     module = sys.modules["kill_test"] = importlib.util.module_from_spec(spec)
@@ -31,12 +31,14 @@ outcome, differing = kill_test.outcome, kill_test.differing
 
 
 def begin(run, config):
-    """Leave a run folder in which a training has begun, and nothing is learned."""
-    write_json(run / "config.json", sealed(admit(run, config, resume=False, accept_changes=False)))
+    """Create a run folder in which a training has started and nothing is learned."""
+    write_json(
+        run / "config.json", sealed(prepare_run(run, config, resume=False, accept_changes=False))
+    )
 
 
 def tiny(task, agent, num_envs=1, actuator="paper", total_episodes=None, **env):
-    """A training of about a second, with three or four checkpoints and evaluations."""
+    """Return a training of about a second, with three or four checkpoints and evaluations."""
     often = {"checkpoint_interval": 60, "evaluation_interval": 80, "evaluation_episodes": 2}
     budget = {"total_steps": None if total_episodes else 240, "total_episodes": total_episodes}
     env = EnvConfig(task, actuator, max_episode_steps=25, **env)
@@ -63,7 +65,7 @@ DISTURBED = {
 }
 NOISY = {"controller": {"current_noise": 0.1, "current_bias": 0.05}}
 NOISY_PAPER = {"name": "paper", **NOISY}
-"""Actuators with what a sensor of the current gets wrong."""
+"""Actuators with errors of the current sensor."""
 
 CASES = {
     "ppo, one optimiser": tiny(
@@ -125,11 +127,11 @@ CASES = {
         physics="analytic",
     ),
 }
-"""Every agent, alone and with several environments, on both physics, with everything that an environment can have."""
+"""Trainings of all agents, with one and several environments, both physics, and all features."""
 
 
 class Crash(BaseException):
-    """The end of a process, as far as a test within one can have it."""
+    """Error that stands for the end of a process within a test."""
 
 
 def crash(*_):
@@ -143,7 +145,7 @@ TERMINATE, INTERRUPT = (
 
 @contextlib.contextmanager
 def after(steps, act):
-    """Act once when a training has taken some environment steps within the block."""
+    """Act once in a block, when a training has taken some environment steps."""
     original, due = Watcher._on_step, None
 
     def counting(watcher):
@@ -163,10 +165,10 @@ def after(steps, act):
 
 
 def interrupt(config, out, steps, act):
-    """Start or continue a training that ends early: it acts when it has taken some steps.
+    """Start or continue a training that ends early, by an action after some steps.
 
     Returns:
-        The message of a training that was asked to stop; None if it crashed.
+        The message of a training that was stopped; None if it crashed.
     """
     try:
         with after(steps, act):

@@ -1,4 +1,4 @@
-"""What cannot be trained, continued or loaded costs one line that says why and what to do, and changes nothing."""
+"""Invalid input gives one line with the reason and the remedy, and changes nothing."""
 
 import json
 import shutil
@@ -21,41 +21,42 @@ TYPO, OTHER = "task: cartpole\ntotal_step: 5", "task: cartpole\nagent: {name: pp
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A folder with what the command lines speak of: finished and unfinished runs, a policy alone, others' files."""
-    place = tmp_path_factory.mktemp("made")
-    do(f"train cartpole --agent ppo {TINY} --out {place / 'run'}")
+def source_folder(tmp_path_factory):
+    """Return a folder with the files of the command lines: runs, a policy, files of others."""
+    folder = tmp_path_factory.mktemp("source")
+    do(f"train cartpole --agent ppo {TINY} --out {folder / 'run'}")
     for name in ("unfinished", "cut", "little", "unversioned"):
-        shutil.copytree(place / "run", place / name)
+        shutil.copytree(folder / "run", folder / name)
         for file in ("result.json", *POLICY):
-            (place / name / file).unlink()
-    (place / "cut/config.json").write_text("{")
-    (place / "little/config.json").write_text('{"train": {"task": "cartpole"}}')
-    edit(place / "unversioned/config.json", versions=lambda _: 5)
+            (folder / name / file).unlink()
+    (folder / "cut/config.json").write_text("{")
+    (folder / "little/config.json").write_text('{"train": {"task": "cartpole"}}')
+    edit(folder / "unversioned/config.json", versions=lambda _: 5)
     for name in ("alone", "empty"):
-        (place / name).mkdir()
+        (folder / name).mkdir()
     for name in POLICY:
-        shutil.copy(place / "run" / name, place / "alone")
+        shutil.copy(folder / "run" / name, folder / "alone")
     PPO("MlpPolicy", gymnasium.make("CartPole-v1"), n_steps=8, batch_size=8).save(
-        place / "model.zip"
+        folder / "model.zip"
     )
-    (place / "typo.yaml").write_text(TYPO)
-    (place / "other.yaml").write_text(OTHER)
-    return place
+    (folder / "typo.yaml").write_text(TYPO)
+    (folder / "other.yaml").write_text(OTHER)
+    return folder
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(made, tmp_path, monkeypatch):
-    """A copy of it is where the test runs."""
+def in_copied_folder(source_folder, tmp_path, monkeypatch):
+    """Run the test in a copy of the folder."""
     monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
-    monkeypatch.chdir(shutil.copytree(made, tmp_path / "copy"))
+    monkeypatch.chdir(shutil.copytree(source_folder, tmp_path / "copy"))
 
 
 def edit(config, **changes):
     content = json.loads(config.read_text())
     for name, change in changes.items():
         content[name] = change(content[name])
-    del content["sha256"]  # it is edited on purpose
+    # Without its digest, an edited file is not reported as damaged.
+    del content["sha256"]
     config.write_text(json.dumps(content))
 
 
@@ -67,8 +68,8 @@ def do(line):
     assert main(line.split()) == 0
 
 
-def refused(capsys, *line):
-    """The one line that bad input costs; nothing is written."""
+def error_of(capsys, *line):
+    """Return the single line of error of bad input; nothing may be written."""
     before = files()
     capsys.readouterr()
     assert main([*line]) == 2
@@ -92,8 +93,8 @@ def refused(capsys, *line):
         ("--out elsewhere", "a run continues in its own folder, {}"),
     ],
 )
-def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
-    assert expected.format(run) in refused(capsys, "train", "--resume", run, *flags.split())
+def test_flags_that_contradict_a_run_raise(capsys, run, flags, expected):
+    assert expected.format(run) in error_of(capsys, "train", "--resume", run, *flags.split())
 
 
 @pytest.mark.parametrize(
@@ -110,7 +111,7 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
             "train --resume unversioned",
             "unversioned/config.json: not a run configuration: versions = 5",
         ),
-        # no training
+        # Not a training.
         ("train pendulum --agent sarsa", "agents that can: ppo, ddpg, td3, sac"),
         ("train pendulum --agent dqn", "cannot act in the Box actions of pendulum"),
         ("train acrobot --agent ddpg", "agents that can: ppo, dqn, sarsa"),
@@ -127,7 +128,7 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
             "train --no-tensorboard pendulum",
             "name the task before the flags, as in codrl-mj train pendulum",
         ),
-        # no command line
+        # Not a command line.
         (
             "train cartpole --settings printed",
             "--settings printed: must be one of default, paper, repaired",
@@ -141,7 +142,7 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
             "unknown flag --agent.gama: did you mean '--agent.gamma'?",
         ),
         ("train", "codrl-mj train needs TASK"),
-        # no policy of that task or agent, or only one
+        # No policy of this task or agent, or only one.
         ("evaluate unfinished", "unfinished is not finished"),
         (
             "evaluate unfinished",
@@ -152,7 +153,7 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
         ("evaluate alone", "name its task with --task"),
         ("evaluate alone --task pendulum", "observation_space: the policy was trained with Box"),
         ("evaluate alone --task cartpole --which best", "leave --which out"),
-        # a zip does not say what it is, and is loaded only on trust
+        # A zip file may contain code, and is loaded only with --trust.
         ("evaluate model.zip --task cartpole --agent ppo", "Pass --trust if that author is you"),
         (
             "render model.zip --task cartpole --agent ppo --out film.gif",
@@ -172,37 +173,42 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
         ),
     ],
 )
-def test_what_cannot_be_done_is_named(capsys, line, expected):
-    assert expected in refused(capsys, *line.split())
+def test_impossible_commands_raise(capsys, line, expected):
+    assert expected in error_of(capsys, *line.split())
 
 
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
         ({"code": lambda _: "0123456789abcdef"}, "the code of codrl_mj was 01234567, is "),
-        ({"versions": lambda there: there | {"torch": "1.13"}}, "torch was 1.13, is 2."),
-        ({"versions": lambda there: there | {"cython": "3"}}, "cython was 3, is absent"),
+        ({"versions": lambda versions: versions | {"torch": "1.13"}}, "torch was 1.13, is 2."),
+        ({"versions": lambda versions: versions | {"cython": "3"}}, "cython was 3, is absent"),
         (
-            {"versions": lambda there: {name: there[name] for name in there if name != "numpy"}},
+            {
+                "versions": lambda versions: {
+                    name: versions[name] for name in versions if name != "numpy"
+                }
+            },
             "numpy was absent, is ",
         ),
     ],
     ids=["code", "version", "package gone", "package new"],
 )
-def test_other_software_is_named_and_can_be_accepted(capsys, changes, expected):
+def test_other_software_raises_and_can_be_accepted(capsys, changes, expected):
     edit(Path("unfinished/config.json"), **changes)
-    error = refused(capsys, "train", "--resume", "unfinished")
+    error = error_of(capsys, "train", "--resume", "unfinished")
     assert expected in error
-    assert error.count(" was ") == 2  # it "was started" with one other thing
-    assert "accept it with --accept-changes" in error
+    # The message has "was started" and a single difference.
+    assert error.count(" was ") == 2
+    assert "accept the change with --accept-changes" in error
     do("train --resume unfinished --accept-changes")
     assert Path("unfinished/result.json").exists()
 
 
-# -- what is done -------------------------------------------------------------------------------------------
+# -- what is done ----------------------------------------------------------------------------------
 
 
-def test_a_finished_run_is_left_alone(capsys):
+def test_a_finished_run_is_not_changed(capsys):
     before = files()
     do("train --resume run")
     assert "run is finished already" in capsys.readouterr().out
@@ -225,11 +231,11 @@ def test_a_finished_run_is_left_alone(capsys):
         ),
     ],
 )
-def test_what_is_enough_is_taken(line):
+def test_minimal_input_is_accepted(line):
     do(line)
 
 
-def test_a_policy_alone_is_that_of_its_run_and_the_best_one_another_file():
+def test_a_separate_policy_equals_that_of_its_run_and_the_best_one_differs():
     do("evaluate alone --task cartpole --episodes 3 --out alone.json")
     do("evaluate run --episodes 3 --out run.json")
     assert Path("alone.json").read_bytes() == Path("run.json").read_bytes()
@@ -238,7 +244,7 @@ def test_a_policy_alone_is_that_of_its_run_and_the_best_one_another_file():
     do("evaluate run --which best --episodes 1")
 
 
-def test_flags_win_over_the_file_and_leave_the_rest_of_it():
+def test_flags_override_the_files_values_only():
     Path("train.yaml").write_text(
         "task: cartpole\nseed: 5\nagent: {name: ppo, gamma: 0.9, learning_rate: 3e-4,"
         " rollout_steps: 64}\nactuator: {name: weaker, controller: {kp: 0.3}}\nenv: {center_radius:"
@@ -253,7 +259,7 @@ def test_flags_win_over_the_file_and_leave_the_rest_of_it():
     assert (config.env.options.center_radius, config.env.inner_steps) == (0.2, 2)
 
 
-def test_the_task_is_found_behind_flags_and_beside_folders_of_its_name():
+def test_the_task_is_found_after_flags_and_beside_a_folder_of_its_name():
     flags = "--evaluation-episodes 1 --no-tensorboard --agent.learning-starts 10"
     do(f"train --out pendulum --total-steps 10 pendulum {flags}")
     config = load_config(Path("pendulum"))

@@ -1,4 +1,4 @@
-"""Damaged files in a run folder: the run goes back to what is intact, says so, and comes to the same result."""
+"""A run with damaged files continues from intact ones, warns, and gives the same result."""
 
 import contextlib
 import dataclasses
@@ -52,7 +52,7 @@ def stopped_once(tmp_path_factory):
 
 @pytest.fixture
 def stopped(stopped_once, tmp_path):
-    """A run that was stopped after 192 of 240 steps, with two checkpoints."""
+    """Return a run that was stopped after 192 of 240 steps, with two checkpoints."""
     return shutil.copytree(stopped_once, tmp_path / "run")
 
 
@@ -60,7 +60,7 @@ def checkpoints(out):
     return sorted((out / "checkpoints").iterdir())
 
 
-# -- what is damaged ----------------------------------------------------------------------------------------
+# -- what is damaged -------------------------------------------------------------------------------
 
 
 def flip_a_bit(content):
@@ -68,12 +68,12 @@ def flip_a_bit(content):
 
 
 def last(change):
-    """Damage that changes the last checkpoint's content."""
+    """Return a function that changes the content of the last checkpoint."""
     return lambda out: checkpoints(out)[-1].write_bytes(change(checkpoints(out)[-1].read_bytes()))
 
 
 def forged(content):
-    """Damage that replaces the last checkpoint by what has the right digest in its name, and nothing else."""
+    """Return a function that replaces the last checkpoint by content with a valid digest only."""
 
     def replace(out):
         path = checkpoints(out)[-1]
@@ -85,7 +85,7 @@ def forged(content):
 
 
 def replace_by_another_runs(out):
-    """Checkpoints that are intact, of a run with another seed."""
+    """Replace the checkpoints by intact ones of a run with another seed."""
     interrupt(dataclasses.replace(CONFIG, seed=4), out.parent / "other", 180, TERMINATE)
     shutil.rmtree(out / "checkpoints")
     shutil.copytree(out.parent / "other/checkpoints", out / "checkpoints")
@@ -96,13 +96,13 @@ def cut(path):
 
 
 def half_a_row(table):
-    """What was flushed of a row when the process was killed."""
+    """Return a function that appends an incomplete row, as after a kill."""
     return lambda out: (out / table).write_text((out / table).read_text() + "7,1")
 
 
 BOMB = pickle.dumps(Bomb(Path("exploded")))
-BACK, ANEW = "going back to the one before", "no other is left: starting anew"
-# what is done to the run, and the remedy that is told for each checkpoint that cannot be used
+BACK, RESTART = "going back to the previous one", "there is no other: starting from the beginning"
+# The damage, and the remedy in the warning of each checkpoint that cannot be used.
 DAMAGES = {
     "truncated": (lambda out: cut(checkpoints(out)[-1]), [BACK]),
     "a bit flipped": (last(flip_a_bit), [BACK]),
@@ -111,8 +111,8 @@ DAMAGES = {
     "a pickle with the right digest": (forged(BOMB), [BACK]),
     "tensors with the right digest": (forged(save({"a": np.zeros(3)})), [BACK]),
     "another program's": (forged(save({"a": np.zeros(3)}, metadata={"format": "pt"})), [BACK]),
-    "another run's": (replace_by_another_runs, [BACK, ANEW]),
-    "all truncated": (lambda out: [*map(cut, checkpoints(out))], [BACK, ANEW]),
+    "another run's": (replace_by_another_runs, [BACK, RESTART]),
+    "all truncated": (lambda out: [*map(cut, checkpoints(out))], [BACK, RESTART]),
     "none left": (lambda out: shutil.rmtree(out / "checkpoints"), []),
     "half a report": (half_a_row("progress.csv"), []),
     "half an episode": (half_a_row("episodes.csv"), []),
@@ -120,7 +120,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_a_run_goes_back_to_what_is_intact_says_so_and_comes_to_the_same(
+def test_a_damaged_run_goes_back_to_an_intact_checkpoint_with_the_same_result(
     stopped, expected, monkeypatch, name
 ):
     monkeypatch.chdir(stopped.parent)
@@ -139,7 +139,7 @@ def test_a_run_goes_back_to_what_is_intact_says_so_and_comes_to_the_same(
     assert not Path("exploded").exists()
 
 
-# -- which checkpoints are kept -----------------------------------------------------------------------------
+# -- which checkpoints are kept --------------------------------------------------------------------
 
 
 def state_at(step, number=0):
@@ -147,26 +147,30 @@ def state_at(step, number=0):
 
 
 @pytest.mark.parametrize(
-    ("steps", "damaged", "kept"),
+    ("steps", "damaged", "remaining"),
     [
         ((10, 20, 30), None, [20, 30]),
-        ((10, 20, 20, 20), None, [10, 20]),  # beside the one before, the last of its step
-        ((10, 20, 15), 20, [10, 15]),  # of a run that fell back to 10
+        # The previous checkpoint, and the last one of its step.
+        ((10, 20, 20, 20), None, [10, 20]),
+        # The run went back to step 10.
+        ((10, 20, 15), 20, [10, 15]),
     ],
 )
-def test_the_last_two_are_kept_and_the_last_written_is_loaded(tmp_path, steps, damaged, kept):
+def test_the_last_two_checkpoints_remain_and_the_last_written_is_loaded(
+    tmp_path, steps, damaged, remaining
+):
     assert load_checkpoint(tmp_path / "nowhere", "a run") is None
     for number, step in enumerate(steps):
         path = save_checkpoint(tmp_path, state_at(step, number), "a run")
         if step == damaged:
             cut(path)
-    assert [int(path.name[5:17]) for path in sorted(tmp_path.iterdir())] == kept
+    assert [int(path.name[5:17]) for path in sorted(tmp_path.iterdir())] == remaining
     loaded = load_checkpoint(tmp_path, "a run")
     assert loaded.facts == {"num_timesteps": steps[-1], "number": len(steps) - 1}
     assert loaded.arrays["array"].tolist() == [steps[-1]] * 4
 
 
-def test_however_a_few_bytes_are_damaged_the_one_before_is_loaded_whole(tmp_path):
+def test_the_previous_checkpoint_is_loaded_after_any_damage(tmp_path):
     random_ = random.Random(0)
     for step in (10, 20):
         path = save_checkpoint(tmp_path, state_at(step), "a run")
@@ -179,12 +183,12 @@ def test_however_a_few_bytes_are_damaged_the_one_before_is_loaded_whole(tmp_path
         assert loaded.arrays["array"].tolist() == [10.0] * 4
 
 
-# -- what a killed process leaves --------------------------------------------------------------------------
+# -- what a killed process leaves ------------------------------------------------------------------
 
 
 @pytest.fixture
-def leave_half_written():
-    """Leaves what `writing` leaves if the process is killed within its block, whose end is not reached."""
+def leave_temporary_file():
+    """Leave a temporary file, as `writing` does if the process is killed in its block."""
     entered = []
 
     def leave(path):
@@ -196,7 +200,7 @@ def leave_half_written():
     return leave
 
 
-def test_what_a_killed_process_left_half_written_goes_and_nothing_else(stopped, leave_half_written):
+def test_only_temporary_files_of_a_killed_process_are_deleted(stopped, leave_temporary_file):
     names = [
         "policy.json",
         "best/policy.safetensors",
@@ -205,8 +209,8 @@ def test_what_a_killed_process_left_half_written_goes_and_nothing_else(stopped, 
         "learning_curve.png",
     ]
     names += [f"checkpoints/{checkpoints(stopped)[0].name}"]
-    ours = [leave_half_written(stopped / name) for name in names]
-    others = [leave_half_written(stopped / name) for name in ("notes.txt", "best/film.mp4")]
+    ours = [leave_temporary_file(stopped / name) for name in names]
+    others = [leave_temporary_file(stopped / name) for name in ("notes.txt", "best/film.mp4")]
     others += [
         stopped / ".policy.json",
         stopped / ".policy-old.json",
@@ -220,22 +224,22 @@ def test_what_a_killed_process_left_half_written_goes_and_nothing_else(stopped, 
     assert [path for path in others if not path.exists()] == []
 
 
-def test_a_folder_in_which_nothing_was_begun_yet_is_started(tmp_path, expected, leave_half_written):
-    """Who was to train in it was killed between taking it and writing the configuration."""
+def test_a_training_starts_in_a_locked_but_empty_folder(tmp_path, expected, leave_temporary_file):
+    """The process was killed between locking the folder and writing the configuration."""
     out = tmp_path / "run"
     out.mkdir()
     (out / ".lock").touch()
-    leave_half_written(out / "config.json")
+    leave_temporary_file(out / "config.json")
     resume(CONFIG, out)
     assert differing(expected, outcome(out)) == []
 
 
-# -- a full disk --------------------------------------------------------------------------------------------
+# -- a full disk -----------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def no_file_larger_than(size):
-    """Every write beyond that fails within the block, as it does on a full disk."""
+    """Let writes beyond a size fail within the block, as on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -245,16 +249,14 @@ def no_file_larger_than(size):
 
 
 @pytest.mark.parametrize("size", [8000, 1200, 120], ids=["checkpoint", "policy", "table"])
-def test_where_nothing_can_be_written_the_error_is_one_line_and_the_run_goes_on_later(
-    stopped, expected, capsys, size
-):
+def test_a_full_disk_gives_one_line_and_the_run_continues_later(stopped, expected, capsys, size):
     line = ["train", "--resume", str(stopped), "--no-tensorboard"]
     before = {path.name: path.read_bytes() for path in checkpoints(stopped)}
     with no_file_larger_than(size):
         assert main(line) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert error.startswith(f"codrl-mj: error: training in {stopped} was broken off: ")
+    assert error.startswith(f"codrl-mj: error: training in {stopped} was interrupted: ")
     assert "File too large" in error
     assert error.endswith(f"continue with codrl-mj train --resume {stopped}\n")
     assert {path.name: path.read_bytes() for path in checkpoints(stopped)} == before
@@ -264,10 +266,8 @@ def test_where_nothing_can_be_written_the_error_is_one_line_and_the_run_goes_on_
 
 
 @pytest.mark.parametrize("best", [False, True])
-def test_where_nothing_can_be_written_before_a_checkpoint_it_says_what_there_is(
-    tmp_path, capsys, best
-):
-    """No policy fits into so much; or the best policy does, and no checkpoint."""
+def test_a_full_disk_before_a_checkpoint_names_the_remaining_files(tmp_path, capsys, best):
+    """Either no policy fits on the disk, or the best policy does, but no checkpoint."""
     out, yaml = tmp_path / "run", tmp_path / "train.yaml"
     config = dataclasses.replace(CONFIG, checkpoint_interval=10**6) if best else CONFIG
     yaml.write_text(json.dumps(config.as_mapping()))

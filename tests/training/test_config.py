@@ -1,4 +1,4 @@
-"""Training configurations: from Python, JSON and YAML; what is wrong in them is named."""
+"""Training configurations from Python, JSON and YAML; errors name the field."""
 
 import dataclasses
 import json
@@ -9,7 +9,7 @@ import pytest
 
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Motor
 from codrl_mj.agents import AGENTS, DDPGConfig, PPOConfig
-from codrl_mj.agents.presets import ELSEWHERE, PRESETS
+from codrl_mj.agents.presets import OTHER_ENV, PRESETS
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.tasks import named_actuator
@@ -39,7 +39,7 @@ def test_a_configuration_survives_json_and_a_run_folder(tmp_path, actuator):
 @pytest.mark.parametrize(
     ("agent", "task", "settings"),
     [
-        (agent, task if task != ELSEWHERE else "InvertedPendulum-v5", name)
+        (agent, task if task != OTHER_ENV else "InvertedPendulum-v5", name)
         for (agent, task), named in PRESETS.items()
         for name in named
     ],
@@ -53,11 +53,13 @@ def test_every_preset_is_a_configuration_that_survives_json(agent, task, setting
     assert TrainConfig.from_mapping({"task": task, "agent": agent, "settings": settings}) == config
 
 
-def test_a_name_a_mapping_and_an_actuator_mean_the_same():
-    own = {"motor": {"arm_radius": 0.15}, "controller": {"kp": 0.2, "ki": 0.2}}
+def test_name_mapping_and_actuator_give_the_same_configuration():
+    fields = {"motor": {"arm_radius": 0.15}, "controller": {"kp": 0.2, "ki": 0.2}}
     over = {"name": "paper", "controller": {"kp": 0.2, "ki": 0.2, "kd": 0.0, "kff": 0.0}}
-    forms = (own, over, named_actuator("weaker", "cartpole"))
-    assert {TrainConfig(EnvConfig("cartpole", what)) for what in forms} == {TrainConfig(ENV)}
+    forms = (fields, over, named_actuator("weaker", "cartpole"))
+    assert {TrainConfig(EnvConfig("cartpole", actuator)) for actuator in forms} == {
+        TrainConfig(ENV)
+    }
     assert (
         EnvConfig("cartpole", "ideal")
         == EnvConfig("cartpole", None)
@@ -65,7 +67,7 @@ def test_a_name_a_mapping_and_an_actuator_mean_the_same():
     )
 
 
-def test_a_file_sets_fields_over_the_settings_that_it_names(tmp_path):
+def test_a_file_sets_fields_of_its_preset(tmp_path):
     path = tmp_path / "train.yaml"
     path.write_text("task: cartpole")
     default = TrainConfig.preset("cartpole", "ppo")
@@ -88,7 +90,7 @@ env:
         assert read_config(path, **overriding) == expected
 
 
-# -- what is wrong ------------------------------------------------------------------------------------------
+# -- what is wrong ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -103,7 +105,7 @@ env:
         ({"total_steps": 1e5}, "total_steps = 100000.0: must be an integer >= 1"),
         (
             {"total_steps": None},
-            "total_steps = None: must be an integer >= 1, or total_episodes must be one",
+            "total_steps = None: must be an integer >= 1 unless total_episodes is set",
         ),
         ({"num_envs": 0}, "num_envs = 0: must be an integer >= 1"),
         ({"num_envs": "8"}, "num_envs = '8': must be an integer >= 1"),
@@ -118,7 +120,7 @@ env:
         ),
     ],
 )
-def test_a_bad_field_is_named_with_its_value_and_bound(fields, message):
+def test_an_invalid_field_raises_with_its_value_and_bound(fields, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         TrainConfig(**{"env": ENV} | fields)
 
@@ -150,7 +152,7 @@ def test_the_budget_may_be_episodes():
     ],
     ids=range(12),
 )
-def test_a_damaged_run_configuration_is_named(tmp_path, content):
+def test_a_damaged_run_configuration_raises(tmp_path, content):
     path = tmp_path / "config.json"
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=rf"{path}: not a run configuration"):
@@ -189,12 +191,12 @@ def test_a_damaged_run_configuration_is_named(tmp_path, content):
         ("task: cartpole\nenv: 5", "env = 5: must be a mapping"),
         ("seed: 5", "it has no task"),
         ("task: cartpol", "did you mean 'cartpole'"),
-        ("- task", "is no mapping"),
+        ("- task", "is not a mapping"),
         ("task: [", "while parsing"),
         ("task: !!python/object/apply:os.system ['true']", "could not determine a constructor"),
     ],
 )
-def test_what_is_wrong_in_a_file_is_named(tmp_path, text, expected):
+def test_errors_in_a_file_are_named(tmp_path, text, expected):
     path = tmp_path / "train.yaml"
     path.write_text(text)
     with pytest.raises(ValueError, match=rf"(?s)^{path}: .*{re.escape(expected)}"):

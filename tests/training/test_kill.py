@@ -1,4 +1,4 @@
-"""Trainings that are killed for real, in processes of their own, and continued."""
+"""Trainings in separate processes that are killed and continued."""
 
 import gc
 import os
@@ -13,7 +13,7 @@ import pytest
 from codrl_mj.cli import main
 from codrl_mj.runs import files, policies
 from codrl_mj.training import checkpoint, folder, history, run, watcher
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.training.interruptions import differing, kill_test, outcome
 
 INTERVAL = 500
@@ -42,21 +42,23 @@ def expected(tmp_path_factory):
 
 
 def in_a_process(arguments, prepare=lambda: None):
-    """Start the command line in a copy of this process, which has everything imported and compiled.
+    """Start the command line in a fork of this process, with all imports and compiled code.
 
     Returns:
-        The process's id. What it says goes to the file `said`.
+        The process's id. Its output goes to the file `output`.
     """
     gc.collect()
     child = os.fork()
     if child == 0:
         status = 99
-        gc.freeze()  # deleting an old simulation would wait for its threads, which are not here
+        # The deletion of an old simulation would wait for its threads, which a fork does not have.
+        gc.freeze()
         try:
-            signal.alarm(60)  # whatever happens, it ends
-            said = os.open("said", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            os.dup2(said, 1)
-            os.dup2(said, 2)
+            # The process ends in any case.
+            signal.alarm(60)
+            output = os.open("output", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(output, 1)
+            os.dup2(output, 2)
             sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
             prepare()
             status = main(arguments)
@@ -72,7 +74,7 @@ def status_of(child):
 
 
 def continued(expected):
-    """Continue the run, and hold it against the uninterrupted one."""
+    """Continue the run, and compare it with the uninterrupted one."""
     assert main(["train", "--resume", "run"]) == 0
     assert differing(expected, outcome(Path("run"))) == []
     assert kill_test.hidden_files(Path("run")) == []
@@ -81,13 +83,14 @@ def continued(expected):
 STATUS = {"SIGKILL": -9, "SIGTERM": 143, "SIGINT": 130}
 
 
-@pytest.mark.parametrize("number", but(["SIGKILL"], STATUS))
-def test_a_training_killed_at_a_random_moment_comes_to_the_same_result(expected, number):
+@pytest.mark.parametrize("number", matrix_params(["SIGKILL"], STATUS))
+def test_a_training_killed_at_a_random_moment_gives_the_same_result(expected, number):
     moment = random.Random(number)
     steps, wait = moment.randint(1, 1000), moment.uniform(0.0, 0.05)
     child = in_a_process(["train", *LINE.split(), "--out", "run"])
     while kill_test.saved_steps(Path("run")) < steps:
-        assert os.waitpid(child, os.WNOHANG) == (0, 0)  # it lives
+        # The process is alive.
+        assert os.waitpid(child, os.WNOHANG) == (0, 0)
         time.sleep(0.005)
     time.sleep(wait)
     os.kill(child, signal.Signals[number])
@@ -96,16 +99,16 @@ def test_a_training_killed_at_a_random_moment_comes_to_the_same_result(expected,
     lost = kill_test.reported_steps(Path("run")) - kill_test.saved_steps(Path("run"))
     assert lost <= (INTERVAL + ROLLOUT if number == "SIGKILL" else 0)
     if number != "SIGKILL":
-        said = Path("said").read_text().splitlines()[-1]
-        assert said.startswith(
+        message = Path("output").read_text().splitlines()[-1]
+        assert message.startswith(
             f"codrl-mj: stopped after {kill_test.saved_steps(Path('run')):,} steps: continue with "
         )
-        assert said.endswith("codrl-mj train --resume run")
+        assert message.endswith("codrl-mj train --resume run")
     continued(expected)
 
 
 def die_at_call(owner, name, which):
-    """Have a function die at its n-th call, or at the one whose arguments are said."""
+    """Kill the process at a function's n-th call, or at one with matching arguments."""
     original, calls = getattr(owner, name), iter(range(1, 10**9))
 
     def dying(*arguments, **keywords):
@@ -130,11 +133,12 @@ KILLED_WHILE = {
 }
 
 
-@pytest.mark.parametrize("moment", but(["writing a checkpoint"], KILLED_WHILE))
-def test_a_training_killed_while_writing_comes_to_the_same_result(expected, moment):
+@pytest.mark.parametrize("moment", matrix_params(["writing a checkpoint"], KILLED_WHILE))
+def test_a_training_killed_while_writing_gives_the_same_result(expected, moment):
     line = ["train", *LINE.split(), "--out", "run"]
     assert status_of(in_a_process(line, KILLED_WHILE[moment])) == -9
     if Path("run/config.json").exists():
         continued(expected)
     else:
-        assert main(["train", "--resume", "run"]) == 2  # nothing was begun
+        # No training had started.
+        assert main(["train", "--resume", "run"]) == 2

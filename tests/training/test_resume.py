@@ -1,4 +1,4 @@
-"""A training that was interrupted, however and how often, comes to the very result of one that was not."""
+"""A training gives the same result with any interruptions as without them."""
 
 import functools
 from pathlib import Path
@@ -16,7 +16,7 @@ from codrl_mj.training import (
     history,
     watcher,
 )
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.training.interruptions import (
     CASES,
     INTERRUPT,
@@ -32,12 +32,12 @@ from tests.training.interruptions import (
 )
 
 RESUMED = ["ppo, one optimiser", "ddpg, several environments", "sarsa, traces"]
-"""One case of every kind of agent."""
+"""Names of a case for each kind of agent."""
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    """Reports as often as checkpoints, evaluations of short episodes, and no picture at the end."""
+    """Make reports as frequent as checkpoints, evaluations short, and skip the picture."""
     monkeypatch.setattr(TrainConfig, "evaluation_env", property(lambda config: config.env))
     monkeypatch.setattr(watcher, "REPORT_INTERVAL", 40)
     monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
@@ -45,7 +45,7 @@ def quick(monkeypatch):
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
-    """What the cases come to, each trained once."""
+    """Return the results of the cases, each trained once."""
 
     @functools.cache
     def train_once(name):
@@ -54,13 +54,15 @@ def uninterrupted(tmp_path_factory):
     return train_once
 
 
-@pytest.mark.parametrize("name", but(RESUMED, CASES))
-def test_a_run_of_interruptions_changes_nothing(tmp_path, uninterrupted, name):
+@pytest.mark.parametrize("name", matrix_params(RESUMED, CASES))
+def test_interruptions_do_not_change_the_result(tmp_path, uninterrupted, name):
     config, out = CASES[name], tmp_path / "run"
-    interrupt(config, out, 1, TERMINATE)  # before the first checkpoint
-    interrupt(config, out, 70, crash)  # past a checkpoint
+    # Before the first checkpoint, then after one.
+    interrupt(config, out, 1, TERMINATE)
+    interrupt(config, out, 70, crash)
     interrupt(config, out, 1, INTERRUPT)
-    interrupt(config, out, 1, TERMINATE)  # twice in a row
+    # Two interruptions without a step between them.
+    interrupt(config, out, 1, TERMINATE)
     interrupt(config, out, 40, INTERRUPT)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
@@ -80,13 +82,11 @@ FINAL = (
     "learning_curve.png",
     "result.json",
 )
-"""What a training writes when it has learned, in this order."""
+"""Files that a training writes at its end, in this order."""
 
 
 @pytest.mark.parametrize("last", FINAL)
-def test_between_the_final_files_a_run_is_not_finished_for_anybody(
-    tmp_path, uninterrupted, monkeypatch, last
-):
+def test_a_run_is_unfinished_until_its_last_file(tmp_path, uninterrupted, monkeypatch, last):
     name, out = "ppo, one optimiser", tmp_path / "run"
     replace, written = Path.replace, []
 
@@ -105,16 +105,17 @@ def test_between_the_final_files_a_run_is_not_finished_for_anybody(
         with pytest.raises(Crash):
             resume(CASES[name], out)
     assert tuple(written) == FINAL[: len(written)]
-    done = last == FINAL[-1]
-    assert (read_run(out).state, finished(out)) == ("finished" if done else "unfinished", done)
+    is_finished = last == FINAL[-1]
+    assert (read_run(out).state, finished(out)) == (
+        "finished" if is_finished else "unfinished",
+        is_finished,
+    )
     resume(CASES[name], out)
     assert (read_run(out).state, finished(out)) == ("finished", True)
     assert differing(uninterrupted(name), outcome(out)) == []
 
 
-def test_a_signal_before_the_first_step_leaves_a_run_that_starts(
-    tmp_path, uninterrupted, monkeypatch
-):
+def test_a_run_starts_after_a_signal_before_its_first_step(tmp_path, uninterrupted, monkeypatch):
     name, out = "ppo, one optimiser", tmp_path / "run"
     with monkeypatch.context() as patch:
         reset = ActuatedVecEnv.reset
@@ -126,9 +127,7 @@ def test_a_signal_before_the_first_step_leaves_a_run_that_starts(
     assert differing(uninterrupted(name), outcome(out)) == []
 
 
-def test_a_signal_in_the_last_but_one_step_stops_and_one_in_the_last_comes_too_late(
-    tmp_path, uninterrupted
-):
+def test_a_signal_stops_the_training_until_its_last_step(tmp_path, uninterrupted):
     name, out = "dqn, epsilon by episodes", tmp_path / "run"
     assert "stopped after 239 steps" in interrupt(CASES[name], out, 239, TERMINATE)
     with after(1, TERMINATE):
@@ -136,7 +135,7 @@ def test_a_signal_in_the_last_but_one_step_stops_and_one_in_the_last_comes_too_l
     assert differing(uninterrupted(name), outcome(out)) == []
 
 
-def test_while_one_trains_in_a_folder_another_is_refused(tmp_path, uninterrupted):
+def test_a_second_training_in_a_folder_raises(tmp_path, uninterrupted):
     name, out = "ppo, one optimiser", tmp_path / "run"
 
     def train_too():

@@ -1,4 +1,4 @@
-"""A training from start to end: it learns, a seed repeats, the run folder has what is documented."""
+"""A training from start to end: learning, repetition with a seed, and documented files."""
 
 import contextlib
 import csv
@@ -24,7 +24,7 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.training import EVALUATION_SEED, TrainConfig, history, load_config, train, watcher
-from codrl_mj.training.folder import owned
+from codrl_mj.training.folder import locked
 from codrl_mj.training.watcher import Watcher
 from tests.training.interruptions import begin
 
@@ -35,23 +35,24 @@ UNSTABLE = DCMotorActuator(Motor(arm_radius=0.15), CurrentLoop(kp=100.0))
 
 
 def within(**changes):
-    """The tiny training in another environment."""
+    """Return the tiny training in another environment."""
     return dataclasses.replace(TINY, env=dataclasses.replace(ENV, **changes))
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    """No picture at the end, but of `run`."""
+    """Skip the picture, except in `run`."""
     monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A tiny run, and the progress that it reported."""
+    """Return a tiny run, and its progress reports."""
     reports = []
     torch.set_num_threads(2)
     out = train(TINY, tmp_path_factory.mktemp("runs") / "a" / "run", reports.append)
-    assert torch.get_num_threads() == 1  # networks this small are slower on two
+    # Networks of this size are slower on two threads.
+    assert torch.get_num_threads() == 1
     return out, reports
 
 
@@ -64,7 +65,7 @@ def read(path):
     return json.loads(path.read_text())
 
 
-# -- the run folder -----------------------------------------------------------------------------------------
+# -- the run folder --------------------------------------------------------------------------------
 
 
 def test_the_run_folder_has_the_best_policy_and_a_picture(run):
@@ -76,20 +77,21 @@ def test_the_run_folder_has_the_best_policy_and_a_picture(run):
     }
     with Image.open(out / "learning_curve.png") as image:
         assert image.size == (900, 525)
-        assert len(image.convert("RGB").getcolors(100_000)) > 10  # something is drawn
+        # The picture is not empty.
+        assert len(image.convert("RGB").getcolors(100_000)) > 10
 
 
-def test_the_configuration_records_what_was_resolved_and_the_versions(run):
+def test_the_configuration_records_resolved_values_and_versions(run):
     content = read(run[0] / "config.json")
     assert load_config(run[0]) == TINY
     assert content["train"] == json.loads(json.dumps(TINY.as_mapping()))
-    assert content["train"]["env"]["actuator"]["controller"]["kp"] == 0.2  # of `weaker`
+    assert content["train"]["env"]["actuator"]["controller"]["kp"] == 0.2
     versions = content["versions"]
     assert (versions["numpy"], versions["python"]) == (np.__version__, platform.python_version())
     assert len(content["code"]) == 64
 
 
-def test_progress_is_reported_and_written_at_the_ends_of_rollouts_and_every_episode_is_in_its_table(
+def test_progress_is_written_after_rollouts_and_every_episode_is_in_the_table(
     run,
 ):
     out, (report,) = run
@@ -119,29 +121,31 @@ def test_progress_is_reported_and_written_at_the_ends_of_rollouts_and_every_epis
 def test_the_result_and_the_evaluation_agree_with_an_evaluation_of_the_saved_policy(run):
     out, (report,) = run
     result = read(out / "result.json")
-    anew = evaluate(
+    expected = evaluate(
         load_policy(out), EnvConfig("cartpole", "weaker"), episodes=5, seed=EVALUATION_SEED
     ).returns.mean
-    assert read(out / "evaluation.json")["returns"]["mean"] == anew == result["evaluation_return"]
+    assert (
+        read(out / "evaluation.json")["returns"]["mean"] == expected == result["evaluation_return"]
+    )
     assert (result["steps"], result["episodes"]) == (report.steps, report.episodes)
-    assert result["best"] == {"return": anew, "steps": 512}  # the only evaluation
+    assert result["best"] == {"return": expected, "steps": 512}  # the only evaluation
 
 
 def test_another_seed_gives_another_policy(run, tmp_path):
-    other = train(dataclasses.replace(TINY, seed=2), tmp_path / "other")
-    assert (other / "policy.safetensors").read_bytes() != (
+    different = train(dataclasses.replace(TINY, seed=2), tmp_path / "other")
+    assert (different / "policy.safetensors").read_bytes() != (
         run[0] / "policy.safetensors"
     ).read_bytes()
 
 
-def test_a_report_has_the_evaluation_that_took_place_then_and_no_other(tmp_path, monkeypatch):
+def test_a_report_has_only_the_evaluation_of_its_step(tmp_path, monkeypatch):
     monkeypatch.setattr(watcher, "REPORT_INTERVAL", 1250)
     config = dataclasses.replace(
         TINY, total_steps=2500, evaluation_interval=1000, evaluation_episodes=2
     )
     rows = read_csv(train(config, tmp_path / "run") / "progress.csv")
-    found = {int(row["steps"]): math.isfinite(float(row["evaluation_return"])) for row in rows}
-    assert found == {
+    evaluated = {int(row["steps"]): math.isfinite(float(row["evaluation_return"])) for row in rows}
+    assert evaluated == {
         1024: True,
         1280: False,
         2048: True,
@@ -149,8 +153,9 @@ def test_a_report_has_the_evaluation_that_took_place_then_and_no_other(tmp_path,
     }  # 1280: the report alone; 2560: the end
 
 
-def test_the_best_policy_is_kept_though_a_worse_one_comes_last(tmp_path):
-    ppo = dataclasses.replace(TINY_PPO, learning_rate=0.05)  # unsteady
+def test_the_best_policy_is_saved_if_a_later_one_is_worse(tmp_path):
+    # With this learning rate, returns rise and fall.
+    ppo = dataclasses.replace(TINY_PPO, learning_rate=0.05)
     config = dataclasses.replace(
         TINY, agent=ppo, total_steps=3000, evaluation_interval=256, evaluation_episodes=5
     )
@@ -176,9 +181,7 @@ def test_tensorboard_gets_returns_and_losses(run):
     assert "train/value_loss" in events.Tags()["scalars"]
 
 
-def test_without_tensorboard_there_are_no_events_and_nothing_lies_anywhere_else(
-    tmp_path, monkeypatch
-):
+def test_without_tensorboard_no_events_are_written(tmp_path, monkeypatch):
     monkeypatch.setenv(
         "SB3_LOGDIR", str(tmp_path / "theirs")
     )  # where Stable-Baselines3 would make a folder
@@ -217,31 +220,30 @@ def test_episodes_can_be_counted_instead_of_steps(tmp_path):
     assert read(out / "result.json")["episodes"] == 20
 
 
-# -- refusals -----------------------------------------------------------------------------------------------
+# -- refusals --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("holds", "begun"),
+    ("names", "has_config"),
     [
         (["precious.txt"], False),
         (["tensorboard/mine"], False),
         (["best/policy.json"], False),
         (["policy.json"], False),
         *(
-            (["notes.txt", theirs], False)
-            for theirs in ("config.json", ".lock", "best", "tensorboard/events")
+            (["notes.txt", name], False)
+            for name in ("config.json", ".lock", "best", "tensorboard/events")
         ),
-        # what a training has before it learned anything is a folder to begin in, but not with
-        # something else
-        *(([theirs], True) for theirs in ("precious.txt", "best/policy.json", "policy.json")),
+        # A training may start in a folder with only a configuration, but not with other files.
+        *(([name], True) for name in ("precious.txt", "best/policy.json", "policy.json")),
     ],
 )
-def test_a_folder_that_holds_something_is_refused_and_untouched(tmp_path, holds, begun):
+def test_a_folder_with_other_files_raises_and_is_not_changed(tmp_path, names, has_config):
     out = tmp_path / "run"
-    for name in holds:
+    for name in names:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_text("mine")
-    if begun:
+    if has_config:
         begin(tmp_path / "new", TINY)
         (tmp_path / "new/config.json").rename(out / "config.json")
     before = {path: path.is_dir() or path.read_bytes() for path in out.rglob("*")}
@@ -261,28 +263,26 @@ def test_a_folder_that_holds_something_is_refused_and_untouched(tmp_path, holds,
         ({"env": within(physics="newton").env}, "unknown physics 'newton'"),
     ],
 )
-def test_what_cannot_be_trained_is_refused_with_nothing_written(tmp_path, changes, message):
+def test_an_impossible_training_raises_before_it_writes(tmp_path, changes, message):
     config = dataclasses.replace(TINY, **changes)
     with pytest.raises(ValueError, match=message):
         train(config, tmp_path / "runs" / "run")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_training_that_breaks_off_before_it_learned_anything_does_not_block_the_next(
-    tmp_path, monkeypatch
-):
-    out, kept = tmp_path / "runs" / "run", tmp_path / "kept"
-    kept.mkdir()
+def test_an_early_failure_does_not_block_the_next_training(tmp_path, monkeypatch):
+    out, existing = tmp_path / "runs" / "run", tmp_path / "existing"
+    existing.mkdir()
     with monkeypatch.context() as patch:
         patch.setattr(Watcher, "_on_step", lambda _: 1 / 0)
-        for path in (out, kept):
+        for path in (out, existing):
             with pytest.raises(ZeroDivisionError):
                 train(TINY, path)
-    assert (out.parent.exists(), list(kept.iterdir())) == (False, [])  # what was there stays
+    assert (out.parent.exists(), list(existing.iterdir())) == (False, [])  # what was there stays
     assert read(train(TINY, out) / "result.json")["steps"] == 512
 
 
-def test_weights_that_are_no_numbers_are_named_and_not_kept(tmp_path, monkeypatch):
+def test_weights_that_are_not_finite_raise_and_are_not_saved(tmp_path, monkeypatch):
     learn = FastPPO.train
 
     def diverging(model):
@@ -293,7 +293,7 @@ def test_weights_that_are_no_numbers_are_named_and_not_kept(tmp_path, monkeypatc
     monkeypatch.setattr(FastPPO, "train", diverging)
     often = dataclasses.replace(TINY, total_steps=1000, checkpoint_interval=256)
     message = (
-        r"weights of ppo became no finite numbers by step 512: .* Lower agent\.learning_rate ="
+        r"weights of ppo are not finite at step 512: .* Lower agent\.learning_rate ="
         r" 0\.001, or"
     )
     with pytest.raises(FloatingPointError, match=message):
@@ -304,25 +304,25 @@ def test_weights_that_are_no_numbers_are_named_and_not_kept(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("line", ["train cartpole --out run", "train --resume run"])
-def test_a_folder_in_use_is_refused_before_anything_is_made(tmp_path, monkeypatch, capsys, line):
+def test_a_locked_folder_raises_before_anything_is_created(tmp_path, monkeypatch, capsys, line):
     monkeypatch.chdir(tmp_path)
     begin(tmp_path / "run", TrainConfig.preset("cartpole", "ppo"))
     monkeypatch.setattr(PPOConfig, "make_model", lambda *_: pytest.fail("it was made"))
-    with owned(tmp_path / "run"):
+    with locked(tmp_path / "run"):
         assert main(line.split()) == 2
     shown = capsys.readouterr()
     assert shown.out == ""
     assert "another process is training in it; wait for it" in shown.err
 
 
-def test_a_folder_that_cannot_be_made_is_named_before_training(tmp_path):
+def test_a_folder_that_cannot_be_created_raises_before_training(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OSError, match="file"):
         train(TINY, tmp_path / "file" / "run", lambda _: pytest.fail("it trained"))
     assert (tmp_path / "file").read_text() == "in the way"
 
 
-def test_the_torque_error_of_compiled_episodes_is_that_of_all_their_steps(tmp_path, monkeypatch):
+def test_the_torque_error_of_compiled_episodes_has_all_steps(tmp_path, monkeypatch):
     config = TrainConfig.preset("mountain_car", "sarsa", total_episodes=6, evaluation_episodes=1)
     errors = []
     for compiled in (True, False):

@@ -1,4 +1,4 @@
-"""Every entry of a model's state matters to what comes next, or it is said why it does not; none may be missing."""
+"""Every entry of a model's state has an effect or a reason not to; none may be missing."""
 
 import copy
 import dataclasses
@@ -12,11 +12,11 @@ from stable_baselines3.common.logger import Logger
 from codrl_mj.envs.sb3 import make_sb3_vec_env
 from codrl_mj.training.checkpoint import State, capture, restore
 from codrl_mj.training.watcher import LearningEnded
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.training.interruptions import CASES
 
 EVERYWHERE = {"_current_progress_remaining", "env.seeds", "last_episode_starts"}
-"""Without effect: is computed anew; used up by the reset before the first step; matters only within a rollout."""
+"""Entries that are computed again, used by the first reset, or used only in a rollout."""
 FOR_THE_LOG, COPIED, DRAWN = {"_n_updates"}, {"env.observations"}, {"env.rejected"}
 NUMPY, TORCH, ACTIONS = {"random.numpy", "random.numpy.key"}, {"random.torch"}, {"random.actions"}
 WITHOUT_EFFECT = {
@@ -54,15 +54,13 @@ WITHOUT_EFFECT = {
         }
     ),  # between two whole episodes
 }
-"""For each case the entries that make no difference: counts that only the log has, generators that
-the agent does not draw from, and what can be computed from other entries.
-"""
+"""Entries of each case without effect: counts for logs, unused generators, computed values."""
 NETWORKS_ASKED = ("ppo, an episode budget", "ddpg")
-"""Cases in which each tensor of networks and optimisers is asked for; the others restore theirs by the same lines."""
+"""Cases that test each tensor of networks and optimizers; all cases share the code."""
 
 
 class Stretch(BaseCallback):
-    """Learns from a state on (None: from the beginning) to the first end of a rollout after some steps."""
+    """Callback that learns from a state (None: the start) to the end of a rollout."""
 
     def __init__(self, start, end):
         """Learn from `start` to `end`."""
@@ -97,7 +95,7 @@ class Stretch(BaseCallback):
 
 
 class Learner:
-    """A model that learns from given states on."""
+    """Model that learns from given states."""
 
     def __init__(self, config):
         """Make the model."""
@@ -106,7 +104,7 @@ class Learner:
         self.model.set_logger(Logger(None, []))
 
     def learn(self, start, end):
-        """What it comes to: the state, and the episodes on the way, by name."""
+        """Return the resulting state, and the episodes by name."""
         stretch = Stretch(start, end)
         with pytest.raises(LearningEnded):
             self.model.learn(10**6, callback=stretch, log_interval=None)
@@ -118,7 +116,7 @@ class Learner:
 
 
 def quick(config):
-    """The same with few gradient steps."""
+    """Return the configuration with few gradient steps."""
     if "gradient_steps" not in {field.name for field in dataclasses.fields(config.agent)}:
         return config
     return dataclasses.replace(
@@ -127,19 +125,19 @@ def quick(config):
 
 
 def matters(learner, start, name, end, expected):
-    """Whether what comes next is refused or another, if one entry of the state is."""
+    """Return True if a change of an entry of the state is refused or changes what follows."""
     arrays, facts = dict(start.arrays), copy.deepcopy(start.facts)
-    whose = arrays if name in arrays else facts
-    whose[name] = another(name, whose[name])
+    values = arrays if name in arrays else facts
+    values[name] = another(name, values[name])
     try:
         _, reached = learner.learn(State(arrays, facts), end)
     except (RuntimeError, ValueError):
         return True
-    return any(not equal(reached[other], expected[other]) for other in expected if other != name)
+    return any(not equal(reached[entry], expected[entry]) for entry in expected if entry != name)
 
 
 def another(name, value):
-    """Another value of the same type and shape."""
+    """Return another value of the same type and shape."""
     if name == "random.torch":
         return torch.Generator().manual_seed(1).get_state().numpy()
     if name.startswith("random") and isinstance(value, dict):
@@ -148,7 +146,8 @@ def another(name, value):
             "state": {"pos": (inner["pos"] + 7) % 624} if "pos" in inner else inner | {"state": 1}
         }
     if name == "buffer.actions" and value.dtype.kind == "i":
-        return 1 - value  # of two
+        # There are two actions.
+        return 1 - value
     if name.endswith(".groups"):
         return [group | {"betas": (0.5, 0.5)} for group in value]
     if name.endswith(".moments") or name == "buffer":
@@ -165,44 +164,41 @@ def another(name, value):
     return value + (0.05 * noise * (1 + np.abs(value))).astype(value.dtype)
 
 
-def equal(one, other):
-    if isinstance(one, np.ndarray):
-        return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
-    return one == other
+def equal(value, expected):
+    if isinstance(value, np.ndarray):
+        return np.array_equal(value, expected, equal_nan=value.dtype.kind == "f")
+    return value == expected
 
 
 def is_network(entry):
     return entry.startswith("policy.") or ".optimizer" in entry
 
 
-@pytest.mark.parametrize("name", but(NETWORKS_ASKED, WITHOUT_EFFECT))
-def test_every_entry_of_the_state_matters_and_none_may_be_missing(name):
+@pytest.mark.parametrize("name", matrix_params(NETWORKS_ASKED, WITHOUT_EFFECT))
+def test_every_entry_of_the_state_has_an_effect_and_must_exist(name):
     config = quick(CASES[name])
     learner = Learner(config)
     length = {"ppo": 32, "dqn": 24 * config.num_envs}.get(config.agent.name, 8 * config.num_envs)
     mattered = set()
-    for begin in (
-        20,
-        69 * config.num_envs,
-    ):  # in the middle of episodes, before and after a buffer is learned from
-        start, _ = learner.learn(None, begin)
+    # Both are in the middle of episodes, before and after learning from a buffer begins.
+    for first_steps in (20, 69 * config.num_envs):
+        start, _ = learner.learn(None, first_steps)
         end = start.facts["num_timesteps"] + length
         _, expected = learner.learn(start, end)
         _, repeated = learner.learn(start, end)
         assert [entry for entry in expected if not equal(expected[entry], repeated[entry])] == []
-        found = {*start.arrays, *start.facts}
-        for entry in sorted(
-            found - mattered
-        ):  # always in the same order: generators go on from one to the next
+        entries = {*start.arrays, *start.facts}
+        # The order is fixed, because generators continue from one entry to the next.
+        for entry in sorted(entries - mattered):
             network = is_network(entry) and config.agent.name != "sarsa"
-            if not network or (begin > 20 and name in NETWORKS_ASKED):
+            if not network or (first_steps > 20 and name in NETWORKS_ASKED):
                 mattered |= {entry} if matters(learner, start, entry, end, expected) else set()
             else:
                 mattered.add(entry)
-    assert found - mattered == EVERYWHERE | WITHOUT_EFFECT[name]
-    for entry in found:
+    assert entries - mattered == EVERYWHERE | WITHOUT_EFFECT[name]
+    for entry in entries:
         arrays, facts = (
             {key: value for key, value in part.items() if key != entry} for part in start
         )
-        with pytest.raises(ValueError, match="of another configuration"):
+        with pytest.raises(ValueError, match="belongs to another configuration"):
             restore(learner.model, learner.envs, State(arrays, facts))

@@ -1,4 +1,4 @@
-"""What docs/training.md tells a reader to type works as it stands, and the files that it names are those of a run."""
+"""The commands and examples of docs/training.md work, and the files that it names exist."""
 
 import contextlib
 import re
@@ -17,7 +17,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "training.md").read_text()
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
-    """The files that the page speaks of, in an empty folder."""
+    """Create the files that the page mentions, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     (block,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
     Path("car.yaml").write_text(block)
@@ -27,7 +27,7 @@ def elsewhere(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "command", re.findall(r"^\$ codrl-mj (.*)$|`codrl-mj ([a-z]+ [^`A-Z]*)`", PAGE, re.MULTILINE)
 )
-def test_the_commands_are_understood(command, monkeypatch):
+def test_the_pages_commands_are_valid(command, monkeypatch):
     parsed = []
     for verb in cli.VERBS:
         monkeypatch.setattr(cli.find_verb(verb), "run", lambda self: parsed.append(self) or 0)
@@ -41,7 +41,7 @@ def test_the_commands_are_understood(command, monkeypatch):
         assert len(parsed) == 1
 
 
-def test_the_configuration_file_says_what_it_seems_to():
+def test_the_pages_configuration_has_the_documented_values():
     config = read_config(Path("car.yaml"))
     assert (config.task, config.agent.name, config.seed) == ("mountain_car_continuous", "ddpg", 7)
     assert (config.agent.learning_rate, config.actuator.controller.kp) == (5e-4, 3.0)
@@ -61,6 +61,6 @@ def test_the_python_example_runs_and_leaves_the_files_of_the_table():
     }
 
 
-def test_the_columns_that_may_differ_are_those_of_the_tests():
+def test_the_pages_nondeterministic_columns_are_those_of_the_tests():
     for column in kill_test.TIME_COLUMNS:
         assert f"`{column}`" in PAGE

@@ -3,7 +3,7 @@
 import mujoco
 
 from codrl_mj.actuators import DCMotorActuator, parameters_type
-from codrl_mj.engine.families import HEAD
+from codrl_mj.engine.families import USER_HEADER_SIZE
 from codrl_mj.physics import MujocoPhysics
 
 
@@ -20,7 +20,7 @@ def wrong_model(monkeypatch, change):
 
 def entry(parameter):
     """Where a current loop's parameter is in the user data of its actuator."""
-    return HEAD + parameters_type(DCMotorActuator)._fields.index(parameter)
+    return USER_HEADER_SIZE + parameters_type(DCMotorActuator)._fields.index(parameter)
 
 
 def scaled_motor(parameter, factor):

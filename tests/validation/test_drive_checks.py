@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import Drive, GearMotor
-from codrl_mj.tasks import OURS, TASKS
+from codrl_mj.tasks import PAPER_TASKS, TASKS
 from codrl_mj.validation.motor_catalogue import FITTED, Bench, Mechanics, drive_checks, fitted
 
 ROTOR = GearMotor(
@@ -74,7 +74,7 @@ def test_the_bench_settles_at_what_is_asked_or_at_ohm_s_law():
 
 
 def test_every_task_has_a_drive_and_together_they_have_every_addition():
-    assert FITTED.keys() == {task.name for task in OURS}
+    assert FITTED.keys() == {task.name for task in PAPER_TASKS}
     drives = [fitted(name) for name in FITTED]
     assert len({name for name, *_ in FITTED.values()}) == len(FITTED)
     assert all(any(one.additions[entry] > 0.0 for one in drives) for entry in range(3))

@@ -63,13 +63,13 @@ def test_a_wrong_force_on_the_analytic_physics_fails(monkeypatch):
 
     def stronger(self, *arguments, **options):
         make(self, *arguments, **options)
-        drive = self.twin
+        drive = self.reference_env
 
         class Stronger:
             def __call__(self, state, force, timestep, integrator):
                 return drive(state, 1.02 * force, timestep, integrator)
 
-        self.twin = Stronger()
+        self.reference_env = Stronger()
 
     monkeypatch.setattr(AnalyticPhysics, "__init__", stronger)
     checks = {

@@ -155,7 +155,7 @@ def test_a_fault_of_ours_is_still_found_in_somebodys_task_and_said_to_be_ours(tm
         "textbook steps of such sizes have this order: " + REPORT
         in failed["order, rk4, ideal actuator"]
     )
-    assert "gentler run in Task.trials" in failed["order, mechanical balance, rk4"]
+    assert "gentler run in Task.reference_states" in failed["order, mechanical balance, rk4"]
 
 
 def test_an_unstable_motor_is_its_owners():

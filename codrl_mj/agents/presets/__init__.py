@@ -1,8 +1,9 @@
-"""Settings that suit an agent and a task: ours (`default`, `fast`), the paper's (`paper`), these mended (`repaired`).
+"""Presets: settings of an agent for a task.
 
-One TOML file an agent beside this module: a table for each task and name with the fields of
-`Preset`, where `"none"` stands for None, and `like` names the settings above that it starts from.
-What the numbers gave, in training and in test, is in docs/agents.md.
+They are ours (`default`, `fast`), the paper's (`paper`), and the paper's with repairs (`repaired`).
+Each agent has a TOML file in this folder, with a table of the fields of `Preset` for each task and
+name. In it `"none"` means None, and `like` names the settings above from which the table starts.
+docs/agents.md has the results of training and tests.
 """
 
 import dataclasses
@@ -13,40 +14,40 @@ from typing import Any
 
 from codrl_mj.agents import AGENTS, AgentConfig, find_agent
 
-__all__ = ["ELSEWHERE", "PRESETS", "SETTINGS", "Preset", "find_preset"]
+__all__ = ["OTHER_ENV", "PRESETS", "SETTINGS", "Preset", "find_preset"]
 
 SETTINGS = ("default", "paper", "repaired", "fast")
-"""Names that settings can have: ours, the paper's as printed, the paper's with what makes it fail
-changed, and ours for the least time.
+"""Names of settings: ours; the paper's as printed; the paper's with changes where they fail; and
+ours for the shortest training time.
 """
-ELSEWHERE = "another's environment"
-"""Instead of a task: any environment that is none of ours."""
+OTHER_ENV = "another's environment"
+"""Key that stands for any third-party environment, in place of a task."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Preset:
-    """How an agent learns a task: its settings, its budget and what it trains in."""
+    """Settings of a training: of the agent, its budget and its environments."""
 
     agent: AgentConfig
     """The agent's settings."""
     total_steps: int | None = None
-    """Environment steps in all; None where the episodes are counted."""
+    """Total number of environment steps; None if `total_episodes` limits the training."""
     total_episodes: int | None = None
-    """Training episodes in all; None where the steps are counted."""
+    """Total number of training episodes; None if `total_steps` limits the training."""
     num_envs: int = 1
-    """Environments side by side."""
+    """Number of parallel environments."""
     env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Fields of the environment in training, and options of the task, that are not at their defaults."""
+    """Fields of the training environment and options of the task that differ from the defaults."""
     about: str = ""
-    """Where the settings come from; for `repaired`, every deviation from the paper and why."""
+    """Source of the settings; for `repaired`, each deviation from the paper with its reason."""
 
 
 def _read(agent: str) -> dict[str, dict[str, Preset]]:
-    """An agent's file: task -> name of the settings -> the settings."""
+    """Read an agent's file as task -> name of the settings -> preset."""
     tasks = tomllib.loads(files(__name__).joinpath(f"{agent}.toml").read_text())
     presets: dict[str, dict[str, Preset]] = {task: {} for task in tasks}
-    for task, named in tasks.items():
-        for name, table in named.items():
+    for task, by_name in tasks.items():
+        for name, table in by_name.items():
             like = table.pop("like", None)
             base = presets[task][like] if like else Preset(AGENTS[agent]())
             fields = {
@@ -62,30 +63,37 @@ def _read(agent: str) -> dict[str, dict[str, Preset]]:
 PRESETS: dict[tuple[str, str], dict[str, Preset]] = {
     (agent, task): named for agent in AGENTS for task, named in _read(agent).items()
 }
-"""(agent, task) -> name of the settings -> the settings."""
+"""(agent, task) -> name of the settings -> preset."""
 
 
 def find_preset(agent: str, task: str, settings: str = "default") -> Preset:
-    """The settings of that name for an agent on a task; the agent's own defaults where somebody brought one of them.
+    """Return the preset of a name for an agent on a task.
+
+    A custom agent, or a custom task, has the agent's default settings as `default`.
 
     Args:
-        agent: its name.
-        task: the task's name, or `ELSEWHERE`.
-        settings: one of `SETTINGS`.
+        agent: the agent's name.
+        task: the task's name, or `OTHER_ENV`.
+        settings: a name of `SETTINGS`.
 
     Raises:
-        ValueError: there are none; the message names those that exist.
+        ValueError: there is no such preset; the message names those that exist.
     """
-    named = PRESETS.get((agent, task), {})
-    ours = ":" not in agent and task != ELSEWHERE and any(of == task for _, of in PRESETS)
-    if settings == "default" and not named and not ours:
+    by_name = PRESETS.get((agent, task), {})
+    # Built-in agents have no default for a built-in task that they cannot learn.
+    is_built_in = (
+        ":" not in agent and task != OTHER_ENV and any(name == task for _, name in PRESETS)
+    )
+    if settings == "default" and not by_name and not is_built_in:
         return Preset(find_agent(agent)(), total_steps=200_000, num_envs=8)
-    if settings not in named:
-        there = "; ".join(
-            f"{other}: {', '.join(names)}" for (other, of), names in PRESETS.items() if of == task
+    if settings not in by_name:
+        available = "; ".join(
+            f"{other_agent}: {', '.join(names)}"
+            for (other_agent, name), names in PRESETS.items()
+            if name == task
         )
         raise ValueError(
             f"settings = {settings!r}: {agent} on {task} has no such settings; those on {task} are"
-            f" {there or 'none'}"
+            f" {available or 'none'}"
         )
-    return named[settings]
+    return by_name[settings]

@@ -169,7 +169,7 @@ def torque_label(task: str, actuator: ActuatorModel, motor: int) -> str:
         return "shaft torque [N·m]"
     if task not in TASKS:
         return "joint force [N, N·m]"
-    slides = "[m/s]" in TASKS[task].state_names[TASKS[task].speeds[motor]]
+    slides = "[m/s]" in TASKS[task].state_names[TASKS[task].speed_indices[motor]]
     return "joint force [N]" if slides else "joint torque [N·m]"
 
 

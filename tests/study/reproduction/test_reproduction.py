@@ -37,7 +37,7 @@ from reproduction.rows import read_rows
 from reproduction.study import Reproduction
 from reproduction.value_iteration import Mesh
 from tests.conftest import REPRESENTATIVES
-from tests.matrix import but
+from tests.matrix import matrix_params
 from tests.study.reproduction.worlds import PAPERS, trained, world
 
 RESULTS = Path(__file__).parents[3] / "docs/results"
@@ -378,7 +378,7 @@ def made_up(arm, steps=30, inner_steps=3):
     )
 
 
-@pytest.mark.parametrize("task", but(REPRESENTATIVES, TASKS))
+@pytest.mark.parametrize("task", matrix_params(REPRESENTATIVES, TASKS))
 def test_states_and_torques_are_drawn_of_every_task(task, tmp_path):
     arms = [arm for arm in ARMS if arm.task == task and arm.physics == "mujoco"]
     states = [row for arm in arms for row in state_rows(arm, made_up(arm))]
