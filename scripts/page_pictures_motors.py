@@ -138,7 +138,9 @@ def actuators_in_numbers(out: Path) -> None:
     """Shares of the largest force that the paper's actuators deliver on a blocked joint, on three tasks."""
     plots = []
     for task in (
-        one for one in PAPER_TASKS if one.name in ("pendulum", "cartpole", "acrobot", "mountain_car")
+        one
+        for one in PAPER_TASKS
+        if one.name in ("pendulum", "cartpole", "acrobot", "mountain_car")
     ):
         timestep = task.step_duration / task.motor_inner_steps
         curves = []

@@ -182,9 +182,9 @@ def test_a_model_that_is_not_there_is_refused_when_the_task_is_made():
 def test_the_speeds_of_a_task_follow_from_its_model():
     assert slips.task().speed_indices == (2,)
     assert slips.task(motors=("elbow",)).speed_indices == (3,)
-    assert [task.speed_indices for task in codrl_mj.tasks.TASKS.values() if task.name == "acrobot"] == [
-        (3,)
-    ]
+    assert [
+        task.speed_indices for task in codrl_mj.tasks.TASKS.values() if task.name == "acrobot"
+    ] == [(3,)]
 
 
 def reset(task, **options):

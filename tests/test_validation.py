@@ -407,7 +407,9 @@ def test_one_nan_among_good_samples_fails_the_check(monkeypatch, at):
         return signals
 
     monkeypatch.setattr(MujocoPhysics, "step", broken)
-    check, *_ = dynamics.one_step(TASKS["cartpole"], TASKS["cartpole"].reference_states, "euler", quick=True)
+    check, *_ = dynamics.one_step(
+        TASKS["cartpole"], TASKS["cartpole"].reference_states, "euler", quick=True
+    )
     assert math.isnan(check.worst)
     assert not check.passed
     assert "x [m] from" in check.where

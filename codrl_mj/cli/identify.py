@@ -87,7 +87,7 @@ class Identify:
 
     def run(self) -> tuple[int, Any]:
         """Check the logs, fit, print a table, write the files."""
-        from codrl_mj.identify.identify import check_arguments, predict_missing, identify
+        from codrl_mj.identify.identify import check_arguments, identify, predict_missing
         from codrl_mj.identify.reading import read_log
         from codrl_mj.identify.result import ACTUATOR
         from codrl_mj.sizing import find_drive

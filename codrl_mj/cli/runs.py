@@ -130,9 +130,13 @@ class Data:
         from codrl_mj.identify.published import fetch, published_datasets
 
         if self.name is None:
-            rows = [(name, one["title"], one["licence"]) for name, one in published_datasets().items()]
+            rows = [
+                (name, one["title"], one["licence"]) for name, one in published_datasets().items()
+            ]
             print_table("", ("name", "motor and rig", "licence"), rows)
-            print("\n".join(f"{name}: {one['source']}" for name, one in published_datasets().items()))
+            print(
+                "\n".join(f"{name}: {one['source']}" for name, one in published_datasets().items())
+            )
             return 0
         files = fetch(self.name, self.out)
         for file in files:

@@ -33,7 +33,7 @@ from codrl_mj.runs.files import read_json
 from codrl_mj.runs.summaries import read_reports
 from codrl_mj.tasks import TASKS
 from codrl_mj.training.config import TrainConfig, default_agent, read_config
-from codrl_mj.training.folder import prepare_run, load_config, needs_trust
+from codrl_mj.training.folder import load_config, needs_trust, prepare_run
 from codrl_mj.training.history import REPORT_COLUMNS
 
 _OWN_FLAGS = ("agent", "env")  # of the configuration: not made from its fields' types

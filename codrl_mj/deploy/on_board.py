@@ -58,7 +58,9 @@ def asked_of_board(
     got = 0
     if table[_LOST] == 0.0 and _write(int(table[_TO]), entry_address(table, 8), 40) == 40:
         while got < 24 and _poll(entry_address(table, 1), 1, WITHIN) > 0:
-            count = _read(u64(_table_at())[1] & 0xFFFFFFFF, entry_address(table, 16) + got, 24 - got)
+            count = _read(
+                u64(_table_at())[1] & 0xFFFFFFFF, entry_address(table, 16) + got, 24 - got
+            )
             if count <= 0:
                 break
             got += count

@@ -19,7 +19,7 @@ from codrl_mj.envs.setup import ResolvedEnv
 from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.variation import Variation, field_of, write_fields
 from codrl_mj.tasks import Task
-from codrl_mj.tasks.attributes import Attribute, Fixed, Derived, ModelNumber, Setting
+from codrl_mj.tasks.attributes import Attribute, Derived, Fixed, ModelNumber, Setting
 
 
 def shared(attribute: Attribute) -> bool:

@@ -10,8 +10,8 @@ from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Drive, Ideal, Servo
 from codrl_mj.disturbances import OFF, Disturbances, check_delay
-from codrl_mj.engine.reading import motors as motors_of
 from codrl_mj.engine.reading import actuators_sharing_motor
+from codrl_mj.engine.reading import motors as motors_of
 from codrl_mj.engine.specs import ON_JOINT
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
@@ -256,7 +256,9 @@ class ControlCommands:
         self._disturber = Disturber(disturbances, step_duration, largest * np.abs(self._gains), 1)
         present = motors_of(model)
         holds = [
-            _hold(model, one, present[index]) for index in indices for one in actuators_sharing_motor(model, index)
+            _hold(model, one, present[index])
+            for index in indices
+            for one in actuators_sharing_motor(model, index)
         ]
         self._holds = np.array(holds).reshape(-1, 2).T
         self._outputs = model.actuator_outadr[every]
@@ -392,4 +394,8 @@ def _plain_gain(model: mujoco.MjModel, index: int) -> float | None:
     )
     plain = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE)
     gain = float(model.actuator_gainprm[index, 0])
-    return gain if kinds == plain and gain != 0.0 and len(actuators_sharing_motor(model, index)) == 1 else None
+    return (
+        gain
+        if kinds == plain and gain != 0.0 and len(actuators_sharing_motor(model, index)) == 1
+        else None
+    )

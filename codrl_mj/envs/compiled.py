@@ -34,7 +34,7 @@ from numba import types
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
-from codrl_mj.engine.memory import f32, f64, to_floats, i64, internal, stack_floats
+from codrl_mj.engine.memory import f32, f64, i64, internal, stack_floats, to_floats
 from codrl_mj.envs.setup import FIRST_OPTION, NEEDS_KEY, ResolvedEnv
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
 from codrl_mj.physics.rows import Lane, Rows, load, store
@@ -174,7 +174,10 @@ def _kernels(
 
     @compiled
     def step(force: Any, where: int) -> tuple[float, bool, bool]:
-        before, after = numba.carray(stack_floats(size), size), numba.carray(stack_floats(size), size)
+        before, after = (
+            numba.carray(stack_floats(size), size),
+            numba.carray(stack_floats(size), size),
+        )
         read(before, where)
         fine = advance(force, where)
         trace = simulation_at(where)[4]

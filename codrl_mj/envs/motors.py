@@ -13,7 +13,7 @@ from codrl_mj.actuators import ActuatorModel, Command, Family, Inputs, parameter
 from codrl_mj.actuators.noise import LARGEST_KEY
 from codrl_mj.disturbances import OFF, Disturbances
 from codrl_mj.engine.families import USER_HEADER_SIZE, signals_offset
-from codrl_mj.engine.reading import Readout, bring_to_rest, actuators_sharing_motor, motor_slots
+from codrl_mj.engine.reading import Readout, actuators_sharing_motor, bring_to_rest, motor_slots
 from codrl_mj.engine.specs import match_pattern, matchable_names
 from codrl_mj.envs.commands import ControlCommands, command_of
 from codrl_mj.envs.distributions import paths_of
@@ -124,7 +124,9 @@ class ActuatorBank:
         """Exchange the motors for others of their families; to be followed by a reset."""
         for index, one in zip(self.present, actuators, strict=True):
             numbers = (one.arm_radius, *one.numbers)
-            self.data.model.actuator_user[index, USER_HEADER_SIZE : USER_HEADER_SIZE + len(numbers)] = numbers
+            self.data.model.actuator_user[
+                index, USER_HEADER_SIZE : USER_HEADER_SIZE + len(numbers)
+            ] = numbers
             self.present[index] = one
         self._parameters = list(map(_parameters, actuators))
 
@@ -198,7 +200,9 @@ def motor_names(model: mujoco.MjModel, motors: Iterable[int]) -> tuple[str, ...]
     own = [
         name if name and every.count(name) == 1 else str(index) for index, name in enumerate(every)
     ]
-    return tuple(" & ".join(own[each] for each in actuators_sharing_motor(model, index)) for index in motors)
+    return tuple(
+        " & ".join(own[each] for each in actuators_sharing_motor(model, index)) for index in motors
+    )
 
 
 def sensor_names(motors: Mapping[str, Family]) -> tuple[str, ...]:

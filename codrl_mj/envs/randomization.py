@@ -22,7 +22,7 @@ from codrl_mj.actuators import (
     from_array,
     parameter_paths,
 )
-from codrl_mj.engine.reading import check_shafts, actuators_sharing_motor
+from codrl_mj.engine.reading import actuators_sharing_motor, check_shafts
 from codrl_mj.engine.specs import match_pattern, matchable_names
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
@@ -371,15 +371,25 @@ def _matched(
         list(motors.values()),
         variable(model) if distributions else (),
     )
-    names, rubbing = matchable_names(model), [mounts_of(model, index)[2] is not None for index in motors]
-    called = [[name for one in actuators_sharing_motor(model, index) for name in names[one]] for index in indices]
+    names, rubbing = (
+        matchable_names(model),
+        [mounts_of(model, index)[2] is not None for index in motors],
+    )
+    called = [
+        [name for one in actuators_sharing_motor(model, index) for name in names[one]]
+        for index in indices
+    ]
     matched: dict[str, list[int]] = {}
     for path, distribution in distributions.items():
         pattern, field = split_path(path)
         try:
             every = list(range(len(indices)))
             own = (
-                [] if field.startswith(MODEL) else match_pattern(pattern, called) if pattern else every
+                []
+                if field.startswith(MODEL)
+                else match_pattern(pattern, called)
+                if pattern
+                else every
             )
             _check_known(field, [simulated[at] for at in own], varied, whose)
             if any(

@@ -192,7 +192,9 @@ class EnvSource(abc.ABC):
         taken = {index for pattern in patterns for index in match_pattern(pattern, names)}
         left = {
             " & ".join(
-                re.escape(names[one][0]) for one in actuators_sharing_motor(model, index) if one not in taken
+                re.escape(names[one][0])
+                for one in actuators_sharing_motor(model, index)
+                if one not in taken
             ): actuator
             for pattern, actuator in config.driven.items()
             for index in match_pattern(pattern, names)

@@ -15,7 +15,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.disturbances import OFF, resolve
-from codrl_mj.engine.reading import bring_to_rest, motors, motor_slots
+from codrl_mj.engine.reading import bring_to_rest, motor_slots, motors
 from codrl_mj.engine.specs import resolve_patterns
 from codrl_mj.envs.motors import ActuatorBank, MotorSettings, longer
 from codrl_mj.envs.recording import SubstepRecorder

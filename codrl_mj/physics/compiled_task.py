@@ -15,7 +15,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
-from codrl_mj.engine.memory import entries_type, to_floats, internal, read_row, named_tuple_type
+from codrl_mj.engine.memory import entries_type, internal, named_tuple_type, read_row, to_floats
 from codrl_mj.physics.base import LARGEST
 from codrl_mj.tasks import Task
 

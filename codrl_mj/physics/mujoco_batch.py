@@ -120,7 +120,9 @@ class MujocoBatchPhysics:
         )
         for at, (one, limit) in enumerate(zip(self._wiring, self.plant.max_forces, strict=True)):
             index, arm = int(one.actuator), arms[:, at]
-            user[rows, index, USER_HEADER_SIZE : USER_HEADER_SIZE + numbers.shape[2]] = numbers[:, at]
+            user[rows, index, USER_HEADER_SIZE : USER_HEADER_SIZE + numbers.shape[2]] = numbers[
+                :, at
+            ]
             gear[rows, self.model.actuator_outadr[index], 0] = 1.0 / arm
             limits[rows, int(one.ctrl)] = np.stack([-limit * arm, limit * arm], axis=-1)
         self._arms[rows] = arms

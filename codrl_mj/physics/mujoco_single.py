@@ -111,7 +111,9 @@ class MujocoPhysics(Physics):
             return
         for row, (one, limit) in enumerate(zip(actuators, self.plant.max_forces, strict=True)):
             index, arm, numbers = int(self.wiring[row].actuator), one.arm_radius, one.numbers
-            self.model.actuator_user[index, USER_HEADER_SIZE : USER_HEADER_SIZE + len(numbers)] = numbers
+            self.model.actuator_user[index, USER_HEADER_SIZE : USER_HEADER_SIZE + len(numbers)] = (
+                numbers
+            )
             self.model.actuator_gear[self.model.actuator_outadr[index], 0] = 1.0 / arm
             self.model.actuator_ctrlrange[int(self.wiring[row].ctrl)] = -limit * arm, limit * arm
             self.settings[row, ARM] = arm

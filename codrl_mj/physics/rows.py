@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.compile_cache import njit
-from codrl_mj.engine.layout import field_address, addresses, engine_function
+from codrl_mj.engine.layout import addresses, engine_function, field_address
 from codrl_mj.engine.memory import copy_bytes, f64, internal
 from codrl_mj.physics.mujoco_single import ARM, MujocoPhysics
 from codrl_mj.physics.sharing import apart

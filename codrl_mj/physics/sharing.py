@@ -18,7 +18,7 @@ import numpy as np
 from numba import types
 
 from codrl_mj.compile_cache import external, njit
-from codrl_mj.engine.memory import atomic_add, internal, atomic_load
+from codrl_mj.engine.memory import atomic_add, atomic_load, internal
 from codrl_mj.physics.compiled_task import Compiled
 
 _WORTH_WAKING = 64

@@ -18,10 +18,16 @@ from numba.extending import overload
 from codrl_mj.actuators import Family
 from codrl_mj.compile_cache import njit
 from codrl_mj.disturbances import OFF
-from codrl_mj.engine.model_access import user_address
-from codrl_mj.engine.families import USER_HEADER_SIZE, SlotHeader, compiled_observe, load_family, signals_offset
+from codrl_mj.engine.families import (
+    USER_HEADER_SIZE,
+    SlotHeader,
+    compiled_observe,
+    load_family,
+    signals_offset,
+)
 from codrl_mj.engine.layout import DATA, MODEL, addresses, engine_function
-from codrl_mj.engine.memory import f64, i64, internal, stack_floats, read_row
+from codrl_mj.engine.memory import f64, i64, internal, read_row, stack_floats
+from codrl_mj.engine.model_access import user_address
 from codrl_mj.physics.base import SimulationConfig
 from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_fine
 from codrl_mj.physics.disturber import KEY_COLUMN, Numbers, disturb

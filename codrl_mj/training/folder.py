@@ -15,7 +15,6 @@ from filelock import FileLock, Timeout
 
 from codrl_mj.actuators import label_of, set_display_name, trusting
 from codrl_mj.fields import command, differing
-from codrl_mj.user_code import UntrustedCodeError
 from codrl_mj.runs import (
     BEST,
     CHECKPOINT,
@@ -34,6 +33,7 @@ from codrl_mj.runs import (
 )
 from codrl_mj.runs.files import check_writable, leftovers, read_json
 from codrl_mj.training.config import TrainConfig
+from codrl_mj.user_code import UntrustedCodeError
 
 _FILES = {CONFIG, RESULT, EVALUATION, PROGRESS, EPISODES, CURVE, *POLICY_FILES}
 _PACKAGES = ("codrl-mj", "gymnasium", "mujoco", "numba", "numpy", "stable-baselines3", "torch")

@@ -67,7 +67,9 @@ def free_run(task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     trials = task.reference_states
     steps, balanced = (6, 2) if trials is None else (trials.steps, trials.balanced_steps)
     start = (
-        task.draw_initial_state(np.random.default_rng(3), None) if trials is None else np.array(trials.start)
+        task.draw_initial_state(np.random.default_rng(3), None)
+        if trials is None
+        else np.array(trials.start)
     )
     forces = forces_of(task, np.random.default_rng(3).choice([-1.0, 1.0], steps * len(task.motors)))
     return start, forces, forces[:balanced]
@@ -212,7 +214,9 @@ def analogues(task: Task) -> tuple[DCMotorActuator, ...]:
 
 def halvings(task: Task, most: int = 4) -> range:
     """Return how many times more the steps of a run are halved, in turn, until its errors show an order."""
-    first = 2 if task.reference_states is None else 0  # in a run that nobody chose the first steps are finer
+    first = (
+        2 if task.reference_states is None else 0
+    )  # in a run that nobody chose the first steps are finer
     return range(first, first + (1 if is_ours(task) else most + 1), 2)
 
 

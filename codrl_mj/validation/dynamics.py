@@ -135,7 +135,9 @@ def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
     task = find_task(task_name)
     missing = without_oracle(task)
     if missing or task.reference_states is None:
-        yield Skipped("all checks", missing or "it names no states to try it in: Task.reference_states")
+        yield Skipped(
+            "all checks", missing or "it names no states to try it in: Task.reference_states"
+        )
         return
     flat = len(task.state_names) == 2
     points = (9 if flat else 3) if quick else (51 if flat else 7)

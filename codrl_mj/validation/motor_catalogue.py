@@ -171,7 +171,9 @@ def fitted_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
     inner, arm, speed = task.motor_inner_steps, one.arm_radius, task.speed_indices[0]
     longest = round((5e4 if quick else 5e5) / (task.step_duration * one.controller.sample_rate))
     steps = min(
-        longest, task.max_episode_steps or longest, (task.reference_states and task.reference_states.horizon) or longest
+        longest,
+        task.max_episode_steps or longest,
+        (task.reference_states and task.reference_states.horizon) or longest,
     )
     timestep, state = task.step_duration / inner, task.draw_initial_state(generator, None)
     physics = MujocoPhysics(SimulationConfig(task, [one], inner, integrator))

@@ -31,8 +31,8 @@ from codrl_mj.actuators import (
     spectral_radius,
 )
 from codrl_mj.engine import load_family
-from codrl_mj.engine.model_access import shaft_inertia
 from codrl_mj.engine.families import SLOT_HEADER_SIZE, SlotHeader, slot_size
+from codrl_mj.engine.model_access import shaft_inertia
 from codrl_mj.engine.reading import actuators_sharing_motor, motor_slots
 from codrl_mj.engine.specs import describe_duplicate_dynamics
 from codrl_mj.physics import SimulationConfig, install_callbacks, motors

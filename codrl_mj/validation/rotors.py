@@ -170,7 +170,8 @@ EVERY_FEATURE = Loop(
 def standard_loops() -> dict[str, Loop]:
     """The paper's loop of each of our tasks at the task's inner step, and one with every feature."""
     paper = {
-        task.name: Loop(task.paper[0], task.step_duration / task.motor_inner_steps) for task in PAPER_TASKS
+        task.name: Loop(task.paper[0], task.step_duration / task.motor_inner_steps)
+        for task in PAPER_TASKS
     }
     return {**paper, "every feature": EVERY_FEATURE}
 

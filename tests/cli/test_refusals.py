@@ -125,7 +125,9 @@ OF_A_RUN = [
 ]
 
 
-@pytest.mark.parametrize(("line", "says"), [*REFUSED, *OF_TRAINING, *matrix_params(OF_A_RUN[:6], OF_A_RUN)])
+@pytest.mark.parametrize(
+    ("line", "says"), [*REFUSED, *OF_TRAINING, *matrix_params(OF_A_RUN[:6], OF_A_RUN)]
+)
 def test_a_line_that_cannot_be_followed_costs_one_line(capsys, trained, line, says):
     before = contents(trained)
     assert says in refused(capsys, line.replace("RUN", str(trained)))

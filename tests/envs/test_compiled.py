@@ -71,7 +71,9 @@ def _plain_step(env, task, state, force):
             data.qpos[:], data.qvel[:] = state[positions], state[velocities]
     if env.actuator == IDEAL:
         return state, force
-    return state, env.actuator.motor.torque_constant * data.act[signals_offset(DCMotorActuator)] / arm
+    return state, env.actuator.motor.torque_constant * data.act[
+        signals_offset(DCMotorActuator)
+    ] / arm
 
 
 @every_rebuilt

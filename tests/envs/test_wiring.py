@@ -73,7 +73,10 @@ OFF = {  # feature -> the change that takes it away, and what else both sides of
 @functools.cache
 def _episode(task, physics, integrator, actuator):
     """States, and traces of all integration steps, under random actions: of the environment, and of the oracle."""
-    env, driver = ActuatedEnv(task, actuator, physics, integrator=integrator), TASKS[task].reference_env()
+    env, driver = (
+        ActuatedEnv(task, actuator, physics, integrator=integrator),
+        TASKS[task].reference_env(),
+    )
     env.reset(seed=0)
     env.action_space.seed(0)
     motor, state = MotorSimulation(actuator), env.state

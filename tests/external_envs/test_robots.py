@@ -50,7 +50,9 @@ def robot():
     gym.registry.pop("ForeignRobot-v0", None)
 
 
-@pytest.mark.parametrize("path", matrix_params(MENAGERIE[5:6], MENAGERIE), ids=lambda path: path.parent.name)
+@pytest.mark.parametrize(
+    "path", matrix_params(MENAGERIE[5:6], MENAGERIE), ids=lambda path: path.parent.name
+)
 def test_ideal_motors_change_no_bit_of_robots_that_one_can_buy(path, robot):
     env_id = robot(path)
     plain, ours = gym.make(env_id), codrl_mj.make(env_id, IDEAL)

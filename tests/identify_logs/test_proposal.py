@@ -248,7 +248,7 @@ def test_columns_are_proposed_and_valid_once_the_units_are_filled_in(tmp_path, s
     ],
 )
 def test_a_unit_keeps_the_factor_that_a_header_states(tmp_path, header, expected, factor):
-    path = written(tmp_path, {"t [s]": TIME, "U [V]": VOLTS, header: CURRENT})
+    path = write_columns(tmp_path, {"t [s]": TIME, "U [V]": VOLTS, header: CURRENT})
     columns = propose_columns(path).columns
     assert columns.endswith(f",{expected}")
     log = read_log(path, columns)
@@ -259,7 +259,7 @@ def test_a_unit_keeps_the_factor_that_a_header_states(tmp_path, header, expected
     "header", ["position (deg x10)", "speed [rpm/10]", "current_10mA", "pos_01deg", "pos_x100_deg"]
 )
 def test_a_factor_that_can_be_read_in_two_ways_leaves_the_unit_open(tmp_path, header):
-    path = written(tmp_path, {"t [s]": TIME, "U [V]": VOLTS, header: CURRENT})
+    path = write_columns(tmp_path, {"t [s]": TIME, "U [V]": VOLTS, header: CURRENT})
     assert propose_columns(path).columns.endswith(":UNIT")
 
 

@@ -339,7 +339,8 @@ def arrivals(task, actuator, episodes=5):
 
 
 @pytest.mark.parametrize(
-    "task", matrix_params(["pendulum"], ["pendulum", "cartpole", "acrobot", "mountain_car_continuous"])
+    "task",
+    matrix_params(["pendulum"], ["pendulum", "cartpole", "acrobot", "mountain_car_continuous"]),
 )
 def test_the_first_choice_does_the_task_in_the_engine(task):
     assert arrivals(task, choose(demand_of(task))[0].drive) == 5

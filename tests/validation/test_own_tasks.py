@@ -5,10 +5,10 @@ import itertools
 
 import numpy as np
 import pytest
+from codrl_mj.tasks.twin import Trials
 
 import codrl_mj
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator
-from codrl_mj.tasks.twin import Trials
 from codrl_mj.validation import validate, validate_model
 from codrl_mj.validation.mutations import wrong_model
 from codrl_mj.validation.table import REPORT
