@@ -28,7 +28,7 @@ from codrl_mj.tasks import TASKS
 from codrl_mj.validation import (
     GROUPS,
     MUTATIONS,
-    Caught,
+    MutationResult,
     Certificate,
     Check,
     Skipped,
@@ -40,8 +40,8 @@ from codrl_mj.validation import (
     validate_model,
 )
 from codrl_mj.validation.compare import differences
-from codrl_mj.validation.mutations import edited, unfailed, wrong_loop, wrong_model
-from codrl_mj.validation.table import TABLE, Case, outcome
+from codrl_mj.validation.mutations import compile_edited, undetected_checks, wrong_loop, wrong_model
+from codrl_mj.validation.table import TABLE, Case, evaluate_cases
 from codrl_mj.validation.trajectories import Growth
 from codrl_mj.viz.pages import certificate as page
 from tests.add_motors.models import ACTUATORS, INTEGRATORS, LOOP, arm, behind_plugin
@@ -82,7 +82,7 @@ def one_check(**fields):
     )
 
 
-# -- it passes ----------------------------------------------------------------------------------------------
+# -- it passes -------------------------------------------------------------------------------------
 
 
 def test_the_quick_certificate_passes(certificate):
@@ -229,7 +229,7 @@ def test_parts_are_told_as_they_begin():
     assert parts[-1][:2] == (4, 4)
 
 
-# -- it can fail --------------------------------------------------------------------------------------------
+# -- it can fail -----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -244,13 +244,13 @@ def test_every_fault_is_caught_in_every_task_and_far_beyond_the_tolerance(caught
     assert {outcome.mutation for outcome in caught} == made
     assert len(made) >= len(MUTATIONS) - 1
     assert [(outcome.mutation, outcome.task) for outcome in caught if not outcome.failed] == []
-    assert min(outcome.clearest.beyond for outcome in caught) > 5
+    assert min(outcome.clearest_failure.tolerance_ratio for outcome in caught) > 5
 
 
 @pytest.mark.matrix
 def test_every_check_is_failed_by_some_fault(certificate, caught):
     checks = [check for check in certificate.checks if check.task in ("pendulum", "")]
-    assert [(check.group, check.task, check.name) for check in unfailed(checks, caught)] == []
+    assert [(check.group, check.task, check.name) for check in undetected_checks(checks, caught)] == []
 
 
 @pytest.mark.slow
@@ -259,7 +259,7 @@ def test_every_check_of_every_task_is_failed_by_some_fault(certificate, of_other
     assert [(outcome.mutation, outcome.task) for outcome in outcomes if not outcome.failed] == []
     every = (*certificate.checks, *of_others.checks)
     checks = [check for check in every if check.task in ("", *REBUILT)]  # in which faults are made
-    assert unfailed(checks, outcomes) == []
+    assert undetected_checks(checks, outcomes) == []
 
 
 @pytest.mark.matrix
@@ -341,7 +341,7 @@ def test_a_wrong_loop_is_undone_after_an_error(installed):
 
 def test_an_edit_whose_text_is_gone_is_an_error_and_not_a_passed_test():
     with pytest.raises(ValueError, match="occurs 0 times"):
-        edited(sys.modules["codrl_mj.actuators.current_loop"], [("no such text", "")])
+        compile_edited(sys.modules["codrl_mj.actuators.current_loop"], [("no such text", "")])
 
 
 def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
@@ -359,7 +359,7 @@ def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
     )
 
 
-# -- numbers that are none ----------------------------------------------------------------------------------
+# -- numbers that are none -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -369,11 +369,11 @@ def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
 def test_a_check_passes_up_to_its_tolerance_and_never_on_nan(worst, passed):
     check = one_check(worst=worst, tolerance=1e-12)
     assert check.passed is passed
-    assert (check.beyond > 1) is not passed
+    assert (check.tolerance_ratio > 1) is not passed
 
 
 def worst_of(*cases):
-    found = outcome(Check("name", "oracle", 1.0), {}, [Case(*case) for case in cases])
+    found = evaluate_cases(Check("name", "oracle", 1.0), {}, [Case(*case) for case in cases])
     return found.worst, found.where
 
 
@@ -455,7 +455,7 @@ def test_no_checks_are_no_certificate():
     assert not Certificate("nothing", (), (), False, 0.0).passed
 
 
-# -- how it measures ----------------------------------------------------------------------------------------
+# -- how it measures -------------------------------------------------------------------------------
 
 
 def test_angles_are_compared_on_the_circle_only_where_both_were_wrapped():
@@ -497,7 +497,7 @@ def test_bits_are_compared_and_not_values():
     assert execution.differing(np.array([np.nan]), np.array([np.nan])).tolist() == [False]
 
 
-# -- a model of one's own -----------------------------------------------------------------------------------
+# -- a model of one's own --------------------------------------------------------------------------
 
 TWO_MOTORS = """
 <mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="5 5 .1"/>
@@ -644,7 +644,7 @@ def test_the_users_model_is_left_as_it_was():
     assert model.opt.disableflags == flags
 
 
-# -- bad input ----------------------------------------------------------------------------------------------
+# -- bad input -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -652,8 +652,8 @@ def test_the_users_model_is_left_as_it_was():
     [
         ("acrobat", None, "did you mean 'acrobot'"),
         ("acrobot", ["dynamic"], r"'dynamic'.*dynamics, trajectories"),
-        ([], None, r"tasks = \[\].*must name one at least"),
-        (None, [], r"groups = \[\].*must name one at least"),
+        ([], None, r"tasks = \[\].*must name at least one"),
+        (None, [], r"groups = \[\].*must name at least one"),
     ],
 )
 def test_what_is_no_task_or_group_or_none_of_them_is_refused(tasks, groups, message):
@@ -708,7 +708,7 @@ def test_bad_input_costs_one_line_and_leaves_nothing(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bare.xml", "broken.xml"]
 
 
-# -- the files ----------------------------------------------------------------------------------------------
+# -- the files -------------------------------------------------------------------------------------
 
 
 BAD = one_check(name="b <i>", group="motor", worst=math.nan, where="x < y & z", unit="A", task="")
@@ -754,7 +754,7 @@ def test_plots_can_be_looked_at(certificate):
 
 def test_the_json_holds_the_verdict_and_every_number(tmp_path):
     json_file, html_file = page.write(
-        SAMPLE, tmp_path / "new" / "folder", [Caught("m", "", (BAD,), 2)]
+        SAMPLE, tmp_path / "new" / "folder", [MutationResult("m", "", (BAD,), 2)]
     )
     content = json.loads(json_file.read_text())
     assert content["verdict"] == "FAILED"
@@ -779,7 +779,7 @@ def test_a_certificate_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-# -- the command line ---------------------------------------------------------------------------------------
+# -- the command line ------------------------------------------------------------------------------
 
 
 def test_the_command_prints_writes_and_exits_with_0(capsys, tmp_path):
@@ -825,8 +825,8 @@ def test_a_fault_that_is_missed_fails_the_command(capsys, monkeypatch, missed, s
     monkeypatch.setattr(
         "codrl_mj.validation.validate", lambda *_, **__: Certificate("c", (good,), (), False, 1.0)
     )
-    outcomes = [Caught("fault", "cartpole", (failed,), 1)] + [
-        Caught("other", "cartpole", (), 1)
+    outcomes = [MutationResult("fault", "cartpole", (failed,), 1)] + [
+        MutationResult("other", "cartpole", (), 1)
     ] * missed
     monkeypatch.setattr("codrl_mj.validation.try_mutations", lambda *_, **__: outcomes)
     assert main(["validate", "cartpole", "--mutations"]) == status

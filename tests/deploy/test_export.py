@@ -110,7 +110,7 @@ def test_the_table_is_the_policy(tmp_path):
     np.testing.assert_array_equal(done.on_board[1].action, done.in_python[1].action)
 
 
-# -- the folder ---------------------------------------------------------------------------------------------
+# -- the folder ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

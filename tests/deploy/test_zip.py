@@ -94,7 +94,7 @@ def _elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-# -- statistics ---------------------------------------------------------------------------------------------
+# -- statistics ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("double", [False, True], ids=["float", "double"])
@@ -257,7 +257,7 @@ def test_statistics_are_for_zips_alone(capsys):
     assert "runs/mine is no zip of Stable-Baselines3: leave it out" in capsys.readouterr().err
 
 
-# -- units --------------------------------------------------------------------------------------------------
+# -- units -----------------------------------------------------------------------------------------
 
 
 VOLTS = {"actuator": {"name": "paper", "controller": {"max_voltage": 12.0}}, "action": "voltage"}

@@ -82,7 +82,7 @@ def test_a_wrong_force_on_the_analytic_physics_fails_every_check(monkeypatch):
     )
 
 
-# -- the oracle ---------------------------------------------------------------------------------------------
+# -- the oracle ------------------------------------------------------------------------------------
 
 
 def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
@@ -142,7 +142,7 @@ def test_the_runs_stay_away_from_every_bound(task, motor):
     """Solution and coarsest run, at every integration step of it."""
     definition = TASKS[task]
     start, forces, _ = free_run(definition)
-    actuators = convergence.analogues(definition) if motor else [IDEAL]
+    actuators = convergence.continuous_actuators(definition) if motor else [IDEAL]
     states = [*solve(definition, gymnasium_equations(definition), start, forces, actuators)]
     unbounded = dataclasses.replace(
         definition, step_duration=definition.step_duration / 128, constrain=None

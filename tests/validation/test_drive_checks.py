@@ -8,7 +8,7 @@ import pytest
 
 from codrl_mj.actuators import Drive, GearMotor
 from codrl_mj.tasks import OURS, TASKS
-from codrl_mj.validation.motor_catalogue import FITTED, Bench, Mechanics, drive_checks, fitted
+from codrl_mj.validation.motor_catalogue import TASK_MOTORS, DriveOracle, JointOracle, drive_checks, task_drive
 
 ROTOR = GearMotor(
     rotor_inertia=0.02, viscous_friction=0.3, coulomb_friction=0.4, gear_ratio=2.0, arm_radius=0.8
@@ -39,7 +39,7 @@ def accelerations(task, state, force, inertia):
 def test_the_oracle_moves_as_mass_matrices_with_a_rotor_say(task, state, integrator):
     """While it slides; the damping of a semi-implicit step is that of the new speed."""
     definition, step = TASKS[task], 1e-3
-    after = Mechanics(definition, Drive(ROTOR), step, integrator).step(np.array(state), 0.6)
+    after = JointOracle(definition, Drive(ROTOR), step, integrator).step(np.array(state), 0.6)
     speeds = list(definition.qvel)
     sliding = 0.6 - DAMPING * state[1] - math.copysign(FRICTION, state[1])
     implicit = step * DAMPING if integrator == "semi-implicit" else 0.0
@@ -51,7 +51,7 @@ def test_the_oracle_moves_as_mass_matrices_with_a_rotor_say(task, state, integra
 
 def test_the_oracle_holds_what_is_less_than_the_friction():
     pendulum, state = TASKS["pendulum"], np.array([math.pi, 0.0])
-    mechanics = Mechanics(pendulum, Drive(ROTOR), 0.05, "semi-implicit")
+    mechanics = JointOracle(pendulum, Drive(ROTOR), 0.05, "semi-implicit")
     for _ in range(40):
         state = mechanics.step(state, 0.9)
     assert abs(state[0] - math.pi) < 0.05
@@ -62,26 +62,26 @@ def test_the_oracle_holds_what_is_less_than_the_friction():
 
 def test_the_bench_settles_at_what_is_asked_or_at_ohm_s_law():
     one = Drive()
-    bench = Bench(one, 0.01)
+    bench = DriveOracle(one, 0.01)
     torques = [bench.torque(0.05, 100.0) for _ in range(3)]
     assert torques[-1] == pytest.approx(0.05, rel=1e-9)
     stalled = [bench.torque(10.0, 100.0) for _ in range(3)]
     assert stalled[-1] == pytest.approx(0.042 * (24.0 - 0.042 * 100.0) / 8.4, rel=1e-9)
-    lossy = Bench(
+    lossy = DriveOracle(
         dataclasses.replace(one, motor=dataclasses.replace(one.motor, gear_efficiency=0.8)), 0.01
     )
     assert [lossy.torque(0.05, 100.0) for _ in range(3)][-1] == pytest.approx(0.04, rel=1e-9)
 
 
 def test_every_task_has_a_drive_and_together_they_have_every_addition():
-    assert FITTED.keys() == {task.name for task in OURS}
-    drives = [fitted(name) for name in FITTED]
-    assert len({name for name, *_ in FITTED.values()}) == len(FITTED)
+    assert TASK_MOTORS.keys() == {task.name for task in OURS}
+    drives = [task_drive(name) for name in TASK_MOTORS]
+    assert len({name for name, *_ in TASK_MOTORS.values()}) == len(TASK_MOTORS)
     assert all(any(one.additions[entry] > 0.0 for one in drives) for entry in range(3))
 
 
 def test_a_wrong_motor_fails(monkeypatch):
     """The comparison with the oracle sees a torque that is off by a thousandth; that of two of ours does not."""
-    torque = Bench.torque
-    monkeypatch.setattr(Bench, "torque", lambda self, *inputs: 1.001 * torque(self, *inputs))
+    torque = DriveOracle.torque
+    monkeypatch.setattr(DriveOracle, "torque", lambda self, *inputs: 1.001 * torque(self, *inputs))
     assert [check.passed for check in drive_checks(quick=True)] == [False, True]

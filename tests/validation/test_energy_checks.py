@@ -7,7 +7,7 @@ from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationDivergedError
 from codrl_mj.tasks import TASKS
 from codrl_mj.validation import energy, validate
-from codrl_mj.validation.energy import Meter, hill_potential, keep
+from codrl_mj.validation.energy import Meter, hill_potential, record_energies
 from tests.validation.mutations import euler, failed, once, rusty, scaled, scaled_motor, wrong_model
 
 pytestmark = pytest.mark.usefixtures("bare_engine")
@@ -26,7 +26,7 @@ def orders(task, *balances):
 
 def failures(monkeypatch, task):
     """The checks that fail of a fault in MuJoCo: analytic runs, which it does not move, are made once."""
-    monkeypatch.setattr(energy, "keep", once(energy.keep, MujocoPhysics))
+    monkeypatch.setattr(energy, "record_energies", once(energy.record_energies, MujocoPhysics))
     return failed(energy.checks(task, quick=True))
 
 
@@ -89,7 +89,7 @@ def test_a_run_that_diverges_is_a_failed_check(monkeypatch):
     assert all(not check.passed and "it diverged" in check.where for check in checks)
 
 
-# -- the ledger ---------------------------------------------------------------------------------------------
+# -- the ledger ------------------------------------------------------------------------------------
 
 
 def test_the_meter_reads_textbook_energies():
@@ -120,7 +120,7 @@ def test_the_hills_potential_is_the_integral_of_gymnasiums_force(task):
 def test_a_loaded_spring_of_a_motor_pays_for_everything():
     """Signs: a motor that accelerates a load draws more than it heats; what it gives back is negative."""
     task = TASKS["mountain_car"]
-    ledger = keep(
+    ledger = record_energies(
         MujocoPhysics, task, task.paper, np.array([-0.5, 0.0]), np.ones(20), 20, "semi-implicit", 20
     )
     assert ledger.supplied[-1] > ledger.copper[-1] > 0

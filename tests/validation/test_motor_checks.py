@@ -52,14 +52,14 @@ EVERY = LOOP | {VOLTAGE, LINE, NO_LOAD, RK4, GEM} | NATIVE | COMPILED | DRIVES
 MINE = {"every feature": EVERY_FEATURE}
 MOTORS = {"every feature": EVERY_FEATURE.actuator.motor}
 MADE = (  # names -> their checks, with a few loops and motors only
-    ({ORDER, LIMIT}, lambda: motor.analogue(MINE, quick=True)),
+    ({ORDER, LIMIT}, lambda: motor.order_to_closed_form(MINE, quick=True)),
     ({SAMPLED, STEP, MAGNITUDE, PHASE}, lambda: motor.sampled_checks(MINE, quick=True)),
     ({VOLTAGE}, lambda: motor.voltage_limit(MINE)),
     ({LINE}, lambda: motor.torque_speed_line(MOTORS)),
     ({NO_LOAD}, lambda: motor.no_load(MOTORS)),
-    ({MAP}, lambda: motor.same_map(SMALL, quick=True)),
-    ({SUB}, lambda: motor.substeps(SMALL, quick=True)),
-    ({FAST}, lambda: motor.implicitfast(SMALL, quick=True)),
+    ({MAP}, lambda: motor.equal_to_native(SMALL, quick=True)),
+    ({SUB}, lambda: motor.order_in_substeps(SMALL, quick=True)),
+    ({FAST}, lambda: motor.order_under_implicitfast(SMALL, quick=True)),
     (COMPILED, lambda: own_model.compiled_checks(quick=True)),
     ({RK4}, lambda: motor.rk4_check(quick=True)),
     ({GEM}, lambda: motor.gem_check(Motor(), quick=True)),
@@ -159,14 +159,14 @@ def test_a_command_that_is_a_step_late_fails(monkeypatch):
 
 
 def test_a_task_has_its_own_loop_checked(monkeypatch):
-    monkeypatch.setattr(motor, "checks_of", lambda loops, _: iter([list(loops)]))
+    monkeypatch.setattr(motor, "loop_checks", lambda loops, _: iter([list(loops)]))
     assert next(motor.checks("cartpole", quick=True)) == ["cartpole"]
 
 
 def test_a_motor_that_never_saturates_and_one_without_back_emf_have_their_own_checks():
     quiet = DCMotorActuator(Motor(back_emf_constant=0.0), CurrentLoop(max_voltage=math.inf))
     names = {
-        check.name: check for check in motor.checks_of({"mine": Loop(quiet, 0.01)}, quick=True)
+        check.name: check for check in motor.loop_checks({"mine": Loop(quiet, 0.01)}, quick=True)
     }
     assert names.keys() == LOOP | {LINE}
     assert all(check.passed for check in names.values())
@@ -176,7 +176,7 @@ def test_a_motor_that_never_saturates_and_one_without_back_emf_have_their_own_ch
 def test_a_motor_behind_a_supply_is_held_to_the_torque_that_this_leaves(supply):
     actuator = DCMotorActuator(controller=CurrentLoop(kp=2.0, ki=5.0), supply=supply)
     checks = {
-        check.name: check for check in motor.checks_of({"mine": Loop(actuator, 0.01)}, quick=True)
+        check.name: check for check in motor.loop_checks({"mine": Loop(actuator, 0.01)}, quick=True)
     }
     assert checks["stall torque at the voltage limit"].passed
 
@@ -192,11 +192,11 @@ def test_a_stiff_motor_passes_at_its_own_substeps():
         ),
         CurrentLoop(kp=0.5, ki=800.0, substeps=40),
     )
-    for check in motor.checks_of({"mine": Loop(stiff, 0.01)}, quick=True):
+    for check in motor.loop_checks({"mine": Loop(stiff, 0.01)}, quick=True):
         assert check.passed, check
 
 
-# -- the oracles --------------------------------------------------------------------------------------------
+# -- the oracles -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [*standard_loops()])
@@ -258,7 +258,7 @@ def test_the_native_motor_is_wrong_under_rk4_and_ours_is_not():
 
 
 def test_without_gym_electric_motor_its_check_is_left_out(monkeypatch):
-    for name in ("checks_of", "compiled_checks", "drive_checks"):
+    for name in ("loop_checks", "compiled_checks", "drive_checks"):
         monkeypatch.setattr(motor, name, lambda *_: iter(()))
     monkeypatch.setattr(motor, "MOTORS", SMALL)
     monkeypatch.setitem(sys.modules, "gym_electric_motor", None)

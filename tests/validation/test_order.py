@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from codrl_mj.validation.table import Family, fit_slope, of_order, order, outcome
+from codrl_mj.validation.table import ConvergenceSeries, fit_slope, order_case, order_check, evaluate_cases
 
 STEPS = 0.1 / 2.0 ** np.arange(5)
 
 
 def check(errors, promised):
-    return judged(Family("family", STEPS, np.asarray(errors)), promised)
+    return distance_from(ConvergenceSeries("family", STEPS, np.asarray(errors)), promised)
 
 
-def judged(family, promised):
-    return outcome(
-        order("name", "oracle"),
+def distance_from(family, promised):
+    return evaluate_cases(
+        order_check("name", "oracle"),
         {},
-        [of_order(promised, [family], "title", "step [s]", "error [m]")],
+        [order_case(promised, [family], "title", "step [s]", "error [m]")],
     )
 
 
@@ -71,8 +71,8 @@ def test_what_is_not_of_the_promised_order_fails(errors):
     ],
 )
 def test_an_order_is_not_fitted_to_rounding(errors, passed, said):
-    family = Family("family", STEPS, np.array(errors), 1e-15)
-    found = judged(family, 4.0)
+    family = ConvergenceSeries("family", STEPS, np.array(errors), 1e-15)
+    found = distance_from(family, 4.0)
     assert found.passed == passed
     assert said in found.where
 

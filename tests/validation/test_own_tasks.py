@@ -99,13 +99,13 @@ CASES = {
         (('<body name="rod"', '<body name="rod" gravcomp="1"'),),
         {},
         TWO,
-        "the model has gravity compensation, whose energy no balance knows: leave that out",
+        "the model has gravity compensation, whose energy is in no balance: remove it",
     ),
     "another actuator": (
         (("</actuator>", '<position joint="hinge" kp="0.1"/></actuator>'),),
         {},
         TWO,
-        "the model has actuators besides the task's motors, whose energy no balance knows",
+        "the model has actuators besides the task's motors, whose energy is in no balance",
     ),
     "quadratic drag": (
         (('timestep="0.001"', 'timestep="0.001" density="1000" viscosity="0.001"'),),
@@ -142,7 +142,7 @@ def test_a_fault_of_ours_is_still_found_in_somebodys_task_and_said_to_be_ours(tm
         found = judged(task)
     failed = {check.name: check.fault for check in found.checks if not check.passed}
     assert (
-        "textbook steps of such sizes have this order: " + REPORT
+        "textbook steps of the same size have this order: " + REPORT
         in failed["order, rk4, ideal actuator"]
     )
     assert "gentler run in Task.trials" in failed["order, mechanical balance, rk4"]
@@ -158,7 +158,7 @@ def test_an_unstable_motor_is_its_owners():
     assert (
         failed
         == [
-            "your model or motor is not stable at this step: shorten it, or slow down the motor's"
+            "your model or motor is not stable at this step: shorten the step, or slow down the motor's"
             " loop"
         ]
         * 2
