@@ -90,7 +90,7 @@ def _compiled_once(tmp_path_factory):
 def test_episodes_on_the_board_are_those_of_onnxruntime(folder, target):
     done = board_test(folder, target, 3, seed=5)
     assert done.frames == sum(len(one.time) for one in done.on_board)
-    assert (done.refused, done.unanswered, done.alike) == (0, 0, 3)
+    assert (done.refused, done.unanswered, done.num_equal_returns) == (0, 0, 3)
     np.testing.assert_allclose(done.returns[:, 0], done.returns[:, 1], rtol=1e-3)
 
 
@@ -212,7 +212,7 @@ def test_a_bridge_comes_behind_a_policy_that_commands_voltages(tmp_path, task):
     assert not np.allclose(exact, np.round(exact), atol=1e-3)
     # What the policy commanded is logged as it is: `board check` finds it again.
     contract = Contract.read(tmp_path / "out")
-    commanded = contract.commands(done.on_board[0].action).ravel() / step
+    commanded = contract.to_commands(done.on_board[0].action).ravel() / step
     np.testing.assert_allclose(coarse, np.round(commanded), atol=1e-6)
     with pytest.raises(
         ValueError, match="the policy commands voltages, and the C measures no current"
@@ -261,14 +261,14 @@ def test_a_contract_that_names_a_module_takes_trust(tmp_path, monkeypatch, capsy
         assert main([*line, *options, "--trust"]) == 0
     with pytest.raises(ValueError, match="trust=True"):
         board_test(tmp_path / "out", episodes=1)
-    assert board_test(tmp_path / "out", episodes=1, trust=True).alike == 1
+    assert board_test(tmp_path / "out", episodes=1, trust=True).num_equal_returns == 1
 
 
 @of_furuta
 def test_encoders_and_late_answers_come_between(folder):
     contract, step = Contract.read(folder), 2.0 * np.pi / 2048
     row = np.array(contract.golden["observations"][50])
-    seen = Link(counts=2048).encoded(contract, row)
+    seen = Link(counts=2048).quantize(contract, row)
     for place in (0, 2):
         angle = np.arctan2(seen[place + 1], seen[place])
         assert angle / step == pytest.approx(round(angle / step), abs=1e-9)
@@ -323,10 +323,10 @@ def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
     rows = np.array([[1.0, 0.0, np.cos(one), np.sin(one), 3.0 * one, 0.0] for one in angles])
     fine = (np.abs(angles) < 3.0) & (np.abs(3.0 * angles) < 4.0)
     assert 20 < fine.sum() < 180
-    np.testing.assert_array_equal(contract.within(rows), fine)
+    np.testing.assert_array_equal(contract.is_within_limits(rows), fine)
     with Board(tmp_path / "out") as board:
         commands = np.array([board.command(row) for row in rows])
-        assert board.stopped == (~fine).sum()
+        assert board.beyond_limits == (~fine).sum()
     assert not commands[~fine].any()
     assert commands[fine].all()
     np.testing.assert_allclose(python.predict(rows)[0], commands, atol=1e-6)
@@ -378,7 +378,7 @@ def test_an_answer_is_found_again_behind_noise(folder, noise):
     for sequence in range(1, 21):
         content = struct.pack(f"<BBI{len(numbers)}d", sequence, OK, 0, *numbers)
         os.write(said, b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF)))
-        answer = wire.asked(b"", sequence, 0.2)
+        answer = wire.request(b"", sequence, 0.2)
         assert answer is not None
         assert (answer.sequence, answer.status) == (sequence, OK)
         np.testing.assert_array_equal(answer.observation, numbers[: len(contract.observations)])

@@ -14,9 +14,9 @@ from codrl_mj.actuators import DCMotorActuator, Drive, Servo, ServoLoop, Supply,
 from codrl_mj.actuators.drive import State
 from codrl_mj.actuators.model import Inputs
 from codrl_mj.actuators.parameters import parameters_type
-from codrl_mj.deploy import Contract, network_of
+from codrl_mj.deploy import Contract, extract_network
 from codrl_mj.deploy.c_code import c_files, check_board
-from codrl_mj.deploy.loops import current_loop
+from codrl_mj.deploy.loops import loop_parameters
 from codrl_mj.envs.config import EnvConfig
 from tests.deploy.test_export import EACH, observed, trained
 from tests.matrix import but
@@ -37,8 +37,8 @@ def each(names, in_float):
 def written(folder, task, agent="ppo", settings=(), double=False, **changes):
     """The C files of a policy with random weights, the policy, and its contract."""
     policy, _ = trained(task, agent, **dict(settings))
-    contract = Contract.of(policy, EnvConfig(task, **changes), agent, 1, double=double)
-    for name, content in c_files(network_of(policy), contract).items():
+    contract = Contract.from_policy(policy, EnvConfig(task, **changes), agent, 1, double=double)
+    for name, content in c_files(extract_network(policy), contract).items():
         (folder / name).write_text(content)
     return policy, contract
 
@@ -66,7 +66,7 @@ def test_the_policy_in_c_is_the_policy(tmp_path, task, agent, settings, double):
     policy, contract = written(tmp_path, task, agent, settings, double)
     library, kind = compiled(tmp_path, double)
     seen = observed(policy.observation_space, 2000)
-    network = network_of(policy)
+    network = extract_network(policy)
     expected = network(seen, np.float64) if double else policy.predict(seen, deterministic=True)[0]
     command = (kind * len(contract.actions))()
     got = np.empty((len(seen), len(contract.actions)))
@@ -272,7 +272,7 @@ def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name,
     ],
 )
 def test_without_a_drive_s_loop_there_is_the_policy_alone(tmp_path, task, changes):
-    assert current_loop(EnvConfig(task, **changes)) is None
+    assert loop_parameters(EnvConfig(task, **changes)) is None
     written(tmp_path, task, **changes)
     assert "current_step" not in (tmp_path / "controller.h").read_text()
 
@@ -309,7 +309,7 @@ MLP, SARSA = ("pendulum", "ppo"), ("acrobot", "sarsa")
     ],
 )
 def test_a_policy_that_does_not_fit_is_refused_with_both_sizes(board, policy, hidden, double, says):
-    network = network_of(trained(*policy, **({"hidden": (hidden, hidden)} if hidden else {}))[0])
+    network = extract_network(trained(*policy, **({"hidden": (hidden, hidden)} if hidden else {}))[0])
     check_board("nucleo-f446re", network, double=False)
     with pytest.raises(ValueError, match=says):
         check_board(board, network, double)

@@ -43,7 +43,7 @@ def test_a_rig_that_is_the_simulation_does_what_it_does(logged, task):
     assert found.simulated.shape == episode.observation[:-1].shape
     np.testing.assert_array_equal(found.simulated[found.starts], found.logged[found.starts])
     np.testing.assert_allclose(found.simulated, found.logged, atol=2e-4)  # observations are float32
-    assert (found.moved > 100.0 * found.errors).all()
+    assert (found.baseline_errors > 100.0 * found.errors).all()
 
 
 def test_another_motor_is_seen_and_what_identifies_it_takes_the_difference_away(logged, tmp_path):
@@ -68,7 +68,7 @@ def test_windows_begin_at_what_was_observed_and_the_motor_goes_on(logged):
     assert whole.starts.tolist() == [0]
     np.testing.assert_allclose(whole.simulated, whole.logged, atol=1e-6)
     held = found.logged[np.repeat(found.starts, 10)[: len(found.time)]]
-    np.testing.assert_allclose(found.moved, np.sqrt(((held - found.logged) ** 2).mean(axis=0)))
+    np.testing.assert_allclose(found.baseline_errors, np.sqrt(((held - found.logged) ** 2).mean(axis=0)))
 
 
 def test_a_log_has_what_the_motor_did(logged):
@@ -118,11 +118,11 @@ def test_what_cannot_be_compared_is_said(logged, tmp_path, capsys):
     }.items():
         assert main(["identify", "compare", *map(str, (log.parent / "out", *more))]) == 2
         assert says in capsys.readouterr().err
-    with pytest.raises(ValueError, match="the policy knows none"):
+    with pytest.raises(ValueError, match="unknown to the policy"):
         compare(EnvConfig("cartpole"), log)
     (drive,) = FURUTA.driven.values()
     with pytest.raises(
-        ValueError, match=r"as this motor gives it, is beyond the simulation's bound, \["
+        ValueError, match=r"converted to this motor, is beyond the simulation's bound, \["
     ):
         compare(FURUTA, log, actuator=drive.replaced({"motor.torque_constant": 1e3}))
 
@@ -143,7 +143,7 @@ def test_identify_reads_what_a_board_logged(tmp_path):
 
     Slow.held = np.zeros((1, 1), np.float32)
     (episode,) = run_episodes(Slow(), env.make, 1, 3)
-    write_log(tmp_path / "log.csv", Interface.between(env), episode)
+    write_log(tmp_path / "log.csv", Interface.from_env(env), episode)
     columns = 'time="time:s":s,torque="motor:N*m":N*m,position=unwrap(atan2("sin_angle:1","cos_angle:1"),2*pi)+pi:rad'
     log = read_log(tmp_path / "log.csv", columns)
     found = identify([log], rig="pendulum", known={"viscous_friction": 0.0})

@@ -13,7 +13,7 @@ from onnx.reference import ReferenceEvaluator
 from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.agents import AGENTS
 from codrl_mj.cli import main
-from codrl_mj.deploy import Contract, board_test, export, network_of, onnx_model
+from codrl_mj.deploy import Contract, board_test, export, extract_network, onnx_model
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy
 from codrl_mj.runs.policies import load_policy, save_policy
@@ -78,7 +78,7 @@ def test_other_runtimes_act_as_the_policy_does(task, agent, settings):
     policy, _ = trained(task, agent, **settings)
     seen = observed(policy.observation_space)
     acted = policy.predict(seen, deterministic=True)[0]
-    for run in runtimes(onnx_model(network_of(policy), {})):
+    for run in runtimes(onnx_model(extract_network(policy), {})):
         other = run(seen)
         assert other.dtype == acted.dtype
         if acted.dtype == np.int64:
@@ -194,22 +194,22 @@ def test_units_are_those_of_state_signals_and_commands(task, changes, units, act
 def test_observations_of_another_kind_or_rate_are_refused(exported, change, rate, message):
     contract = Contract.read(exported)
     rows = [(one["name"], one["unit"]) for one in contract.observations]
-    contract.admit(rows, 50.0)
+    contract.check_observations(rows, 50.0)
     with pytest.raises(ValueError, match=message):
-        contract.admit(change(rows), rate)
+        contract.check_observations(change(rows), rate)
 
 
 def test_another_actuator_is_refused_by_the_number_that_differs(exported):
     contract = Contract.read(exported)
     (drive,) = EnvConfig("furuta").driven.values()
-    contract.admit_actuators({"motor": drive})
+    contract.check_actuators({"motor": drive})
     weaker = drive.replaced({"supply.voltage": 6.0})
     for other, message in {
         weaker: r"supply\.voltage = 6\.0, must be 18\.0",
         DCMotorActuator(): "must be drive",
     }.items():
         with pytest.raises(ValueError, match=message):
-            contract.admit_actuators({"motor": other})
+            contract.check_actuators({"motor": other})
 
 
 def test_an_edited_contract_is_refused(exported, tmp_path):

@@ -69,7 +69,7 @@ def registered(request):
 @pytest.mark.parametrize("env_id", V5)
 def test_of_gymnasiums_environments(env_id):
     with gym.make(env_id) as env:
-        assert Interface.between(EnvConfig(env_id)).rate == pytest.approx(
+        assert Interface.from_env(EnvConfig(env_id)).rate == pytest.approx(
             1.0 / env.unwrapped.dt, rel=1e-9
         )
 
@@ -77,22 +77,22 @@ def test_of_gymnasiums_environments(env_id):
 def test_of_another_frame_skip():
     with gym.make("Hopper-v5", frame_skip=8) as env:
         assert env.unwrapped.dt == pytest.approx(0.016)
-        rate = Interface.between(EnvConfig("Hopper-v5", options={"frame_skip": 8})).rate
+        rate = Interface.from_env(EnvConfig("Hopper-v5", options={"frame_skip": 8})).rate
     assert rate == pytest.approx(62.5, rel=1e-9)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_of_tasks(task):
-    assert Interface.between(EnvConfig(task)).rate == pytest.approx(
+    assert Interface.from_env(EnvConfig(task)).rate == pytest.approx(
         1.0 / TASKS[task].step_duration, rel=1e-12
     )
 
 
 def test_of_a_world_and_of_a_task_of_ones_own():
-    assert Interface.between(EnvConfig("tests.envs.rig:RIG")).rate == pytest.approx(
+    assert Interface.from_env(EnvConfig("tests.envs.rig:RIG")).rate == pytest.approx(
         50.0
     )  # 10 steps of 2 ms
-    assert Interface.between(EnvConfig("tests.own_project.arm:TASK")).rate == pytest.approx(20.0)
+    assert Interface.from_env(EnvConfig("tests.own_project.arm:TASK")).rate == pytest.approx(20.0)
 
 
 @pytest.mark.parametrize(
@@ -104,13 +104,13 @@ def test_of_a_world_and_of_a_task_of_ones_own():
     indirect=["registered"],
 )
 def test_of_functions_that_make_environments(registered, rate):
-    assert Interface.between(EnvConfig(registered)).rate == pytest.approx(rate, rel=1e-9)
+    assert Interface.from_env(EnvConfig(registered)).rate == pytest.approx(rate, rel=1e-9)
 
 
 @pytest.mark.parametrize("registered", [functools.partial(repeated, 2, 3)], indirect=True)
 def test_steps_of_no_one_duration_are_refused(registered):
     with pytest.raises(ValueError, match=r"first steps take \[0\.02, 0\.03.*must be equal"):
-        Interface.between(EnvConfig(registered))
+        Interface.from_env(EnvConfig(registered))
 
 
 @pytest.mark.parametrize(

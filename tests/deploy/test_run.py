@@ -108,7 +108,7 @@ def test_a_board_is_watched_or_driven_and_what_it_says_is_a_log(
     log = tmp_path / "swing.csv"
     line = ["board", "run", str(folder), "--port", port(), "--out", str(log), "--seconds", "0.7"]
     assert main([*line, "--drive"] if drive else line) == 0
-    assert "told to" in capsys.readouterr().out
+    assert "requested" in capsys.readouterr().out
     header, rows = table_of(log)
     assert 15 <= len(rows) <= 37  # 50 a second, fewer on a machine that is busy
     assert header[-4:] == ["motor:N*m", "motor_voltage:V", "motor_current:A", "motor_position:rad"]
@@ -142,22 +142,22 @@ def test_a_board_is_watched_or_driven_and_what_it_says_is_a_log(
 )
 def test_a_board_that_drives_is_stopped_when_something_is_wrong(folder, port, tmp_path, worse, why):
     done = run_board(folder, port(10, worse), tmp_path / "log.csv", drive=True, seconds=5.0)
-    assert why in done.why
+    assert why in done.reason
     assert done.rows == 10 - done.missed  # on a machine that is busy an answer may come too late
     _, rows = table_of(tmp_path / "log.csv")
     assert rows[:-1, 7].all()
     assert rows[-1, 7] == 0.0  # in C
     watched = run_board(folder, port(10, worse), tmp_path / "log.csv", seconds=0.5)
-    assert watched.why == "told to"
+    assert watched.reason == "requested"
 
 
 def test_a_second_run_does_not_drive_with_the_command_of_the_first(folder, port, tmp_path):
     board = port()
-    assert run_board(folder, board, tmp_path / "first.csv", seconds=0.5).why == "told to"
+    assert run_board(folder, board, tmp_path / "first.csv", seconds=0.5).reason == "requested"
     again = run_board(
         folder, board, tmp_path / "again.csv", drive=True, seconds=5.0
     )  # no watchdog: stamps are old
-    assert "took a frame for old" in again.why
+    assert "took a frame for old" in again.reason
     _, rows = table_of(tmp_path / "again.csv")
     assert not rows[:, 8].any()  # what the drive got
 
@@ -171,7 +171,7 @@ def test_what_was_logged_is_kept_when_it_is_interrupted(folder, port, tmp_path):
             raise OSError("the cable is out")
 
     done = run_board(folder, port(), tmp_path / "log.csv", drive=True, seconds=5.0, on_answer=pull)
-    assert "the cable is out" in done.why
+    assert "the cable is out" in done.reason
     assert len(table_of(tmp_path / "log.csv")[1]) == done.rows == 8
 
 
@@ -196,7 +196,7 @@ def test_any_key_ends_it(folder, port, tmp_path):
         assert b"any key ends it" in running.stdout.readline()
         time.sleep(1.0)
         os.write(keys, b" ")
-        assert b"told to" in running.communicate(timeout=10)[0]
+        assert b"requested" in running.communicate(timeout=10)[0]
     assert running.returncode == 0
     for one in (keys, terminal):
         os.close(one)
@@ -207,7 +207,7 @@ def test_in_python_too_limits_are_kept(folder, port, tmp_path):
     done = run_board(
         tighter, port(), tmp_path / "log.csv", drive=True, seconds=5.0
     )  # whose C allows 20 rad/s
-    assert "beyond the limits" in done.why
+    assert "beyond the limits" in done.reason
     _, rows = table_of(tmp_path / "log.csv")
     assert len(rows) == 6 - done.missed
     assert rows[-1, 7] != 0.0
@@ -225,7 +225,7 @@ def test_a_board_without_sensors_an_answer_or_a_port_is_said(folder, port, tmp_p
     assert "is the board plugged in" in capsys.readouterr().err
     ours, theirs = os.openpty()  # nobody listens
     done = run_board(folder, os.ttyname(theirs), log, drive=True, seconds=5.0)
-    assert done.why == "3 frames in a row had no answer"
+    assert done.reason == "3 frames in a row had no answer"
     assert (done.rows, done.missed) == (0, 3)
     for one in (ours, theirs):
         os.close(one)

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 import codrl_mj
 from codrl_mj.cli import main
-from codrl_mj.deploy import Board, Contract, export, network_of
+from codrl_mj.deploy import Board, Contract, export, extract_network
 from codrl_mj.deploy.board import missing_tools
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
@@ -128,7 +128,7 @@ def test_onnx_and_c_and_contract_have_the_statistics(normalized, tmp_path, doubl
         pytest.skip("NOT RUN: no C compiler: apt-get install gcc")
     with Board(tmp_path / "out") as board:
         commands = np.array([board.command(row) for row in seen[:100]])
-    np.testing.assert_allclose(commands, contract.commands(expected[:100]), atol=1e-5)
+    np.testing.assert_allclose(commands, contract.to_commands(expected[:100]), atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -373,7 +373,7 @@ def test_a_run_is_exported_as_it_was_trained(tmp_path, capsys):
 
 def test_statistics_count_as_numbers_of_the_network(half):
     plain, whole = (
-        network_of(load_sb3_zip(half / "policy.zip", "ppo", True, one))
+        extract_network(load_sb3_zip(half / "policy.zip", "ppo", True, one))
         for one in ("none", half / "apart/statistics.pkl")
     )
     assert whole.size == plain.size + 2 * 3
