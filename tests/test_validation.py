@@ -66,7 +66,7 @@ def certificate():
     return validate(SELECTED, quick=True)
 
 
-def one_check(**fields):
+def make_check(**fields):
     return Check(
         **(
             {
@@ -371,7 +371,7 @@ def test_oracle_is_the_installed_gymnasium(monkeypatch):
     [(0.0, True), (1e-12, True), (1.0001e-12, False), (math.inf, False), (math.nan, False)],
 )
 def test_check_passes_up_to_its_tolerance_and_never_with_nan(worst, passed):
-    check = one_check(worst=worst, tolerance=1e-12)
+    check = make_check(worst=worst, tolerance=1e-12)
     assert check.passed is passed
     assert (check.tolerance_ratio > 1) is not passed
 
@@ -721,9 +721,9 @@ def test_bad_input_prints_one_line_and_writes_nothing(
 # -- the files -------------------------------------------------------------------------------------
 
 
-BAD = one_check(name="b <i>", group="motor", worst=math.nan, where="x < y & z", unit="A", task="")
+BAD = make_check(name="b <i>", group="motor", worst=math.nan, where="x < y & z", unit="A", task="")
 SAMPLE = Certificate(
-    "sample", (one_check(task="pendulum"), BAD), (Skipped("s", "why", "motor"),), True, 1.0
+    "sample", (make_check(task="pendulum"), BAD), (Skipped("s", "why", "motor"),), True, 1.0
 )
 
 
@@ -819,8 +819,8 @@ def test_command_takes_a_model_with_motors(capsys, bare_engine, tmp_path):
 def test_command_exits_with_1_if_a_check_fails_and_still_writes(
     capsys, monkeypatch, tmp_path, worst
 ):
-    bad = one_check(name="bad", worst=worst, tolerance=1e-12, where="theta", task="cartpole")
-    wrong = Certificate("cartpole", (one_check(name="good", task="cartpole"), bad), (), False, 1.0)
+    bad = make_check(name="bad", worst=worst, tolerance=1e-12, where="theta", task="cartpole")
+    wrong = Certificate("cartpole", (make_check(name="good", task="cartpole"), bad), (), False, 1.0)
     monkeypatch.setattr("codrl_mj.validation.validate", lambda *_, **__: wrong)
     assert main(["validate", "cartpole", "--out", str(tmp_path)]) == 1
     text = capsys.readouterr().out
@@ -831,7 +831,7 @@ def test_command_exits_with_1_if_a_check_fails_and_still_writes(
 
 @pytest.mark.parametrize(("missed", "status"), [(False, 0), (True, 1)])
 def test_undetected_fault_fails_the_command(capsys, monkeypatch, missed, status):
-    good, failed = one_check(task="cartpole"), one_check(task="cartpole", worst=7.0)
+    good, failed = make_check(task="cartpole"), one_check(task="cartpole", worst=7.0)
     monkeypatch.setattr(
         "codrl_mj.validation.validate", lambda *_, **__: Certificate("c", (good,), (), False, 1.0)
     )

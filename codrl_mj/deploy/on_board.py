@@ -109,7 +109,7 @@ def run_over(
             applied = math.copysign(max(abs(applied) - parameters.deadband, 0.0), applied)
         steady_current = (applied - back_emf) / resistance
         deviation = current - steady_current
-        # The mean current of the sample.
+        # The mean over the sample of the exponential decay to the steady current.
         mean_current = steady_current + deviation * decayed / x
         heat_sum += (
             steady_current * steady_current

@@ -6,10 +6,10 @@ systems theory, `own_model` has the checks that apply to any family of actuators
 `motor_catalogue` compares off-the-shelf motors. Torques are read where the engine applies them.
 
 MuJoCo's motor integrates the winding differently. With the speed held over a step, the native motor
-is exact, i' = i_inf + (i - i_inf) exp(-R dt/L), and ours takes Euler steps. Hence two comparisons:
-at an inductance of R dt/(1 - exp(-R dt/L)) one Euler step *is* the exact one, so that the two
-motors must be equal to rounding; and at the true inductance our motor converges to the native one
-at first order in the substeps.
+is exact, i' = i_inf + (i - i_inf) exp(-R dt/L), and our motor takes Euler steps. Hence two
+comparisons: at an inductance of R dt/(1 - exp(-R dt/L)) one Euler step *is* the exact one, so that
+the two motors must be equal to rounding; and at the true inductance our motor converges to the
+native one at first order in the substeps.
 
 Under `implicitfast` the engine adds the slope of the native motor's torque over speed, kT kE/R (1 -
 exp(-R dt/L)), to the velocity's implicit matrix. Our motor has no such slope. It shrinks with the

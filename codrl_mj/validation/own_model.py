@@ -70,7 +70,7 @@ NOT_APPLICABLE = {
     "dynamics": "no Gymnasium environment has these equations of motion",
     "trajectories": "no Gymnasium environment has these equations of motion",
     "convergence": "there is no second implementation of the mechanics to converge to",
-    "energy": "the losses of joints, contacts and constraints are not modelled here",
+    "energy": "the losses of joints, contacts and constraints are not modeled here",
 }
 """Group that does not apply to a user's model -> reason."""
 

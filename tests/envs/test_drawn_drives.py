@@ -1,4 +1,4 @@
-"""DriveOracle motors in every task, alone and in batches, and whatever of them sits in the model drawn at resets."""
+"""Bench motors in every task, alone and in batches, and whatever of them sits in the model drawn at resets."""
 
 import dataclasses
 import math
