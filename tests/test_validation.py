@@ -831,7 +831,7 @@ def test_command_exits_with_1_if_a_check_fails_and_still_writes(
 
 @pytest.mark.parametrize(("missed", "status"), [(False, 0), (True, 1)])
 def test_undetected_fault_fails_the_command(capsys, monkeypatch, missed, status):
-    good, failed = make_check(task="cartpole"), one_check(task="cartpole", worst=7.0)
+    good, failed = make_check(task="cartpole"), make_check(task="cartpole", worst=7.0)
     monkeypatch.setattr(
         "codrl_mj.validation.validate", lambda *_, **__: Certificate("c", (good,), (), False, 1.0)
     )
