@@ -25,7 +25,7 @@ from codrl_mj.runs.files import writing
 from codrl_mj.sizing import design, find_drive, torque_limits
 from codrl_mj.study.bench import BLOCKED, on_bench
 from codrl_mj.tasks import PAPER_TASKS, named_actuator
-from codrl_mj.validation.motor_catalogue import COLD
+from codrl_mj.validation.motor_catalogue import NO_HEATING
 
 FOLDER = Path(__file__).parent.parent / "docs"
 PAGE = "actuators_in_numbers.md"
@@ -99,7 +99,7 @@ def motor_row(name: str) -> dict[str, Any]:
     """What a motor of the catalogue does at its own gear, at the output, by its nominal voltage or 24 V, still cold."""
     drive, numbers = find_drive(name), motor_entry(name).numbers
     loop = design(drive)
-    cold = dataclasses.replace(drive.motor, **COLD)
+    cold = dataclasses.replace(drive.motor, **NO_HEATING)
     free = dataclasses.replace(
         drive, motor=cold, controller=dataclasses.replace(drive.controller, max_current=math.inf)
     )

@@ -18,7 +18,7 @@ from codrl_mj.physics import SimulationConfig
 from codrl_mj.physics.mjcf import install_callbacks, task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.tasks import TASKS, named_actuator
-from codrl_mj.validation.motor_catalogue import Bench, fitted
+from codrl_mj.validation.motor_catalogue import DriveOracle, task_drive
 
 ACTIONS = 1000
 """Actions drawn beforehand."""
@@ -50,9 +50,9 @@ def engine(task: str, actuator: str | None = "paper") -> Subject:
     timestep = definition.step_duration / definition.motor_inner_steps
     one: Any = named_actuator("paper", task)
     if actuator in ("drive", "stepped"):
-        one = fitted(task)
+        one = task_drive(task)
     if actuator == "stepped":
-        bench = Bench(one, timestep)
+        bench = DriveOracle(one, timestep)
         one = one.replaced(
             {"controller.kp": bench.kp, "controller.ki": bench.ki * one.controller.sample_rate}
         )

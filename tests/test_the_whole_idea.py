@@ -1,4 +1,4 @@
-"""The example of one file is the package in small: the same steps to 1e-12, and what it tells comes true."""
+"""Tests that the one-file example takes the package's steps to 1e-12 and has the stated results."""
 
 import importlib.util
 import sys
@@ -17,7 +17,7 @@ PATH = Path(__file__).parent.parent / "examples" / "the_whole_idea.py"
 
 @pytest.fixture(scope="module")
 def idea():
-    """The example, as a module."""
+    """Import the example as a module."""
     specification = importlib.util.spec_from_file_location("the_whole_idea", PATH)
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
@@ -25,7 +25,7 @@ def idea():
 
 
 def ours(motor):
-    """The package's actuator with the example's numbers."""
+    """Return the package's actuator with the parameters of the example's motor."""
     gains = {
         "kp": motor.kp,
         "ki": motor.ki,
@@ -43,7 +43,7 @@ def ours(motor):
     return DCMotorActuator(Motor(*numbers), CurrentLoop(**gains), None)
 
 
-def test_its_motors_are_the_papers_and_a_slow_one(idea):
+def test_motors_are_the_papers_and_a_slow_one(idea):
     assert ours(idea.PAPER) == named_actuator("paper", "cartpole")
     weak = named_actuator("weak", "cartpole").controller
     assert (idea.SLOW.kp, idea.SLOW.ki, idea.SLOW.kd, idea.SLOW.kff) == (
@@ -63,7 +63,7 @@ def test_its_motors_are_the_papers_and_a_slow_one(idea):
         {"kd": 0.02, "max_voltage": 1.0, "torque_constant": 0.5},
     ],
 )
-def test_every_step_is_the_packages(idea, physics, changed):
+def test_every_step_equals_the_packages(idea, physics, changed):
     motor = idea.PAPER._replace(**changed)
     env = codrl_mj.make("cartpole", ours(motor), physics=physics, disable_env_checker=True)
     rng = np.random.default_rng(0)
@@ -80,11 +80,11 @@ def test_every_step_is_the_packages(idea, physics, changed):
             _, reward, terminated, _, info = env.step(right)
             np.testing.assert_allclose(env.unwrapped.state, state[:, 0], rtol=0, atol=1e-12)
             expected = desired[0], force[0], inside[0, 0], voltage[0]
-            found = [
+            signals = [
                 float(info[name])
                 for name in ("desired_force", "actual_force", "current", "voltage")
             ]
-            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(signals, expected, rtol=0, atol=1e-12)
             standing = bool(idea.standing(state)[0])
             assert terminated != standing
             assert reward == 1.0
@@ -93,7 +93,7 @@ def test_every_step_is_the_packages(idea, physics, changed):
     env.close()
 
 
-def test_on_ideal_forces_it_is_gymnasiums(idea):
+def test_steps_with_ideal_forces_equal_gymnasiums(idea):
     env, rng = gymnasium.make("CartPole-v1").unwrapped, np.random.default_rng(0)
     env.reset(seed=0)
     state = np.array(env.state, dtype=np.float64)[:, None]
@@ -105,42 +105,44 @@ def test_on_ideal_forces_it_is_gymnasiums(idea):
         np.testing.assert_allclose(np.array(env.state), state[:, 0], rtol=1e-12, atol=1e-12)
 
 
-def test_its_gradient_is_that_of_the_log_probability(idea):
-    """By finite differences."""
+def test_gradient_is_that_of_the_log_probability(idea):
+    """Compare the gradient with finite differences."""
     rng = np.random.default_rng(0)
-    policy, seen = rng.normal(size=5), rng.normal(size=(4, 6, 3))
+    policy, observations = rng.normal(size=5), rng.normal(size=(4, 6, 3))
     right = rng.random((6, 3)) < 0.5
 
-    def log_probability(at):
-        chance = idea.probability(at, seen)
+    def log_probability(parameters):
+        chance = idea.probability(parameters, observations)
         return np.log(np.where(right, chance, 1 - chance)).sum()
 
-    surprise = right - idea.probability(policy, seen)
-    gradient = np.append(np.tensordot(seen, surprise, 2), surprise.sum())
+    surprise = right - idea.probability(policy, observations)
+    gradient = np.append(np.tensordot(observations, surprise, 2), surprise.sum())
     steps = 1e-6 * np.eye(5)
     numerical = [
-        (log_probability(policy + one) - log_probability(policy - one)) / 2e-6 for one in steps
+        (log_probability(policy + step) - log_probability(policy - step)) / 2e-6 for step in steps
     ]
     np.testing.assert_allclose(gradient, numerical, rtol=1e-6)
 
 
 @pytest.mark.matrix
-def test_what_learned_on_ideal_forces_falls_and_what_learned_through_the_motor_stands(idea, capsys):
+def test_policy_of_ideal_forces_falls_and_policy_of_the_motor_balances(idea, capsys):
     table = idea.main()
     ideal, through = table["learned on ideal forces"], table["learned through it"]
-    assert ideal["ideal forces"] > 475  # what Gymnasium calls solved
+    # Gymnasium calls a return of 475 solved.
+    assert ideal["ideal forces"] > 475
     assert ideal["the paper's motor"] > 475
     assert ideal["the slow motor"] < 350
     assert through["the slow motor"] > 475
     printed = capsys.readouterr().out
     assert "You ask for 10 N" in printed
     assert len([line for line in printed.splitlines() if line.startswith("learned")]) == 2
-    for seed in (1, 2):  # and not by one seed's luck
+    # Further seeds show that the result is not luck.
+    for seed in (1, 2):
         assert idea.score(idea.learn(None, seed), idea.SLOW) < 350
         assert idea.score(idea.learn(idea.SLOW, seed), idea.SLOW) > 475
 
 
-def test_it_imports_numpy_alone(idea):
+def test_imports_only_numpy(idea):
     imported = [
         line for line in PATH.read_text().splitlines() if line.startswith(("import ", "from "))
     ]

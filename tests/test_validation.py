@@ -1,4 +1,4 @@
-"""The certificate: what it checks passes, every check can fail, and verdict, files and refusals are what they say."""
+"""Tests of the certificate: its checks pass and can fail, and its files and errors are right."""
 
 import importlib
 import inspect
@@ -28,9 +28,9 @@ from codrl_mj.tasks import TASKS
 from codrl_mj.validation import (
     GROUPS,
     MUTATIONS,
-    Caught,
     Certificate,
     Check,
+    MutationResult,
     Skipped,
     dynamics,
     execution,
@@ -40,8 +40,8 @@ from codrl_mj.validation import (
     validate_model,
 )
 from codrl_mj.validation.compare import differences
-from codrl_mj.validation.mutations import edited, unfailed, wrong_loop, wrong_model
-from codrl_mj.validation.table import TABLE, Case, outcome
+from codrl_mj.validation.mutations import compile_edited, undetected_checks, wrong_loop, wrong_model
+from codrl_mj.validation.table import TABLE, Case, evaluate_cases
 from codrl_mj.validation.trajectories import Growth
 from codrl_mj.viz.pages import certificate as page
 from tests.add_motors.models import ACTUATORS, INTEGRATORS, LOOP, arm, behind_plugin
@@ -53,20 +53,20 @@ from tests.validation.test_energy_checks import STEPS, orders
 from tests.validation.test_motor_checks import EVERY
 from tests.viz.pages.parsed import Parsed, check_alone
 
-OWN = ("dynamics", "trajectories", "execution")
+SHORT_GROUPS = ("dynamics", "trajectories", "execution")
 
 
-TELLING = (*REPRESENTATIVES, "furuta")
-OTHERS = tuple(task for task in TASKS if task not in TELLING)
+SELECTED = (*REPRESENTATIVES, "furuta")
+OTHERS = tuple(task for task in TASKS if task not in SELECTED)
 
 
 @pytest.fixture(scope="module")
 def certificate():
-    """The quick form of the certificate, of the telling tasks."""
-    return validate(TELLING, quick=True)
+    """Run the quick certificate of the selected tasks."""
+    return validate(SELECTED, quick=True)
 
 
-def one_check(**fields):
+def make_check(**fields):
     return Check(
         **(
             {
@@ -82,7 +82,7 @@ def one_check(**fields):
     )
 
 
-# -- it passes ----------------------------------------------------------------------------------------------
+# -- it passes -------------------------------------------------------------------------------------
 
 
 def test_the_quick_certificate_passes(certificate):
@@ -97,26 +97,26 @@ def test_the_quick_certificate_passes(certificate):
 
 
 def test_single_steps_of_every_task_pass():
-    every = validate(quick=True, groups=["dynamics"])
-    assert every.passed
-    assert every.subject == "all tasks"
-    assert {check.task for check in every.checks} == set(TASKS)
+    certificate = validate(quick=True, groups=["dynamics"])
+    assert certificate.passed
+    assert certificate.subject == "all tasks"
+    assert {check.task for check in certificate.checks} == set(TASKS)
 
 
 @pytest.fixture(scope="module")
-def of_others():
-    """What is left of the whole certificate."""
+def other_certificate():
+    """Run the quick certificate of the other tasks, without the motor's group."""
     return validate(OTHERS, quick=True, groups=[group for group in GROUPS if group != "motor"])
 
 
 @pytest.mark.matrix
-def test_the_quick_certificate_of_the_other_tasks_passes(of_others):
+def test_the_quick_certificate_of_the_other_tasks_passes(other_certificate):
     assert [
         (check.group, check.task, check.name, check.worst)
-        for check in of_others.checks
+        for check in other_certificate.checks
         if not check.passed
     ] == []
-    check_coverage(of_others, OTHERS)
+    check_coverage(other_certificate, OTHERS)
 
 
 for module in (*GROUPS, "own_model"):
@@ -124,7 +124,7 @@ for module in (*GROUPS, "own_model"):
 
 
 def checks_of(certificate, row):
-    """The certificate's checks that are of a row."""
+    """Return the certificate's checks of a row of the table."""
     name = re.compile(re.sub(r"\\{[^}]*\\}", ".+", re.escape(row.name)))
     return [
         check
@@ -134,22 +134,22 @@ def checks_of(certificate, row):
 
 
 @pytest.mark.parametrize("row", TABLE, ids=[f"{row.group}, {row.name}" for row in TABLE])
-def test_every_row_of_the_table_is_in_it_and_passes(certificate, row):
-    made = checks_of(certificate, row)
-    assert made
-    assert [check for check in made if not check.passed] == []
-    assert row.tolerance in {check.tolerance for check in made}
-    assert row.unit in {check.unit for check in made}
+def test_every_row_of_the_table_is_in_the_certificate_and_passes(certificate, row):
+    checks = checks_of(certificate, row)
+    assert checks
+    assert [check for check in checks if not check.passed] == []
+    assert row.tolerance in {check.tolerance for check in checks}
+    assert row.unit in {check.unit for check in checks}
 
 
-def test_every_check_is_of_the_table(certificate):
-    of_rows = {id(check) for row in TABLE for check in checks_of(certificate, row)}
-    assert of_rows == {id(check) for check in certificate.checks}
+def test_every_check_belongs_to_a_row_of_the_table(certificate):
+    checks_of_rows = {id(check) for row in TABLE for check in checks_of(certificate, row)}
+    assert checks_of_rows == {id(check) for check in certificate.checks}
 
 
-def test_every_group_is_in_it_and_every_check_says_what_it_compared(certificate):
+def test_every_group_has_checks_with_unique_names_and_descriptions(certificate):
     assert {check.group for check in certificate.checks} == set(GROUPS)
-    for task in TELLING:
+    for task in SELECTED:
         assert set(GROUPS) - {"motor"} <= {
             check.group for check in certificate.checks if check.task == task
         }
@@ -173,14 +173,14 @@ def check_coverage(certificate, tasks):
         assert names("energy", task) == {STEPS} | orders(task, "electrical", "mechanical", "whole")
 
 
-def test_every_integrator_and_motor_has_its_checks(certificate):
-    check_coverage(certificate, TELLING)
+def test_every_integrator_and_motor_has_checks(certificate):
+    check_coverage(certificate, SELECTED)
     assert {
         check.name for check in certificate.checks if (check.group, check.task) == ("motor", "")
     } == EVERY
 
 
-def test_tolerances_are_those_promised(certificate):
+def test_tolerances_are_the_documented_ones(certificate):
     for check in certificate.checks:
         if check.group == "dynamics":
             assert check.tolerance == 1e-12
@@ -193,7 +193,7 @@ def test_tolerances_are_those_promised(certificate):
 
 
 @pytest.mark.matrix
-def test_the_whole_form_has_the_same_checks_with_more_samples(certificate):
+def test_full_form_has_the_same_checks_with_more_samples(certificate):
     quick = {
         check.name: check.samples
         for check in certificate.checks
@@ -206,12 +206,12 @@ def test_the_whole_form_has_the_same_checks_with_more_samples(certificate):
     assert all(whole[name] > quick[name] for name in whole)
 
 
-def test_validation_repeats_itself():
+def test_validation_is_deterministic():
     first, second = (validate("cartpole", quick=True, groups=["dynamics"]).checks for _ in range(2))
     assert first == second
 
 
-def test_parts_are_told_as_they_begin():
+def test_progress_callback_gets_each_part():
     parts = []
     validate(
         ["cartpole", "pendulum"],
@@ -229,46 +229,49 @@ def test_parts_are_told_as_they_begin():
     assert parts[-1][:2] == (4, 4)
 
 
-# -- it can fail --------------------------------------------------------------------------------------------
+# -- it can fail -----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def caught():
-    """What every fault does on one task, and on the motor."""
+    """Run the checks of one task and of the motor with every fault."""
     return try_mutations("pendulum")
 
 
 @pytest.mark.matrix
-def test_every_fault_is_caught_in_every_task_and_far_beyond_the_tolerance(caught):
-    made = {mutation.name for mutation in MUTATIONS if "pendulum" in mutation.tasks}
-    assert {outcome.mutation for outcome in caught} == made
-    assert len(made) >= len(MUTATIONS) - 1
+def test_every_fault_is_caught_far_beyond_the_tolerance(caught):
+    names = {mutation.name for mutation in MUTATIONS if "pendulum" in mutation.tasks}
+    assert {outcome.mutation for outcome in caught} == names
+    assert len(names) >= len(MUTATIONS) - 1
     assert [(outcome.mutation, outcome.task) for outcome in caught if not outcome.failed] == []
-    assert min(outcome.clearest.beyond for outcome in caught) > 5
+    assert min(outcome.clearest_failure.tolerance_ratio for outcome in caught) > 5
 
 
 @pytest.mark.matrix
 def test_every_check_is_failed_by_some_fault(certificate, caught):
     checks = [check for check in certificate.checks if check.task in ("pendulum", "")]
-    assert [(check.group, check.task, check.name) for check in unfailed(checks, caught)] == []
+    assert [
+        (check.group, check.task, check.name) for check in undetected_checks(checks, caught)
+    ] == []
 
 
 @pytest.mark.slow
-def test_every_check_of_every_task_is_failed_by_some_fault(certificate, of_others):
+def test_every_check_of_every_task_is_failed_by_some_fault(certificate, other_certificate):
     outcomes = try_mutations()
     assert [(outcome.mutation, outcome.task) for outcome in outcomes if not outcome.failed] == []
-    every = (*certificate.checks, *of_others.checks)
-    checks = [check for check in every if check.task in ("", *REBUILT)]  # in which faults are made
-    assert unfailed(checks, outcomes) == []
+    all_checks = (*certificate.checks, *other_certificate.checks)
+    # Faults are made only in these tasks.
+    checks = [check for check in all_checks if check.task in ("", *REBUILT)]
+    assert undetected_checks(checks, outcomes) == []
 
 
 @pytest.mark.matrix
 def test_faults_are_undone(caught):
-    assert validate("cartpole", quick=True, groups=OWN).passed
+    assert validate("cartpole", quick=True, groups=SHORT_GROUPS).passed
 
 
 def functions():
-    """Every function of the package that is loaded, by (whose it is, name)."""
+    """Return all loaded functions of the package by (id of their owner, name)."""
     modules = [module for name, module in sys.modules.items() if name.startswith("codrl_mj")]
     classes = [
         value for module in modules for value in vars(module).values() if isinstance(value, type)
@@ -284,18 +287,19 @@ def functions():
 
 
 @pytest.mark.matrix
-def test_a_wrong_function_can_be_called_as_the_right_one():
-    """Otherwise its check fails because of the call, and not because of the fault."""
+def test_wrong_function_has_the_signature_of_the_right_one():
+    """Check that a fault's function fails a check because of the fault, not of its call."""
     replacing = set()
     for mutation in MUTATIONS:
         before = functions()
         with mutation.apply():
             during = functions()
-        for place, right in before.items():
-            if (wrong := during[place]) is not right:
+        for key, right in before.items():
+            if (wrong := during[key]) is not right:
                 replacing.add(mutation.name)
                 names = list(inspect.signature(right).parameters)
-                inspect.signature(wrong).bind(*names)  # raises TypeError
+                # `bind` raises a TypeError if the arguments do not fit.
+                inspect.signature(wrong).bind(*names)
                 inspect.signature(wrong).bind(**dict.fromkeys(names))
     assert replacing >= {
         "a stale command",
@@ -309,7 +313,7 @@ def test_a_wrong_function_can_be_called_as_the_right_one():
     }
 
 
-def test_a_fault_is_undone_after_an_error():
+def test_fault_is_undone_after_an_error():
     fault = next(mutation for mutation in MUTATIONS if mutation.name == "a stale command")
     step = MujocoPhysics.step
 
@@ -323,7 +327,7 @@ def test_a_fault_is_undone_after_an_error():
     assert MujocoPhysics.step is step
 
 
-def test_a_wrong_loop_is_undone_after_an_error(installed):
+def test_wrong_loop_is_undone_after_an_error(installed):
     model, inputs = rotor(), controls(20)
     right, advance = trajectory(model, inputs), vars(DCMotorActuator)["advance"]
 
@@ -339,18 +343,18 @@ def test_a_wrong_loop_is_undone_after_an_error(installed):
     assert vars(DCMotorActuator)["advance"] is advance
 
 
-def test_an_edit_whose_text_is_gone_is_an_error_and_not_a_passed_test():
+def test_edit_of_a_missing_text_is_an_error():
     with pytest.raises(ValueError, match="occurs 0 times"):
-        edited(sys.modules["codrl_mj.actuators.current_loop"], [("no such text", "")])
+        compile_edited(sys.modules["codrl_mj.actuators.current_loop"], [("no such text", "")])
 
 
-def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
+def test_oracle_is_the_installed_gymnasium(monkeypatch):
     step = gymnasium.envs.classic_control.CartPoleEnv.step
 
     def shifted(self, action):
-        outcome = step(self, action)
+        result = step(self, action)
         self.state = np.array([*self.state[:3], self.state[3] + 1e-6])
-        return outcome
+        return result
 
     monkeypatch.setattr(gymnasium.envs.classic_control.CartPoleEnv, "step", shifted)
     assert not any(
@@ -359,33 +363,33 @@ def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
     )
 
 
-# -- numbers that are none ----------------------------------------------------------------------------------
+# -- infinities and NaN -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("worst", "passed"),
     [(0.0, True), (1e-12, True), (1.0001e-12, False), (math.inf, False), (math.nan, False)],
 )
-def test_a_check_passes_up_to_its_tolerance_and_never_on_nan(worst, passed):
-    check = one_check(worst=worst, tolerance=1e-12)
+def test_check_passes_up_to_its_tolerance_and_never_with_nan(worst, passed):
+    check = make_check(worst=worst, tolerance=1e-12)
     assert check.passed is passed
-    assert (check.beyond > 1) is not passed
+    assert (check.tolerance_ratio > 1) is not passed
 
 
 def worst_of(*cases):
-    found = outcome(Check("name", "oracle", 1.0), {}, [Case(*case) for case in cases])
-    return found.worst, found.where
+    check = evaluate_cases(Check("name", "oracle", 1.0), {}, [Case(*case) for case in cases])
+    return check.worst, check.where
 
 
-def test_the_worst_is_the_largest_and_a_nan_stays():
-    worst, where = worst_of((0.5, "a"), (0.2, "b"), (math.nan, "c"), (7.0, "d"))
+def test_worst_case_is_the_largest_or_the_first_nan():
+    worst, description = worst_of((0.5, "a"), (0.2, "b"), (math.nan, "c"), (7.0, "d"))
     assert math.isnan(worst)
-    assert where == "c"
+    assert description == "c"
     assert worst_of((1.0, "a"), (3.0, "b"), (3.0, "c")) == (3.0, "b")
     assert worst_of((math.inf, "a"), (math.nan, "b"), (2.0, "c"))[1] == "b"
 
 
-def test_the_worst_of_an_array_is_worded_by_its_index_and_no_difference_is_nowhere():
+def test_worst_entry_of_an_array_is_described_by_its_index():
     assert worst_of((np.array([[0.1, 0.2], [0.9, 0.4]]), "at {}".format), (0.5, "b")) == (
         0.9,
         "at 2",
@@ -396,13 +400,13 @@ def test_the_worst_of_an_array_is_worded_by_its_index_and_no_difference_is_nowhe
     assert worst_of() == (0.0, "everywhere: there is no difference")
 
 
-@pytest.mark.parametrize("at", [1, 7, 200])
-def test_one_nan_among_good_samples_fails_the_check(monkeypatch, at):
+@pytest.mark.parametrize("call", [1, 7, 200])
+def test_single_nan_fails_the_check(monkeypatch, call):
     step, calls = MujocoPhysics.step, iter(range(1, 10**6))
 
     def broken(self, desired_force):
         signals = step(self, desired_force)
-        if next(calls) == at:
+        if next(calls) == call:
             self.data.qpos[0] = np.nan
         return signals
 
@@ -415,7 +419,7 @@ def test_one_nan_among_good_samples_fails_the_check(monkeypatch, at):
     assert "x [m] from" in check.where
 
 
-def test_a_run_that_diverges_is_a_failed_check_that_says_so(monkeypatch):
+def test_diverging_run_is_a_failed_check_with_the_step(monkeypatch):
     step, calls = MujocoPhysics.step, iter(range(1, 10**6))
 
     def diverging(self, desired_force):
@@ -431,7 +435,7 @@ def test_a_run_that_diverges_is_a_failed_check_that_says_so(monkeypatch):
         assert check.where == "step 5 of seed 0: it diverged"
 
 
-def test_a_group_that_breaks_down_is_a_failed_check(monkeypatch):
+def test_arithmetic_error_in_a_group_is_a_failed_check(monkeypatch):
     def broken(task, quick):
         raise ZeroDivisionError("by zero")
         yield
@@ -442,7 +446,7 @@ def test_a_group_that_breaks_down_is_a_failed_check(monkeypatch):
     assert "ZeroDivisionError" in check.where
 
 
-def test_a_missing_library_is_said_and_not_passed_over(monkeypatch):
+def test_missing_library_skips_the_group_with_a_reason(monkeypatch):
     def needing(task, quick):
         raise ModuleNotFoundError("No module named 'control'")
         yield
@@ -453,31 +457,33 @@ def test_a_missing_library_is_said_and_not_passed_over(monkeypatch):
     assert "No module named 'control'" in result.skipped[0].reason
 
 
-def test_no_checks_are_no_certificate():
+def test_certificate_without_checks_does_not_pass():
     assert not Certificate("nothing", (), (), False, 0.0).passed
 
 
-# -- how it measures ----------------------------------------------------------------------------------------
+# -- measurements -------------------------------------------------------------------------------
 
 
 def test_angles_are_compared_on_the_circle_only_where_both_were_wrapped():
     acrobot = TASKS["acrobot"]
     ours, oracle = np.array([np.pi, 0.0, 1.0, 0.0]), np.array([-np.pi, 0.0, 1.0, 0.0])
     assert differences(acrobot, ours, oracle).max() < 1e-15
-    ours[0] = 3 * np.pi  # not wrapped at all: that is no rounding error
+    # An angle that is not wrapped at all is not a rounding error.
+    ours[0] = 3 * np.pi
     assert differences(acrobot, ours, oracle).max() > 1
     assert differences(TASKS["pendulum"], np.array([np.pi, 0.0]), np.array([-np.pi, 0.0])).max() > 1
 
 
-def test_the_growth_near_an_unstable_equilibrium_is_its_eigenvalue():
-    """A pendulum upright: the semi-implicit map's larger eigenvalue, by hand."""
+def test_growth_near_an_unstable_equilibrium_is_its_eigenvalue():
+    """Compare an upright pendulum with the larger eigenvalue of the semi-implicit map."""
     task = TASKS["pendulum"]
     run = AnalyticPhysics(SimulationConfig(task, [IDEAL], 1, "semi-implicit"))
     growth = Growth(task, run, seed=0)
     for _ in range(100):
         run.step(0.0)
         growth.follow(0.0)
-    pull = 15.0 * task.step_duration  # 3 g / 2 l of Gymnasium's rod
+    # 3 g / (2 l) = 15 1/s^2 for Gymnasium's rod.
+    pull = 15.0 * task.step_duration
     matrix = np.array([[1 + pull * task.step_duration, task.step_duration], [pull, 1.0]])
     expected = math.log(np.abs(np.linalg.eigvals(matrix)).max()) / task.step_duration
     exponent, _ = np.polyfit(task.step_duration * np.arange(81), growth.logarithms[20:], 1)
@@ -485,7 +491,7 @@ def test_the_growth_near_an_unstable_equilibrium_is_its_eigenvalue():
     assert growth.rounding[-1] > 1e-16 * math.exp(expected * 4.0)
 
 
-def test_the_grid_reaches_the_bounds_and_the_edges_lie_on_them():
+def test_grid_and_edges_reach_the_bounds():
     for task in TASKS.values():
         states = dynamics.grid(task.reference_states.bounds, 5)
         assert len(states) == 5 ** len(task.state_names)
@@ -495,27 +501,31 @@ def test_the_grid_reaches_the_bounds_and_the_edges_lie_on_them():
 
 
 def test_bits_are_compared_and_not_values():
-    assert execution.differing(np.array([0.0]), np.array([-0.0])).tolist() == [True]
-    assert execution.differing(np.array([np.nan]), np.array([np.nan])).tolist() == [False]
+    assert execution.differs(np.array([0.0]), np.array([-0.0])).tolist() == [True]
+    assert execution.differs(np.array([np.nan]), np.array([np.nan])).tolist() == [False]
 
 
-# -- a model of one's own -----------------------------------------------------------------------------------
+# -- a custom model --------------------------------------------------------------------------
 
 TWO_MOTORS = """
 <mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="5 5 .1"/>
-<body pos="0 0 1"><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .5" size=".05"/>
-<body pos="0 0 .5"><joint name="b" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .4" size=".04"/></body></body>
+<body pos="0 0 1"><joint name="a" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 .5" size=".05"/>
+<body pos="0 0 .5"><joint name="b" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 .4" size=".04"/></body></body>
 <body pos="1 0 0.2"><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody><actuator>
-<general name="left" joint="a" gear="10" dyntype="user" actdim="14" gainprm="0" biastype="user" ctrllimited="true"
- ctrlrange="-1 1" user="250700 268401 843097 1 0.1 1 1 4.3 1 1e-6 0.6 24 1 1 0 0 0 0 inf 0"/>
+<general name="left" joint="a" gear="10" dyntype="user" actdim="14" gainprm="0" biastype="user"
+ ctrllimited="true" ctrlrange="-1 1"
+ user="250700 268401 843097 1 0.1 1 1 4.3 1 1e-6 0.6 24 1 1 0 0 0 0 inf 0"/>
 <position name="foreign" joint="a" kp="1"/>
-<general name="right" joint="b" gear="5" dyntype="user" actdim="14" gainprm="0" biastype="user" ctrllimited="true"
- ctrlrange="-1 1" user="250700 268401 843097 1 0.1 1 1 4.3 1 1e-6 0.6 2 0 4 0.1 0.01 0 0 inf 0"/>
+<general name="right" joint="b" gear="5" dyntype="user" actdim="14" gainprm="0" biastype="user"
+ ctrllimited="true" ctrlrange="-1 1"
+ user="250700 268401 843097 1 0.1 1 1 4.3 1 1e-6 0.6 2 0 4 0.1 0.01 0 0 inf 0"/>
 </actuator></mujoco>
 """
 
 
-def test_a_model_of_ones_own_passes_what_applies_and_is_told_what_does_not():
+def test_custom_model_passes_what_applies_and_skips_the_rest():
     result = validate_model(mujoco.MjModel.from_xml_string(TWO_MOTORS), "two motors", quick=True)
     assert result.passed
     names = {check.name for check in result.checks}
@@ -538,7 +548,7 @@ def test_a_model_of_ones_own_passes_what_applies_and_is_told_what_does_not():
 
 
 @pytest.mark.matrix
-def test_every_check_of_a_model_can_fail():
+def test_every_check_of_a_custom_model_can_fail():
     model, failed = rotor(), set()
     with wrong_loop(("+ parameters.ki * integral", "- parameters.ki * integral")):
         failed |= {
@@ -562,7 +572,7 @@ def test_every_check_of_a_model_can_fail():
     assert failed == {check.name for check in validate_model(model, quick=True).checks}
 
 
-def test_actuators_of_other_families_are_checked_beside_motors():
+def test_actuators_of_other_families_are_checked():
     spec = rotor_spec()
     add_motor(spec, "hinge", Lag(time_constant=0.03, delay=0.013), name="late")
     add_motor(spec, "hinge", TorqueSpeed(), name="line")
@@ -576,7 +586,7 @@ def test_actuators_of_other_families_are_checked_beside_motors():
     assert names[:6] == [
         f"{check}: {name}" for check in ("stable", "steps") for name in ("motor", "late", "line")
     ]
-    assert {skip.name for skip in result.skipped if "no current loop" in skip.reason} == {
+    assert {skip.name for skip in result.skipped if "not a current loop" in skip.reason} == {
         "responses of late",
         "responses of line",
     }
@@ -585,13 +595,14 @@ def test_actuators_of_other_families_are_checked_beside_motors():
 SERVO = """
 <mujoco><option timestep="0.005"/><worldbody><body><joint name="a" axis="0 1 0" damping="0.1"/>
 <geom type="capsule" fromto="0 0 0 0 0 .5" size=".05"/></body></worldbody>
-<actuator><position name="servo" joint="a" kp="3" kv="0.2" timeconst="0.02" gear="2" forcerange="-0.5 0.5"/></actuator>
+<actuator><position name="servo" joint="a" kp="3" kv="0.2" timeconst="0.02" gear="2"
+ forcerange="-0.5 0.5"/></actuator>
 </mujoco>
 """
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_motors_behind_the_plugin_are_put_through_the_same_checks(bare_engine, integrator):
+def test_motors_with_the_plugin_have_the_same_checks(bare_engine, integrator):
     model = behind_plugin(
         arm(integrator), {"one": ACTUATORS["noisy_current_loop"], "two": ACTUATORS["somebody's"]}
     )
@@ -605,7 +616,7 @@ def test_motors_behind_the_plugin_are_put_through_the_same_checks(bare_engine, i
     assert needed_callbacks(model) == ()
 
 
-def test_a_motorised_servo_and_an_ideal_actuator_are_checked_for_what_they_are(bare_engine):
+def test_servo_with_a_motor_and_ideal_actuator_have_their_checks(bare_engine):
     servo = behind_plugin(mujoco.MjSpec.from_string(SERVO), {"servo": LOOP})
     assert validate_model(servo, quick=True).passed
     result = validate_model(behind_plugin(arm(), {"one": "lag", "two": "ideal"}), quick=True)
@@ -613,7 +624,7 @@ def test_a_motorised_servo_and_an_ideal_actuator_are_checked_for_what_they_are(b
     assert [skip.name for skip in result.skipped if "ideal" in skip.reason] == ["steps: two"]
 
 
-def test_a_wrong_motor_behind_the_plugin_fails(bare_engine):
+def test_wrong_motor_with_the_plugin_fails(bare_engine):
     model = behind_plugin(arm(), {"one": LOOP})
     with wrong_loop(("+ parameters.ki * integral", "- parameters.ki * integral")):
         failed = {
@@ -622,15 +633,14 @@ def test_a_wrong_motor_behind_the_plugin_fails(bare_engine):
     assert failed >= {"steps: one", "step response"}
 
 
-def test_an_actuator_that_its_family_would_refuse_is_not_stable():
-    result = validate_model(
-        rotor(Lag(delay=0.081)), quick=True
-    )  # eight steps of 0.01 s are remembered
+def test_actuator_that_its_family_would_reject_is_not_stable():
+    # A lag stores eight steps of 0.01 s.
+    result = validate_model(rotor(Lag(delay=0.081)), quick=True)
     (check,) = (check for check in result.checks if not check.passed)
     assert (check.name, check.worst, check.unit) == ("stable: motor", math.inf, "instability")
 
 
-def test_a_motor_that_never_runs_is_said():
+def test_disabled_motor_is_skipped():
     spec = rotor_spec()
     add_motor(spec, "hinge", FULL, name="off", group=3)
     spec.option.disableactuator = 1 << 3
@@ -639,14 +649,14 @@ def test_a_motor_that_never_runs_is_said():
     assert [skip.name for skip in result.skipped if "disabled" in skip.reason] == ["steps: off"]
 
 
-def test_the_users_model_is_left_as_it_was():
+def test_custom_model_is_not_changed():
     model = rotor()
     flags = model.opt.disableflags
     validate_model(model, quick=True)
     assert model.opt.disableflags == flags
 
 
-# -- bad input ----------------------------------------------------------------------------------------------
+# -- bad input -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -654,16 +664,16 @@ def test_the_users_model_is_left_as_it_was():
     [
         ("acrobat", None, "did you mean 'acrobot'"),
         ("acrobot", ["dynamic"], r"'dynamic'.*dynamics, trajectories"),
-        ([], None, r"tasks = \[\].*must name one at least"),
-        (None, [], r"groups = \[\].*must name one at least"),
+        ([], None, r"tasks = \[\].*must name at least one"),
+        (None, [], r"groups = \[\].*must name at least one"),
     ],
 )
-def test_what_is_no_task_or_group_or_none_of_them_is_refused(tasks, groups, message):
+def test_raises_for_an_unknown_or_empty_task_or_group(tasks, groups, message):
     with pytest.raises(ValueError, match=message):
         validate(tasks, groups=groups)
 
 
-def test_no_model_is_kept_from_a_mutation_nor_into_it():
+def test_mutation_does_not_share_cached_models():
     masses = [bare_model("pendulum").body_mass.sum()]
     with wrong_model(("body_mass", None, 2.0)):
         masses.append(bare_model("pendulum").body_mass.sum())
@@ -674,7 +684,7 @@ def test_no_model_is_kept_from_a_mutation_nor_into_it():
     ]
 
 
-def test_a_model_without_a_motor_is_refused():
+def test_raises_for_a_model_without_a_motor():
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
     with pytest.raises(
         ValueError,
@@ -701,7 +711,7 @@ def test_a_model_without_a_motor_is_refused():
         (["cartpole", "--out", "bare.xml/certificate"], "bare.xml is not a folder"),
     ],
 )
-def test_bad_input_costs_one_line_and_leaves_nothing(
+def test_bad_input_prints_one_line_and_writes_nothing(
     capsys, monkeypatch, tmp_path, arguments, expected
 ):
     monkeypatch.chdir(tmp_path)
@@ -717,32 +727,32 @@ def test_bad_input_costs_one_line_and_leaves_nothing(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bare.xml", "broken.xml"]
 
 
-# -- the files ----------------------------------------------------------------------------------------------
+# -- the files -------------------------------------------------------------------------------------
 
 
-BAD = one_check(name="b <i>", group="motor", worst=math.nan, where="x < y & z", unit="A", task="")
+BAD = make_check(name="b <i>", group="motor", worst=math.nan, where="x < y & z", unit="A", task="")
 SAMPLE = Certificate(
-    "sample", (one_check(task="pendulum"), BAD), (Skipped("s", "why", "motor"),), True, 1.0
+    "sample", (make_check(task="pendulum"), BAD), (Skipped("s", "why", "motor"),), True, 1.0
 )
 
 
 @pytest.mark.matrix
-def test_the_page_is_well_formed_self_contained_and_has_everything(certificate, caught):
+def test_page_is_well_formed_self_contained_and_complete(certificate, caught):
     text = page.html(certificate, caught)
     parsed = check_alone(text)
     assert set(GROUPS) <= set(parsed.ids)
     words = parsed.text
     for check in certificate.checks:
         assert " ".join(check.name.split()) in words
-    for one in caught:
-        assert one.mutation in words
+    for result in caught:
+        assert result.mutation in words
     assert len(parsed.data) == sum(len(check.plots) for check in certificate.checks) > 20
     assert "✓ passed" in words
     assert "prefers-color-scheme: dark" in text
     assert len(text) < 10_000_000
 
 
-def test_a_failure_is_on_top_and_not_by_colour_alone():
+def test_failure_is_at_the_top_and_marked_by_more_than_color():
     words = Parsed(page.html(SAMPLE)).text
     assert words.index("✗ 1 of 2 checks FAILED") < words.index("Checks of ")
     assert "b <i>" in words
@@ -750,7 +760,7 @@ def test_a_failure_is_on_top_and_not_by_colour_alone():
     assert words.count("✗ FAILED") == 1
 
 
-def test_plots_can_be_looked_at(certificate):
+def test_plots_have_titles_units_and_finite_curves(certificate):
     for check in certificate.checks:
         for plot in check.plots:
             assert plot.title
@@ -761,9 +771,9 @@ def test_plots_can_be_looked_at(certificate):
                 assert np.isfinite(curve.y).all()
 
 
-def test_the_json_holds_the_verdict_and_every_number(tmp_path):
+def test_json_has_the_verdict_and_every_number(tmp_path):
     json_file, html_file = page.write(
-        SAMPLE, tmp_path / "new" / "folder", [Caught("m", "", (BAD,), 2)]
+        SAMPLE, tmp_path / "new" / "folder", [MutationResult("m", "", (BAD,), 2)]
     )
     content = json.loads(json_file.read_text())
     assert content["verdict"] == "FAILED"
@@ -779,7 +789,7 @@ def test_the_json_holds_the_verdict_and_every_number(tmp_path):
     ]
 
 
-def test_a_certificate_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_certificate_is_written_atomically(tmp_path, monkeypatch):
     page.write(SAMPLE, tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     monkeypatch.setattr(page, "html", lambda *_: 1 / 0)
@@ -788,10 +798,10 @@ def test_a_certificate_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-# -- the command line ---------------------------------------------------------------------------------------
+# -- the command line ------------------------------------------------------------------------------
 
 
-def test_the_command_prints_writes_and_exits_with_0(capsys, tmp_path):
+def test_command_prints_writes_and_exits_with_0(capsys, tmp_path):
     (tmp_path / "robot.xml").write_text(TWO_MOTORS)
     out = tmp_path / "out"
     assert (
@@ -806,7 +816,7 @@ def test_the_command_prints_writes_and_exits_with_0(capsys, tmp_path):
     assert json.loads((out / "certificate.json").read_text())["verdict"] == "passed"
 
 
-def test_the_command_takes_a_motorised_model(capsys, bare_engine, tmp_path):
+def test_command_takes_a_model_with_motors(capsys, bare_engine, tmp_path):
     spec = codrl_mj.add_motors(mujoco.MjSpec.from_string(SERVO), {"servo": LOOP})
     spec.compile()
     (tmp_path / "servo.xml").write_text(spec.to_xml())
@@ -815,11 +825,11 @@ def test_the_command_takes_a_motorised_model(capsys, bare_engine, tmp_path):
 
 
 @pytest.mark.parametrize("worst", [1.0, math.nan])
-def test_the_command_exits_with_1_when_a_check_fails_and_still_writes(
+def test_command_exits_with_1_if_a_check_fails_and_still_writes(
     capsys, monkeypatch, tmp_path, worst
 ):
-    bad = one_check(name="bad", worst=worst, tolerance=1e-12, where="theta", task="cartpole")
-    wrong = Certificate("cartpole", (one_check(name="good", task="cartpole"), bad), (), False, 1.0)
+    bad = make_check(name="bad", worst=worst, tolerance=1e-12, where="theta", task="cartpole")
+    wrong = Certificate("cartpole", (make_check(name="good", task="cartpole"), bad), (), False, 1.0)
     monkeypatch.setattr("codrl_mj.validation.validate", lambda *_, **__: wrong)
     assert main(["validate", "cartpole", "--out", str(tmp_path)]) == 1
     text = capsys.readouterr().out
@@ -829,30 +839,30 @@ def test_the_command_exits_with_1_when_a_check_fails_and_still_writes(
 
 
 @pytest.mark.parametrize(("missed", "status"), [(False, 0), (True, 1)])
-def test_a_fault_that_is_missed_fails_the_command(capsys, monkeypatch, missed, status):
-    good, failed = one_check(task="cartpole"), one_check(task="cartpole", worst=7.0)
+def test_undetected_fault_fails_the_command(capsys, monkeypatch, missed, status):
+    good, failed = make_check(task="cartpole"), make_check(task="cartpole", worst=7.0)
     monkeypatch.setattr(
         "codrl_mj.validation.validate", lambda *_, **__: Certificate("c", (good,), (), False, 1.0)
     )
-    outcomes = [Caught("fault", "cartpole", (failed,), 1)] + [
-        Caught("other", "cartpole", (), 1)
+    outcomes = [MutationResult("fault", "cartpole", (failed,), 1)] + [
+        MutationResult("other", "cartpole", (), 1)
     ] * missed
     monkeypatch.setattr("codrl_mj.validation.try_mutations", lambda *_, **__: outcomes)
     assert main(["validate", "cartpole", "--mutations"]) == status
     assert ("MISSED" in capsys.readouterr().out) is missed
     assert main(["validate", "cartpole", "--mutations", "--json"]) == status
-    found = json.loads(capsys.readouterr().out)
-    assert found["checks"][0]["unit"] == good.unit
-    assert [fault["failed"] == [] for fault in found["mutations"]] == [False] + [True] * missed
+    content = json.loads(capsys.readouterr().out)
+    assert content["checks"][0]["unit"] == good.unit
+    assert [fault["failed"] == [] for fault in content["mutations"]] == [False] + [True] * missed
 
 
-def test_importing_the_certificate_needs_none_of_the_oracles_libraries():
+def test_import_of_the_command_line_needs_no_libraries_of_the_oracles():
     code = (
         "import sys, codrl_mj.cli.terminal; print([n for n in ('control', 'scipy', 'jinja2') if n"
         " in sys.modules])"
     )
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
     )
-    assert "control" not in done.stdout
-    assert "jinja2" not in done.stdout or "scipy" in done.stdout
+    assert "control" not in process.stdout
+    assert "jinja2" not in process.stdout or "scipy" in process.stdout

@@ -63,7 +63,7 @@ class Export:
     def run(self: Any) -> int:
         """Write the folder, and say what is in it."""
         from codrl_mj.cli.terminal import print_table
-        from codrl_mj.deploy import export, network_of
+        from codrl_mj.deploy import export, extract_network
 
         subject = self.source.load(self.run_folder)
         env = self._environment(subject)
@@ -83,7 +83,7 @@ class Export:
             ("", "name", "unit", "range"),
             rows,
         )
-        weights = network_of(subject.policy).size
+        weights = extract_network(subject.policy).size
         if contract.controller["loop"] is None and contract.actuators:
             why = (
                 f"this policy commands a {env.action}"
@@ -203,12 +203,12 @@ class Test:
         rows = [
             ("return on the board, mean", f"{board:.6g}"),
             ("return in Python, mean", f"{python:.6g}"),
-            ("episodes within 1 %", f"{done.alike} of {self.episodes}"),
+            ("episodes within 1 %", f"{done.num_equal_returns} of {self.episodes}"),
             (
                 "frames: sent, refused, without an answer",
                 f"{done.frames}, {done.refused}, {done.unanswered}",
             ),
-            ("observations beyond the limits", f"{done.stopped}"),
+            ("observations beyond the limits", f"{done.beyond_limits}"),
             ("samples of the current loop", f"{done.samples or 'none'}"),
             ("frames and samples a second", f"{done.rate:.0f}"),
             ("instructions of a policy step, a sample", taken),
@@ -228,7 +228,7 @@ class Test:
             title = f"{env.task} by its C on {self.target}: return {panel.episode.total:.0f}"
             film([dataclasses.replace(panel, title=title)], self.film, 640, 480)
             print(f"wrote {self.film}")
-        return int(done.alike < 0.95 * self.episodes and link == Link() and self.actuator is None)
+        return int(done.num_equal_returns < 0.95 * self.episodes and link == Link() and self.actuator is None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -300,12 +300,12 @@ class RunBoard:
             given = self.folder, self.port, self.out, self.drive, self.seconds, self.baud
             done = run_board(*given, ended=pressed)
         rows = [
-            ("ended", done.why),
+            ("ended", done.reason),
             ("rows; frames without an answer; late", f"{done.rows}; {done.missed}; {done.late}"),
         ]
         print_table(f"{self.folder} on {self.port}", ("", ""), rows)
         print(f"wrote {self.out}; try: {command('board', 'check', self.folder, self.out)}")
-        return int(done.why != "told to")
+        return int(done.reason != "requested")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -359,7 +359,7 @@ class CompareLog:
         )
         found = compare(env, self.log, self.window, self.actuator)
         columns = list(
-            zip(found.names, found.units, found.errors.tolist(), found.moved.tolist(), strict=True)
+            zip(found.names, found.units, found.errors.tolist(), found.baseline_errors.tolist(), strict=True)
         )
         title = (
             f"{self.log.name} through {self.actuator or env.through}: {len(found.starts)} windows"

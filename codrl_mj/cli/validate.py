@@ -12,7 +12,7 @@ from rich.text import Text
 from codrl_mj.cli.parsing import AsJson
 from codrl_mj.cli.terminal import console, print_table, progress_bar, say
 from codrl_mj.tasks import TASKS
-from codrl_mj.validation import GROUPS, Caught, Certificate, Check
+from codrl_mj.validation import GROUPS, MutationResult, Certificate, Check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,14 +45,14 @@ class Validate:
     def run(self) -> tuple[int, Any]:
         """Validate and print a table for each group."""
         from codrl_mj.validation import own_model, try_mutations, validate, validate_model
-        from codrl_mj.validation.mutations import as_mapping, faulty, unfailed
+        from codrl_mj.validation.mutations import as_mapping, mutation_tasks, undetected_checks
 
         if self.model is not None and (self.tasks or self.mutations):
             raise ValueError(
                 "--model: give a model or tasks, and no --mutations, which are faults of the tasks"
             )
-        tasks = faulty(self.tasks) if self.mutations else self.tasks or None
-        model = None if self.model is None else own_model.load(self.model)
+        tasks = mutation_tasks(self.tasks) if self.mutations else self.tasks or None
+        model = None if self.model is None else own_model.load_model(self.model)
         with progress_bar("{task.completed}/{task.total}") as bar:
             row = bar.add_task("validating", total=None)
 
@@ -65,7 +65,7 @@ class Validate:
                 certificate = validate(tasks, quick=self.quick, on_part=show)
             caught = try_mutations(tasks, on_part=show) if self.mutations else []
         print_certificate(certificate)
-        blind = unfailed(certificate.checks, caught) if caught else []
+        blind = undetected_checks(certificate.checks, caught) if caught else []
         if caught:
             print_mutations(caught, blind)
         if self.out is not None:
@@ -115,17 +115,17 @@ def print_certificate(certificate: Certificate) -> None:
     )
 
 
-def print_mutations(caught: Sequence[Caught], blind: Sequence[Check]) -> None:
+def print_mutations(caught: Sequence[MutationResult], blind: Sequence[Check]) -> None:
     """Print one table, a row for each fault made on purpose, and the checks that none of them fails."""
     columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond"
     rows: list[Any] = []
     for outcome in caught:
-        check = outcome.clearest
+        check = outcome.clearest_failure
         shown: list[Any] = [Text("MISSED", "red"), "", "", ""]
         if check is not None:
-            numbers = f"{check.worst:.1e}", f"{check.tolerance:.0e}", f"{check.beyond:.1e}"
+            numbers = f"{check.worst:.1e}", f"{check.tolerance:.0e}", f"{check.tolerance_ratio:.1e}"
             shown = [f"{check.group}: {check.name}", *numbers]
-        failed = f"{len(outcome.failed)} of {outcome.made}"
+        failed = f"{len(outcome.failed)} of {outcome.num_checks}"
         rows.append((outcome.mutation, outcome.task or "the motor", failed, *shown))
     print_table("Faults made on purpose", columns, rows, right=("failed", *columns[4:]), **_FRAMED)
     for check in blind:

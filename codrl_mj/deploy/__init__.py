@@ -1,4 +1,4 @@
-"""A trained policy, taken out of the simulator: as ONNX, as C, and with all that it assumes of its controller."""
+"""Export of a trained policy as ONNX and C, with a contract of all that it assumes."""
 
 from codrl_mj.deploy.board import Board, BoardTest, Link, OnnxPolicy, board_test, instructions
 from codrl_mj.deploy.c_code import c_files
@@ -6,8 +6,8 @@ from codrl_mj.deploy.compare import RigComparison, compare
 from codrl_mj.deploy.contract import Contract, Interface
 from codrl_mj.deploy.export import export, onnx_model
 from codrl_mj.deploy.log import LogCheck, check_log, read_rows, write_log
-from codrl_mj.deploy.loops import current_loop
-from codrl_mj.deploy.network import Network, network_of
+from codrl_mj.deploy.loops import loop_parameters
+from codrl_mj.deploy.network import Network, extract_network
 from codrl_mj.deploy.run import BoardRun, run_board
 from codrl_mj.deploy.tiles import Tiles
 from codrl_mj.deploy.wire import Wire
@@ -29,10 +29,10 @@ __all__ = [
     "c_files",
     "check_log",
     "compare",
-    "current_loop",
+    "loop_parameters",
     "export",
     "instructions",
-    "network_of",
+    "extract_network",
     "onnx_model",
     "read_rows",
     "run_board",

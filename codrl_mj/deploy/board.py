@@ -1,4 +1,7 @@
-"""The exported C as the controller of the simulation: compiled, run here or on an emulated board, asked over a wire."""
+"""Hardware-in-the-loop test of the exported C, compiled for the host or for an emulated board.
+
+The C is the controller of the simulation and communicates with it frame by frame.
+"""
 
 import contextlib
 import dataclasses
@@ -25,7 +28,8 @@ _CORTEX = (
     " -DBOARD_SEMIHOSTING"
 )
 _QEMU = "qemu-system-arm -M mps2-an386 -display none -monitor none -serial none -semihosting-config"
-TARGETS = {  # name -> what it needs: program -> the package of Debian's that has it
+# Target -> required program -> Debian packages that install it.
+TARGETS = {
     "host": {"cc": "gcc"},
     "cortex-m4f": {
         "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
@@ -33,22 +37,31 @@ TARGETS = {  # name -> what it needs: program -> the package of Debian's that ha
     },
 }
 NANOSECONDS = 64
-"""Of an emulated instruction, of which QEMU makes only powers of two, where instructions are counted."""
-_TICK = 40  # ns, of the emulated board's clock
+"""Duration of an emulated instruction while instructions are counted; QEMU has only powers of 2."""
+_TICK = 40
+"""Period of the emulated board's clock [ns]."""
 
 
 def missing_tools(target: str) -> str:
-    """What installs the tools that a target lacks; empty where it lacks none. An unknown target is refused."""
+    """Return the command that installs the missing tools of a target, or "".
+
+    Raises:
+        ValueError: the target is unknown.
+    """
     check_names([target], TARGETS, "target")
-    lacking = [package for program, package in TARGETS[target].items() if not shutil.which(program)]
-    return f"apt-get install {' '.join(lacking)}" if lacking else ""
+    missing = [package for program, package in TARGETS[target].items() if not shutil.which(program)]
+    return f"apt-get install {' '.join(missing)}" if missing else ""
 
 
 class OnnxPolicy:
-    """The policy of an exported folder by onnxruntime, chosen as other policies are; within the contract's limits."""
+    """The ONNX policy of an exported folder, with the safe command beyond the contract's limits.
+
+    It has the interface of other policies and is computed by onnxruntime.
+    """
 
     def __init__(self, folder: Path) -> None:
-        """Load what `codrl_mj.deploy.export` wrote into a folder."""
+        """Load the policy from a folder that `codrl_mj.deploy.export` wrote."""
+        # onnxruntime is optional.
         import onnxruntime
 
         self.session = onnxruntime.InferenceSession(
@@ -62,60 +75,65 @@ class OnnxPolicy:
         *,
         deterministic: bool = True,  # noqa: ARG002 - the protocol's
     ) -> tuple[np.ndarray, Any]:
-        """Actions (N, m) or (N,) for observations (N, k)."""
+        """Return actions (N, m) or (N,) for observations (N, k)."""
         actions = self.session.run(None, {"observation": observation.astype(np.float32)})[0]
-        beyond = ~self.contract.within(observation)
-        if beyond.any():
-            actions[beyond] = self.contract.actions_of(np.array([self.contract.late["command"]]))[0]
+        is_beyond = ~self.contract.is_within_limits(observation)
+        if is_beyond.any():
+            actions[is_beyond] = self.contract.to_actions(
+                np.array([self.contract.late["command"]])
+            )[0]
         return actions, None
 
 
 @dataclasses.dataclass(frozen=True)
 class Link(Checked):
-    """What stands between a board and what it controls; nothing unless something is said.
+    """Imperfections of the connection between a board and the controlled system; none by default.
 
     Raises:
         ValueError: a field is out of bounds.
     """
 
     lost: float = real(0.0, least=0.0, most=1.0)
-    """Share of the frames that never arrive at the board."""
+    """Share of the frames that do not arrive at the board."""
     damaged: float = real(0.0, least=0.0, most=1.0)
-    """Share of the frames in which a bit flips on the way."""
+    """Share of the frames in which one bit flips."""
     late: float = real(0.0, least=0.0, most=1.0)
-    """Share of the answers that come a period late: the command before holds."""
+    """Share of the answers that come one period late, so that the previous command still holds."""
     counts: int = integer(0, least=0)
-    """Steps of the encoders in a turn, in which observed angles come; speeds [rad/s] come as
-    differences of them over a period. 0: exact.
+    """Encoder counts per turn, to which angles are rounded; 0: exact.
+
+    Speeds [rad/s] are rounded to one count per period.
     """
     current_bits: int = integer(0, least=0)
-    """Bits of the converter that measures the current, over the drive's range both ways. 0: exact."""
+    """Bits of the current measurement, over the drive's range in both directions; 0: exact."""
     pwm_bits: int = integer(0, least=0)
-    """Bits of the bridge's voltages, which a current loop or the policy itself commands, over the
-    supply both ways. 0: exact.
+    """Bits of the bridge's voltage, over the supply voltage in both directions; 0: exact.
+
+    A current loop, or the policy itself, commands the voltage.
     """
 
-    def encoded(self, contract: Contract, observation: np.ndarray) -> np.ndarray:
-        """An observation (k,) as encoders with so many counts say it."""
+    def quantize(self, contract: Contract, observation: np.ndarray) -> np.ndarray:
+        """Return an observation (k,) as encoders with `counts` per turn measure it."""
         if not self.counts:
             return observation
-        seen, step = np.array(observation, np.float64), 2.0 * np.pi / self.counts
-        for place, one in enumerate(contract.observations):
-            size = {"rad": step, "rad/s": step * contract.rate}.get(one["unit"] or "")
+        measured, step = np.array(observation, np.float64), 2.0 * np.pi / self.counts
+        for index, entry in enumerate(contract.observations):
+            size = {"rad": step, "rad/s": step * contract.rate}.get(entry["unit"] or "")
             if size:
-                seen[place] = size * np.round(seen[place] / size)
-            elif one["name"].startswith("cos_"):  # the sine follows it
-                angle = step * np.round(np.arctan2(seen[place + 1], seen[place]) / step)
-                seen[place : place + 2] = np.cos(angle), np.sin(angle)
-        return seen
+                measured[index] = size * np.round(measured[index] / size)
+            # The sine of an angle follows its cosine.
+            elif entry["name"].startswith("cos_"):
+                angle = step * np.round(np.arctan2(measured[index + 1], measured[index]) / step)
+                measured[index : index + 2] = np.cos(angle), np.sin(angle)
+        return measured
 
 
 class Board(contextlib.AbstractContextManager["Board"]):
-    """A policy that is computed by the exported C, in a process of its own, and asked frame by frame in lock step.
+    """A policy that the exported C computes in a separate process, frame by frame in lockstep.
 
-    A context manager: the process ends with it. Where no answer comes, the contract's command for
-    safety is taken. While it is open, motors of this process ask another, of the same C, for the
-    voltage of each sample of their loop.
+    It is a context manager, at whose end the process is terminated. If an answer is missing, the
+    contract's safe command is used. If the C closes the current loop, motors in this Python process
+    request the voltage of each sample of their loop from a second process of the same C.
     """
 
     def __init__(
@@ -128,32 +146,33 @@ class Board(contextlib.AbstractContextManager["Board"]):
         actuator: Any = None,
         trust: bool = False,
     ) -> None:
-        """Compile the C and start it.
+        """Compile and start the C.
 
         Args:
-            folder: what `codrl_mj.deploy.export` wrote.
+            folder: a folder that `codrl_mj.deploy.export` wrote.
             target: `host`, or `cortex-m4f`, which QEMU emulates.
-            link: what stands between; None for nothing.
-            seed: of what is lost, damaged and late.
-            loop: whether the C closes the current loop too, where it has one; else the simulation
+            link: imperfections of the connection; None for none.
+            seed: seed of lost, damaged and late frames.
+            loop: True if the C also closes the current loop, if it has one; False if the simulation
                 does.
-            actuator: what the simulation has for motors, by name, file or object; None: those of
-                the training.
-            trust: whether to import the modules that the contract names as task or actuator, which
+            actuator: motors of the simulation, by name, file or object; None: those of the
+                training.
+            trust: True to import the modules that the contract names as task or actuator, which
                 executes them.
 
         Raises:
             FileNotFoundError: the folder has no contract or no C.
             ValueError: the target or actuator is unknown, the actuator is of another family than
-                the C's loop, the contract names a module and `trust` is false, or bits are given
-                where the C neither closes a loop nor commands a voltage, or has no limit for them.
+                the C's loop, the contract names a module and `trust` is false, or bits are set
+                although the C neither closes a loop nor commands a voltage, or has no limit that
+                gives their range.
             RuntimeError: a tool is missing (the message installs it), or the C does not compile.
         """
         if install := missing_tools(target):
             raise RuntimeError(f"target {target}: its tools are missing: {install}")
         self.contract, self.link = Contract.read(folder), link or Link()
         self.random = np.random.default_rng(seed)
-        self.frames, self.refused, self.stopped, self.unanswered = 0, 0, 0, 0
+        self.frames, self.refused, self.beyond_limits, self.unanswered = 0, 0, 0, 0
         self._safe = self._last = np.array(self.contract.late["command"])
         self.loop = self.contract.controller["loop"] if loop else None
         self.env = self.contract.environment(trust)
@@ -168,20 +187,21 @@ class Board(contextlib.AbstractContextManager["Board"]):
                 f"actuator: a {type(motor).__name__}, must be a {trained.__name__}, for which the C"
                 " closes the loop; or let the simulation close it (--no-loop)"
             )
-        self.rig = (
-            self.env
-        )  # where the drive's limit of the current is the C's, which knows its own motor alone
+        # The drive's current limit applies in the C, with the motor of the training. A different
+        # motor in the simulation must therefore have no limit.
+        self.rig = self.env
         if self.loop is not None and actuator is not None and self.loop["kind"] == "sampled":
             unlimited = motor.replaced({"controller.max_current": np.inf})
             self.rig = dataclasses.replace(
                 self.env, actuator=dict.fromkeys(self.env.driven, unlimited)
             )
         steps = self._converters()
-        with contextlib.ExitStack() as held:
-            process = held.enter_context(_running(folder, target))
+        with contextlib.ExitStack() as stack:
+            process = stack.enter_context(_running(folder, target))
             self._wire = Wire(self.contract, process.stdin.fileno(), process.stdout.fileno())
             self._samples = np.zeros(2)
             if self.loop is not None:
+                # The import compiles with numba and is only needed for a loop in the C.
                 from codrl_mj.deploy.on_board import loop_on_board
 
                 amperes = (
@@ -189,37 +209,39 @@ class Board(contextlib.AbstractContextManager["Board"]):
                     if self.env.action == "force"
                     else 1.0
                 )
-                drive = held.enter_context(_running(folder, target, "BOARD_DRIVE"))
-                self._samples = held.enter_context(loop_on_board(trained, drive, amperes, *steps))
-            self._held = held.pop_all()
+                drive = stack.enter_context(_running(folder, target, "BOARD_DRIVE"))
+                self._samples = stack.enter_context(loop_on_board(trained, drive, amperes, *steps))
+            # Without an error so far, the processes stay open until `__exit__`.
+            self._processes = stack.pop_all()
 
     def __exit__(self, *_: object) -> None:
-        self._held.close()
+        self._processes.close()
 
     @property
     def samples(self) -> int:
-        """Samples of the current loop that the board computed."""
+        """Number of samples of the current loop that the board computed."""
         return int(self._samples[0])
 
     def episodes(
         self, count: int, seed: int = 0, on_episode: Callable[[int], None] = lambda _: None
     ) -> list[Episode]:
-        """Whole episodes, one after another: a late answer leaves the command before, which is an episode's own.
+        """Run whole episodes one after another.
 
         Args:
-            count: how many.
-            seed: that of the first; each of the others has the next one.
-            on_episode: called with how many are finished.
+            count: number of episodes.
+            seed: seed of the first episode; each of the others has the next seed.
+            on_episode: callback with the number of finished episodes.
 
         Raises:
             ValueError: `seed` is below 0.
         """
-        done: list[Episode] = []
-        for place in range(count):
+        finished: list[Episode] = []
+        for index in range(count):
+            # A late answer must not apply a command of the episode before.
             self._last = self._safe
-            done += run_episodes(self, self.rig.make, 1, seed + place)
-            on_episode(len(done))
-        return done
+            finished += run_episodes(self, self.rig.make, 1, seed + index)
+            on_episode(len(finished))
+        return finished
 
     def predict(
         self,
@@ -227,15 +249,15 @@ class Board(contextlib.AbstractContextManager["Board"]):
         *,
         deterministic: bool = True,  # noqa: ARG002 - the protocol's
     ) -> tuple[np.ndarray, Any]:
-        """Actions (N, m) or (N,) for observations (N, k), each asked of the board in a frame of its own."""
+        """Return actions (N, m) or (N,) for observations (N, k), each sent in a separate frame."""
         if self._samples[1]:
             raise RuntimeError(f"the board's current loop did not answer at sample {self.samples}")
-        return self.contract.actions_of(np.array([self.command(row) for row in observation])), None
+        return self.contract.to_actions(np.array([self.command(row) for row in observation])), None
 
     def command(self, observation: np.ndarray) -> np.ndarray:
-        """The command for an observation, in the units of the contract; that for safety if no good answer comes."""
+        """Return the command for an observation in the contract's units, safe without an answer."""
         self.frames += 1
-        observation = self.link.encoded(self.contract, observation)
+        observation = self.link.quantize(self.contract, observation)
         frame = bytearray(
             self._wire.frame(
                 self.frames, self.frames * round(1e6 / self.contract.rate), observation
@@ -245,16 +267,15 @@ class Board(contextlib.AbstractContextManager["Board"]):
             self.unanswered += 1
             return self._safe
         if self.random.random() < self.link.damaged:
-            bit = int(
-                self.random.integers(16, 8 * len(frame))
-            )  # its start is found again in any case
+            # The two start bytes stay intact, so that the receiver finds the frame.
+            bit = int(self.random.integers(16, 8 * len(frame)))
             frame[bit // 8] ^= 1 << bit % 8
-        answer = self._wire.asked(bytes(frame), self.frames)
+        answer = self._wire.request(bytes(frame), self.frames)
         if answer is None:
             self.unanswered += 1
             return self._safe
         self.refused += bool(answer.status & REFUSED)
-        self.stopped += bool(answer.status & BEYOND)
+        self.beyond_limits += bool(answer.status & BEYOND)
         command, self._last = (
             (self._last, answer.command)
             if self.random.random() < self.link.late
@@ -263,7 +284,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         return command
 
     def _converters(self) -> tuple[float, float]:
-        """Steps of the measured current [A] and of the voltage [V] of a loop that the C closes."""
+        """Return the resolutions of current [A] and voltage [V] of a loop that the C closes."""
         bits = self.link.current_bits, self.link.pwm_bits
         if not any(bits):
             return 0.0, 0.0
@@ -278,11 +299,12 @@ class Board(contextlib.AbstractContextManager["Board"]):
         resistance, _ = self.env.actuators[0].winding or (1.0, 0.0)
         ranges = self.loop["most"] or voltage / resistance, voltage
         return tuple(
-            2.0 * most / 2**bit if bit else 0.0 for most, bit in zip(ranges, bits, strict=True)
+            2.0 * largest / 2**num_bits if num_bits else 0.0
+            for largest, num_bits in zip(ranges, bits, strict=True)
         )  # type: ignore[return-value]
 
     def _with_bridge(self) -> EnvConfig:
-        """Return the environment with a bridge of `pwm_bits` behind a policy that commands the voltages itself."""
+        """Return the environment with a bridge of `pwm_bits` for policies that command voltages."""
         motor, disturbances, link = self.env.actuators[0], self.env.disturbances, self.link
         refusals = {
             "the simulation closes the current loop: leave --no-loop out": (
@@ -292,7 +314,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
                 self.env.action != "voltage"
             ),
             "the policy commands voltages, and the C measures no current": link.current_bits > 0,
-            "the motors differ": any(one != motor for one in self.env.actuators),
+            "the motors differ": any(actuator != motor for actuator in self.env.actuators),
             "the environment has a disturbances.command_quantum already": (
                 disturbances.command_quantum > 0.0
             ),
@@ -302,6 +324,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
                 f"current_bits = {link.current_bits}, pwm_bits = {link.pwm_bits}: must be 0:"
                 f" {reason}"
             )
+        # The environment's quantum is in its units of force, so the voltage step is converted.
         command = motor.commands()["voltage"]
         step = 2.0 * float(command.limit or 0.0) / 2**link.pwm_bits
         quantum = step * command.torque_per_unit / command.actuator.arm_radius
@@ -312,40 +335,40 @@ class Board(contextlib.AbstractContextManager["Board"]):
 
 @dataclasses.dataclass(frozen=True)
 class BoardTest:
-    """What an exported controller did on a board beside what onnxruntime did in Python, from the same seeds."""
+    """Results of an exported controller on a board and of onnxruntime, from the same seeds."""
 
     on_board: list[Episode]
     """Episodes with the board as the controller."""
     in_python: list[Episode]
-    """The same with the policy, and the current loop, in Python."""
+    """Episodes with the policy and the current loop in Python."""
     frames: int
-    """Observations that were sent."""
+    """Number of observations sent to the board."""
     samples: int
-    """Samples of the current loop that the board computed."""
+    """Number of samples of the current loop that the board computed."""
     refused: int
-    """Frames that the board refused."""
-    stopped: int
-    """Observations beyond the limits."""
+    """Number of frames that the board refused."""
+    beyond_limits: int
+    """Number of observations beyond the limits."""
     unanswered: int
-    """Frames without an answer."""
+    """Number of frames without an answer."""
     rate: float
-    """Exchanges a second, frames and samples, with the simulation between them."""
+    """Exchanged frames and samples per second, including the time of the simulation."""
     instructions: tuple[int, int] | None
-    """Most of a policy step and of a current step, of the golden observations; None where they are not counted."""
+    """Largest instruction counts of a policy step and a current step; None if not counted."""
 
     @property
     def returns(self) -> np.ndarray:
-        """Returns on the board and in Python, shape (episodes, 2)."""
+        """Returns of the episodes on the board and in Python, shape (episodes, 2)."""
         return np.array(
             [
-                [one.reward.sum() for one in pair]
+                [episode.reward.sum() for episode in pair]
                 for pair in zip(self.on_board, self.in_python, strict=True)
             ]
         )
 
     @property
-    def alike(self) -> int:
-        """Episodes whose return is within 1 % of Python's."""
+    def num_equal_returns(self) -> int:
+        """Number of episodes whose return is within 1 % of Python's."""
         board, python = self.returns.T
         return int((np.abs(board - python) <= 0.01 * np.abs(python)).sum())
 
@@ -361,17 +384,17 @@ def board_test(
     on_episode: Callable[[int], None] = lambda _: None,
     trust: bool = False,
 ) -> BoardTest:
-    """Run the exported C as the controller of the simulation, and the exported ONNX model beside it.
+    """Run episodes with the exported C as the controller, and with the exported ONNX model.
 
     Args:
-        folder: what `codrl_mj.deploy.export` wrote.
+        folder: a folder that `codrl_mj.deploy.export` wrote.
         target: `host`, or `cortex-m4f`, which QEMU emulates.
-        episodes: how many, each from its own seed.
-        seed: of the first of them.
-        link: what stands between board and simulation; None for nothing.
-        loop: whether the C closes the current loop too, where it has one.
+        episodes: number of episodes, each with a different seed.
+        seed: seed of the first episode.
+        link: imperfections of the connection; None for none.
+        loop: True if the C also closes the current loop, if it has one.
         actuator: as for `Board`.
-        on_episode: called with how many are finished on the board.
+        on_episode: callback with the number of episodes finished on the board.
         trust: as for `Board`.
 
     Raises:
@@ -381,10 +404,10 @@ def board_test(
     """
     with Board(folder, target, link, seed, loop, actuator, trust) as board:
         env = board.env
-        began = time.perf_counter()
+        start = time.perf_counter()
         on_board = board.episodes(episodes, seed, on_episode)
-        rate = (board.frames + board.samples) / (time.perf_counter() - began)
-        counts = board.frames, board.samples, board.refused, board.stopped, board.unanswered
+        rate = (board.frames + board.samples) / (time.perf_counter() - start)
+        counts = board.frames, board.samples, board.refused, board.beyond_limits, board.unanswered
     in_python = run_episodes(OnnxPolicy(folder), env.make, episodes, seed)
     return BoardTest(
         on_board, in_python, *counts, rate, instructions(folder) if target == "cortex-m4f" else None
@@ -392,7 +415,9 @@ def board_test(
 
 
 def instructions(folder: Path) -> tuple[int, int]:
-    """Most instructions of a policy step and of a current step on an emulated Cortex-M4F, of the golden observations.
+    """Return the largest instruction counts of a policy step and a current step on a Cortex-M4F.
+
+    The maximum is over the golden observations; the processor is emulated.
 
     Raises:
         FileNotFoundError: the folder has no contract or no C.
@@ -403,51 +428,60 @@ def instructions(folder: Path) -> tuple[int, int]:
         contract.golden["observations"], "<f8" if contract.controller["real"] == "double" else "<f4"
     )
     with _running(folder, "cortex-m4f", "BOARD_TICKS") as process:
-        got = process.communicate(rows.tobytes(), timeout=60)[0]
-    most = np.frombuffer(got, "<u4").reshape(len(rows), 2).max(axis=0) * _TICK / NANOSECONDS
-    return int(most[0]), int(most[1])
+        output = process.communicate(rows.tobytes(), timeout=60)[0]
+    counts = np.frombuffer(output, "<u4").reshape(len(rows), 2).max(axis=0) * _TICK / NANOSECONDS
+    return int(counts[0]), int(counts[1])
 
 
 @contextlib.contextmanager
 def _running(folder: Path, target: str, define: str = "") -> Iterator[Any]:
-    """The program of a folder, compiled and running, with pipes."""
-    with tempfile.TemporaryDirectory() as built:
-        command = _build(folder, target, Path(built), [f"-D{define}"] if define else [])
-        counted = (
+    """Compile the program of a folder and run it with pipes during a `with` block."""
+    with tempfile.TemporaryDirectory() as build_folder:
+        command = _build(folder, target, Path(build_folder), [f"-D{define}"] if define else [])
+        # QEMU then counts instructions instead of measuring time.
+        icount_flags = (
             ["-icount", f"shift={NANOSECONDS.bit_length() - 1}"] if define == "BOARD_TICKS" else []
         )
         process = subprocess.Popen(
-            [*command, *counted], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            [*command, *icount_flags], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
         try:
             yield process
         finally:
             process.kill()
-            with contextlib.suppress(ValueError):  # its pipes are closed
+            # The pipes may have been closed already.
+            with contextlib.suppress(ValueError):
                 process.communicate()
 
 
-def _build(folder: Path, target: str, built: Path, flags: list[str]) -> list[str]:
-    """The command that runs the controller of a folder, compiled into another."""
-    sources = [
-        str(folder / name) for name in SOURCES if not flags or name != "wire.c"
-    ]  # frames, or samples
-    if gone := [
+def _build(folder: Path, target: str, build_folder: Path, flags: list[str]) -> list[str]:
+    """Compile the controller of a folder and return the command that runs it.
+
+    Args:
+        folder: folder with the C files.
+        target: name from `TARGETS`.
+        build_folder: folder for the program.
+        flags: compiler flags; programs with a flag exchange no frames and need no `wire.c`.
+    """
+    sources = [str(folder / name) for name in SOURCES if not flags or name != "wire.c"]
+    if absent := [
         name for name in (*sources, str(folder / "controller.h")) if not Path(name).is_file()
     ]:
-        raise FileNotFoundError(f"{gone[0]}: missing: write the folder with codrl-mj export")
-    program = str(built / "controller")
+        raise FileNotFoundError(f"{absent[0]}: missing: write the folder with codrl-mj export")
+    program = str(build_folder / "controller")
     command = ["cc", *_STRICT, *flags, *sources, "-lm", "-o", program]
     if target == "cortex-m4f":
-        linked = ["-T", str(folder / "board.ld"), *sources, "-lm", "-o", program]
-        command = ["arm-none-eabi-gcc", *_CORTEX.split(), *_STRICT, *flags, *linked]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        lines = done.stderr.splitlines()
-        said = next(
-            (line for line in lines if "error:" in line or "undefined" in line), done.stderr.strip()
+        linker_arguments = ["-T", str(folder / "board.ld"), *sources, "-lm", "-o", program]
+        command = ["arm-none-eabi-gcc", *_CORTEX.split(), *_STRICT, *flags, *linker_arguments]
+    compiled = subprocess.run(command, capture_output=True, text=True, check=False)
+    if compiled.returncode:
+        lines = compiled.stderr.splitlines()
+        # The first error; a linker's error says "undefined".
+        error = next(
+            (line for line in lines if "error:" in line or "undefined" in line),
+            compiled.stderr.strip(),
         )
-        raise RuntimeError(f"{folder}: its C does not compile: {said}")
+        raise RuntimeError(f"{folder}: its C does not compile: {error}")
     return (
         [program]
         if target == "host"

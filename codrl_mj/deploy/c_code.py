@@ -1,4 +1,7 @@
-"""A policy, and the current loop behind it, as C99 for a microcontroller: no malloc, of libm tanh, atan2 and fabs."""
+"""C99 code of a policy and of the current loop behind it, for a microcontroller.
+
+The code allocates no memory and uses only tanh, atan2 and fabs of the C library.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,8 +16,8 @@ from codrl_mj.fields import check_names
 from codrl_mj.user_code import asset_path
 
 FILES = ("controller.h", "controller.c", "main.c", "wire.h", "wire.c", "board.c", "board.ld")
-# name -> bytes of flash memory for a program, of RAM; whether an AVR: constants lie in RAM, a
-# double has 4
+# Board -> bytes of flash memory, bytes of RAM, and True for an AVR. An AVR keeps constants in RAM,
+# and its double has only 4 bytes.
 BOARDS = {
     "arduino-uno": (32_256, 2_048, True),
     "arduino-due": (524_288, 98_304, False),
@@ -22,28 +25,31 @@ BOARDS = {
     "raspberry-pi-pico": (2_097_152, 270_336, False),
     "teensy-4.1": (8_126_464, 1_048_576, False),
 }
-# bytes beside the weights: 2,400 with tanhf, of a Cortex-M4 by gcc -O2; the rest for start-up and
-# drivers
-CODE = 6_000
+# Bytes of flash memory in addition to the weights: 2,400 of code with tanhf, for a Cortex-M4 by
+# gcc -O2, and the rest for start-up code and drivers.
+CODE_BYTES = 6_000
 
 
 def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
-    """The C files of a policy, and of the current loop behind it.
+    """Return the C files of a policy and of the current loop behind it.
 
     Args:
         network: the policy.
-        contract: what it assumes, with the golden numbers, the loop's, and in which numbers it
-            computes.
+        contract: its contract, with the golden values, the parameters of the loop and the type of
+            the C's numbers.
 
     Returns:
-        Name -> content, of `FILES`.
+        Name -> content of each of `FILES`.
     """
+    # Only the export needs jinja2.
     import jinja2
 
     loop, double = contract.controller["loop"], contract.controller["real"] == "double"
     suffix = "" if double else "f"
 
     def number(value: float) -> str:
+        # 9 digits restore any float, and repr any double. C reads "1" as an integer, so a decimal
+        # point is added.
         text = repr(float(value)) if double else f"{float(np.float32(value)):.9g}"
         return (text if set(text) & set(".en") else f"{text}.0") + suffix
 
@@ -52,9 +58,9 @@ def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
 
     golden = contract.golden
     levels = contract.levels
-    if (
-        network.low is None and levels is None
-    ):  # an environment of others: what they stand for is their index
+    # The discrete actions of a third-party environment have no known values; the command is the
+    # index.
+    if network.low is None and levels is None:
         levels = np.arange(network.choices, dtype=np.float64)[:, None]
     known = {
         "version": codrl_mj.__version__,
@@ -78,43 +84,49 @@ def c_files(network: Network | Tiles, contract: Contract) -> dict[str, str]:
         **{name: getattr(contract, name) for name in ("task", "agent", "rate", "observations")},
         "commands": contract.actions,
         "limits": [
-            (place, one["name"], *contract.limits[one["name"]])
-            for place, one in enumerate(contract.observations)
-            if one["name"] in contract.limits
+            (index, entry["name"], *contract.limits[entry["name"]])
+            for index, entry in enumerate(contract.observations)
+            if entry["name"] in contract.limits
         ],
         "tolerance": golden["tolerance"],
         "late_after": f"{round(1e6 * contract.late['after'])}u",
         "safe": contract.late["command"],
         "golden_seen": golden["observations"],
-        "golden_commands": contract.commands(np.array(golden["actions"])),
+        "golden_commands": contract.to_commands(np.array(golden["actions"])),
         **_sizes(
             network,
             8 if double else 4,
             3 * len(contract.actions) if levels is None else levels.size,
         ),
     }
-    made = jinja2.Environment(
+    templates = jinja2.Environment(
         undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False
     )
     return {
-        name: made.from_string(asset_path(f"deploy/{name}.jinja").read_text()).render(known)
+        name: templates.from_string(asset_path(f"deploy/{name}.jinja").read_text()).render(known)
         for name in FILES
     }
 
 
-def _sizes(network: Network | Tiles, size: int, further: int) -> dict[str, int]:
-    """Bytes of constants, stack and state by those of a number, and how many operations a step takes."""
-    constants = size * (network.size + len(network.factors) + further)
-    told = {"constants": constants, "stack": size * network.working, "state": 2 * size}
+def _sizes(network: Network | Tiles, size: int, num_extra: int) -> dict[str, int]:
+    """Return the bytes of constants, stack and state, and the operations of a step.
+
+    Args:
+        network: the policy.
+        size: bytes of a number.
+        num_extra: number of constants in addition to the policy's.
+    """
+    constants = size * (network.size + len(network.factors) + num_extra)
+    sizes = {"constants": constants, "stack": size * network.num_working_values, "state": 2 * size}
     if isinstance(network, Tiles):
         tilings, axes = network.coder.displacements.shape
-        return told | {"products": tilings * (axes + network.choices), "tanhs": 0}
+        return sizes | {"products": tilings * (axes + network.choices), "tanhs": 0}
     tanhs = sum(len(layer.bias) for layer in network.layers if layer.activation == "Tanh")
-    return told | {"products": sum(layer.weight.size for layer in network.layers), "tanhs": tanhs}
+    return sizes | {"products": sum(layer.weight.size for layer in network.layers), "tanhs": tanhs}
 
 
 def check_board(board: str, network: Network | Tiles, double: bool = False) -> None:
-    """Refuse a policy that does not fit a board of `BOARDS`, with both sizes."""
+    """Raise a ValueError with both sizes if a policy does not fit a board of `BOARDS`."""
     check_names([board], BOARDS, "board")
     size = 8 if double else 4
     flash, ram, avr = BOARDS[board]
@@ -123,13 +135,13 @@ def check_board(board: str, network: Network | Tiles, double: bool = False) -> N
             f"board {board}: its double has 4 bytes: leave out --float64, or name a larger board"
         )
     needs = (
-        ("flash", size * network.size + CODE, flash),
-        ("RAM", size * (network.working + avr * network.size), ram),
+        ("flash", size * network.size + CODE_BYTES, flash),
+        ("RAM", size * (network.num_working_values + avr * network.size), ram),
     )
     smaller = "tilings 4" if isinstance(network, Tiles) else "hidden 32 32"
-    for what, needed, there in needs:
-        if needed > there:
+    for memory, needed, available in needs:
+        if needed > available:
             raise ValueError(
-                f"board {board}: the policy needs about {needed} bytes of {what}, must be at most"
-                f" {there}: train a smaller one (--agent.{smaller}), or name a larger board"
+                f"board {board}: the policy needs about {needed} bytes of {memory}, must be at most"
+                f" {available}: train a smaller one (--agent.{smaller}), or name a larger board"
             )

@@ -1,7 +1,8 @@
-"""What a policy and its controller assume of each other, in one file: `contract.json`.
+"""Contract between a policy and its controller, in the file `contract.json`.
 
-A policy on a board fails quietly where an angle comes in degrees, two entries change places or the
-loop runs at another rate. So all of it is written down, and a reader refuses what differs.
+A policy on a board fails silently if an angle comes in degrees, two entries are swapped or the loop
+runs at another rate. The contract therefore records all assumptions, and its reader raises an error
+if one does not hold.
 """
 
 import contextlib
@@ -18,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import mapping_of, trusting
-from codrl_mj.deploy.loops import current_loop
-from codrl_mj.deploy.network import network_of
+from codrl_mj.deploy.loops import loop_parameters
+from codrl_mj.deploy.network import extract_network
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
 from codrl_mj.fields import check_names, did_you_mean, differing
@@ -28,17 +29,21 @@ from codrl_mj.runs.policies import Policy
 
 FORMAT = "codrl_mj contract 1"
 FILE = "contract.json"
-GOLDEN = 200
-"""Observations of episodes that are kept with their actions, for whoever computes them elsewhere."""
-CLOSE = 1e-5
-"""Share of the largest golden command, and at least of 1, that those of others may be off."""
-LATE = 1.5
-"""Periods after which a command that has not come is late."""
+NUM_GOLDEN = 200
+"""Number of golden observations, stored with the policy's actions to test other runtimes."""
+GOLDEN_TOLERANCE = 1e-5
+"""Tolerance of other runtimes' commands, relative to the largest golden command, at least 1."""
+LATE_PERIODS = 1.5
+"""Number of periods after which a missing command is late."""
 _PACKAGES = ("codrl-mj", "mujoco", "gymnasium", "numpy", "stable-baselines3", "torch")
 
 
 def _step_duration(env: Any) -> float:
-    """Return the simulated time [s] between two actions: a task's own, else measured: a `dt` knows no wrappers."""
+    """Return the simulated time between two actions [s].
+
+    A task's environment knows it. For others it is measured, because their `dt` does not include
+    wrappers, such as one that repeats actions.
+    """
     recorder, actions, durations = (
         env.get_wrapper_attr("recorder"),
         copy.deepcopy(env.action_space),
@@ -50,9 +55,8 @@ def _step_duration(env: Any) -> float:
     env.reset(seed=0)
     for _ in range(5):
         *_, terminated, truncated, _ = env.step(actions.sample())
-        if not durations or not (
-            terminated or truncated
-        ):  # the last step of an episode may be cut short
+        # The last step of an episode may be cut short.
+        if not durations or not (terminated or truncated):
             durations.append(recorder.step_duration)
         if terminated or truncated:
             break
@@ -66,42 +70,42 @@ def _step_duration(env: Any) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Interface:
-    """What passes between a policy and whatever it controls."""
+    """Observations and actions between a policy and the controlled system."""
 
     task: str
-    """The environment's name."""
+    """Name of the environment."""
     rate: float
-    """Actions a second [Hz]."""
+    """Actions per second [Hz]."""
     observations: list[dict[str, Any]]
-    """Entries of an observation in their order: `name`, `unit`, bounds `least` and `most`; of a
-    contract's also `scale` and `offset` before the first layer (done by the policy itself), and
-    `seen`, the least and the most of the golden episodes.
+    """Entries of an observation in their order: `name`, `unit`, bounds `least` and `most`.
+
+    A contract also has `scale` and `offset` before the first layer, which the policy applies
+    itself, and `seen`, the smallest and the largest value in the golden episodes.
     """
     actions: list[dict[str, Any]]
-    """Entries of an action, likewise; a discrete one has the `levels` that its indices stand for."""
+    """Entries of an action in the same form; a discrete action has the `levels` of its indices."""
 
     @classmethod
-    def between(cls, env: EnvConfig) -> "Interface":
-        """That of an environment."""
-        with contextlib.closing(env.make()) as made:
-            rate = 1.0 / _step_duration(made)
+    def from_env(cls, env: EnvConfig) -> "Interface":
+        """Return the interface of an environment."""
+        with contextlib.closing(env.make()) as instance:
+            rate = 1.0 / _step_duration(instance)
         return cls(env.task, rate, *env.world.interface(env))
 
     @property
     def levels(self) -> np.ndarray | None:
-        """What discrete actions stand for, (choices, m) in the units of `actions`; None of others, or if not known."""
-        levels = [one["levels"] for one in self.actions if "levels" in one]
+        """Commands of discrete actions, (choices, m) in the units of `actions`; None if unknown."""
+        levels = [entry["levels"] for entry in self.actions if "levels" in entry]
         return np.array(levels, dtype=np.float64).T if levels else None
 
-    def commands(self, actions: np.ndarray) -> np.ndarray:
-        """Commands (n, m) in the units of `actions`, for actions (n, m), or indices (n,) of the levels."""
+    def to_commands(self, actions: np.ndarray) -> np.ndarray:
+        """Return commands (n, m) in the units of `actions` for actions (n, m) or indices (n,)."""
         return actions.reshape(len(actions), -1) if self.levels is None else self.levels[actions]
 
-    def actions_of(self, commands: np.ndarray) -> np.ndarray:
-        """The actions (n, m) for commands (n, m), or the indices (n,) of the levels that are nearest to them."""
-        if (
-            levels := self.levels
-        ) is None:  # of a discrete action of others nobody knows more than the index
+    def to_actions(self, commands: np.ndarray) -> np.ndarray:
+        """Return actions (n, m) for commands (n, m), or the indices (n,) of the nearest levels."""
+        # Without levels a discrete action of a third-party environment is its index.
+        if (levels := self.levels) is None:
             return (
                 commands.astype(np.float32)
                 if "least" in self.actions[0]
@@ -109,73 +113,73 @@ class Interface:
             )
         return np.abs(commands[:, None, :] - levels).sum(axis=2).argmin(axis=1)
 
-    def admit(
+    def check_observations(
         self, observations: Sequence[tuple[str, str | None]], rate: float | None = None
     ) -> None:
-        """Refuse observations that are not those of the policy.
+        """Raise an error if observations are not those of the policy.
 
         Args:
-            observations: name and unit of each entry, in the order in which they come; a unit of
-                None is not compared.
-            rate: how many come in a second [Hz]; None is not compared.
+            observations: name and unit of each entry, in their order; a unit of None is not
+                compared.
+            rate: observations per second [Hz]; None is not compared.
 
         Raises:
             ValueError: entries are missing, unknown, in another order or unit, or come at another
                 rate.
         """
-        names, given = (
-            [one["name"] for one in self.observations],
+        names, received = (
+            [entry["name"] for entry in self.observations],
             [name for name, _ in observations],
         )
-        if unknown := [name for name in given if name not in names]:
+        if unknown := [name for name in received if name not in names]:
             raise ValueError(
-                f"observation {unknown[0]!r}: the policy knows none;"
+                f"observation {unknown[0]!r}: unknown to the policy;"
                 f" {did_you_mean(unknown[0], names)}it has {', '.join(names)}"
             )
-        if missing := [name for name in names if name not in given]:
+        if missing := [name for name in names if name not in received]:
             raise ValueError(
                 f"observations: {', '.join(missing)} missing: the policy takes {', '.join(names)}"
             )
-        if given != names:
+        if received != names:
             raise ValueError(
-                f"observations: their order is {', '.join(given)}, must be {', '.join(names)}:"
+                f"observations: their order is {', '.join(received)}, must be {', '.join(names)}:"
                 " reorder the columns"
             )
-        for (name, unit), one in zip(observations, self.observations, strict=True):
-            if unit is not None and one["unit"] is not None and unit != one["unit"]:
+        for (name, unit), entry in zip(observations, self.observations, strict=True):
+            if unit is not None and entry["unit"] is not None and unit != entry["unit"]:
                 raise ValueError(
-                    f"observation {name!r}: its unit is {unit}, must be {one['unit']}: convert it"
+                    f"observation {name!r}: its unit is {unit}, must be {entry['unit']}: convert it"
                 )
         if rate is not None and abs(rate / self.rate - 1.0) > 0.01:
             raise ValueError(
                 f"rate: observations come at {rate:.4g} Hz, must be {self.rate:.4g} Hz, at which"
-                " the policy was trained: it knows no other"
+                " the policy was trained"
             )
 
 
 @dataclasses.dataclass(frozen=True)
 class Contract(Interface):
-    """What stands in the file."""
+    """Contents of the contract file."""
 
     agent: str
-    """Who was trained."""
+    """Name of the trained agent."""
     actuators: dict[str, dict[str, Any]]
-    """Motor, or pattern of motors -> its fields, None for an ideal one, and their `sha256`."""
+    """Motor or pattern of motors -> its `fields`, None for an ideal one, and their `sha256`."""
     assumed: dict[str, Any]
-    """The environment, as `EnvConfig.from_mapping` reads it: command, delays, quanta, joints, what was drawn."""
+    """Environment for `EnvConfig.from_mapping`, with command, delays, quanta and joints."""
     controller: dict[str, Any]
-    """What the C computes in, `real`, and the numbers of the `loop` behind the policy, None where it has none."""
+    """Type of the C's numbers, `real`, and parameters of the `loop` behind the policy or None."""
     limits: dict[str, list[float | None]]
-    """Observation -> least and most, beyond which the policy is not asked and the command is that for safety."""
+    """Observation -> smallest and largest safe value; beyond them the safe command is used."""
     late: dict[str, Any]
-    """What to do when no observation or command comes."""
+    """Time `after` which an observation or command is late, and the safe `command` to use then."""
     golden: dict[str, Any]
-    """`observations` (n, k) of episodes and `actions` (n, m) or (n,) of the policy, and how far others may be off."""
+    """Golden `observations` (n, k), the policy's `actions` (n, m) or (n,), and a `tolerance`."""
     versions: dict[str, str]
-    """Of what made it."""
+    """Versions of the software that wrote the contract."""
 
     @classmethod
-    def of(
+    def from_policy(
         cls,
         policy: Policy,
         env: EnvConfig,
@@ -185,65 +189,74 @@ class Contract(Interface):
         limits: Mapping[str, float] | None = None,
         double: bool = False,
     ) -> "Contract":
-        """What a policy assumes that was trained in an environment.
+        """Create the contract of a policy that was trained in an environment.
 
         Args:
             policy: as `codrl_mj.runs.policies.load_policy` returns it.
-            env: what it was trained in.
-            agent: the name of what trained it.
-            episodes: how many are run for golden numbers, each to its end; as many more if they end
-                too soon.
-            seed: of the first of them.
-            limits: observation -> largest size of it that is safe, in its unit; of an angle that is
-                observed as `cos_NAME` and `sin_NAME` by its NAME, below pi.
-            double: whether the C computes in double, not float.
+            env: the environment of the training.
+            agent: name of the agent that trained the policy.
+            episodes: number of whole episodes for the golden values; the same number is added while
+                they have too few observations.
+            seed: seed of the first episode.
+            limits: observation -> largest safe size, in its unit. An angle that is observed as
+                `cos_NAME` and `sin_NAME` is called NAME and must be below pi.
+            double: True if the C computes in double, False for float.
 
         Raises:
             ValueError: the policy cannot be exported, `episodes` is below 1, or a limit is unknown
                 or not positive.
         """
-        network = network_of(policy)
-        run = run_episodes(policy, env.make, episodes, seed)
-        while sum(len(one.time) for one in run) < GOLDEN:  # some fail at once
-            run += run_episodes(policy, env.make, episodes, seed + len(run))
-        seen = np.concatenate([one.observation[:-1] for one in run])
-        chosen = seen[np.unique(np.linspace(0, len(seen) - 1, GOLDEN).astype(int))]
-        between = Interface.between(env)
-        for place, entry in enumerate(between.observations):
-            entry |= network.first_step(place)
-            entry["seen"] = [float(seen[:, place].min()), float(seen[:, place].max())]
-        acted = policy.predict(chosen, deterministic=True)[0]
-        largest = max(1.0, float(np.abs(between.commands(acted)).max()))
+        network = extract_network(policy)
+        golden_episodes = run_episodes(policy, env.make, episodes, seed)
+        # A policy that fails at once has short episodes.
+        while sum(len(episode.time) for episode in golden_episodes) < NUM_GOLDEN:
+            golden_episodes += run_episodes(policy, env.make, episodes, seed + len(golden_episodes))
+        observations = np.concatenate([episode.observation[:-1] for episode in golden_episodes])
+        golden_observations = observations[
+            np.unique(np.linspace(0, len(observations) - 1, NUM_GOLDEN).astype(int))
+        ]
+        interface = Interface.from_env(env)
+        for index, entry in enumerate(interface.observations):
+            entry |= network.input_scaling(index)
+            entry["seen"] = [
+                float(observations[:, index].min()),
+                float(observations[:, index].max()),
+            ]
+        actions = policy.predict(golden_observations, deterministic=True)[0]
+        largest = max(1.0, float(np.abs(interface.to_commands(actions)).max()))
         return cls(
-            **vars(between),
+            **vars(interface),
             agent=agent,
-            actuators={name: _told(mapping_of(one)) for name, one in env.driven.items()},
+            actuators={
+                name: _with_digest(mapping_of(actuator)) for name, actuator in env.driven.items()
+            },
+            # The round trip turns tuples into lists, as in a contract that is read from a file.
             assumed=json.loads(json.dumps(env.as_mapping())),
-            controller={"real": "double" if double else "float", "loop": current_loop(env)},
-            limits=_limits([one["name"] for one in between.observations], limits or {}),
+            controller={"real": "double" if double else "float", "loop": loop_parameters(env)},
+            limits=_limits([entry["name"] for entry in interface.observations], limits or {}),
             late={
-                "after": LATE / between.rate,
+                "after": LATE_PERIODS / interface.rate,
                 "unit": "s",
-                "command": [0.0] * len(between.actions),
+                "command": [0.0] * len(interface.actions),
             },
             golden={
-                "observations": chosen.tolist(),
-                "actions": acted.tolist(),
-                "tolerance": CLOSE * largest,
+                "observations": golden_observations.tolist(),
+                "actions": actions.tolist(),
+                "tolerance": GOLDEN_TOLERANCE * largest,
             },
             versions={
                 "python": platform.python_version(),
-                **{one: importlib.metadata.version(one) for one in _PACKAGES},
+                **{package: importlib.metadata.version(package) for package in _PACKAGES},
             },
         )
 
     @classmethod
     def read(cls, folder: Path) -> "Contract":
-        """The contract of an exported folder, or a file itself.
+        """Read the contract of an exported folder, or a contract file.
 
         Raises:
-            FileNotFoundError: there is none.
-            ValueError: it is damaged, edited, or no contract.
+            FileNotFoundError: there is no contract.
+            ValueError: the file is damaged, edited, or not a contract.
         """
         path = folder / FILE if folder.is_dir() else folder
         content = read_json(path, "contract")
@@ -253,67 +266,76 @@ class Contract(Interface):
             )
         entries = [field.name for field in dataclasses.fields(cls)]
         if missing := [name for name in entries if name not in content]:
-            raise ValueError(f"{path}: has no {', '.join(missing)}: export it anew")
+            raise ValueError(f"{path}: has no {', '.join(missing)}: export it again")
         return cls(**{name: content[name] for name in entries})
 
     def environment(self, trust: bool = False) -> EnvConfig:
-        """Return the environment of the training; modules that it names are imported with `trust`, or refused."""
+        """Return the environment of the training.
+
+        Args:
+            trust: True to import the modules that it names; otherwise they raise an error.
+        """
         with trusting(trust):
             return EnvConfig.from_mapping(self.assumed)
 
     def write(self, folder: Path) -> None:
-        """Write `contract.json` into a folder, whole or not at all, with a digest of itself."""
+        """Write `contract.json` into a folder atomically, with a digest of its content."""
         write_json(folder / FILE, sealed({"format": FORMAT, **dataclasses.asdict(self)}))
 
-    def within(self, observations: np.ndarray) -> np.ndarray:
-        """Whether observations (N, k) are finite and within the limits, shape (N,)."""
-        fine = np.isfinite(observations).all(axis=1)
-        for place, one in enumerate(self.observations):
-            least, most = self.limits.get(one["name"], (None, None))
-            fine &= (least is None or observations[:, place] >= least) & (
-                most is None or observations[:, place] <= most
+    def is_within_limits(self, observations: np.ndarray) -> np.ndarray:
+        """Return True for observations (N, k) that are finite and within the limits, shape (N,)."""
+        is_safe = np.isfinite(observations).all(axis=1)
+        for index, entry in enumerate(self.observations):
+            lower, upper = self.limits.get(entry["name"], (None, None))
+            is_safe &= (lower is None or observations[:, index] >= lower) & (
+                upper is None or observations[:, index] <= upper
             )
-        return fine
+        return is_safe
 
-    def admit_actuators(self, actuators: Mapping[str, Any]) -> None:
-        """Refuse actuators that are not those of the training; by motor or pattern, each an `ActuatorModel`.
+    def check_actuators(self, actuators: Mapping[str, Any]) -> None:
+        """Raise an error if actuators are not those of the training.
+
+        Args:
+            actuators: motor or pattern of motors -> `ActuatorModel`.
 
         Raises:
-            ValueError: one differs; the message names the first number that does.
+            ValueError: an actuator differs; the message names the first field that does.
         """
-        for name, mine in self.actuators.items():
+        for name, trained in self.actuators.items():
             if name not in actuators:
                 raise ValueError(
-                    f"actuator {name!r}: missing: the policy was trained through {mine['fields']}"
+                    f"actuator {name!r}: missing: the policy was trained with {trained['fields']}"
                 )
-            theirs = _told(mapping_of(actuators[name]))
-            if theirs["sha256"] != mine["sha256"]:
-                found = differing(mine["fields"] or {}, theirs["fields"] or {})
-                where, (wanted, given) = next(iter(found.items()), ("family", (None, None)))
+            actual = _with_digest(mapping_of(actuators[name]))
+            if actual["sha256"] != trained["sha256"]:
+                differences = differing(trained["fields"] or {}, actual["fields"] or {})
+                field, (expected, value) = next(iter(differences.items()), ("family", (None, None)))
                 raise ValueError(
-                    f"actuator {name!r}: {where} = {given}, must be {wanted}, through which the"
-                    " policy was trained; evaluate it on yours, or train through that"
+                    f"actuator {name!r}: {field} = {value}, must be {expected}, with which the"
+                    " policy was trained; evaluate the policy with yours, or train with it"
                 )
 
 
 def _limits(names: list[str], limits: Mapping[str, float]) -> dict[str, list[float | None]]:
-    """Least and most of observations, by the largest size of each or of an angle."""
+    """Return the smallest and largest safe values, from the largest size of values or angles."""
     angles = [name.removeprefix("cos_") for name in names if name.startswith("cos_")]
     check_names(limits, [*names, *angles], "limit")
-    for name, most in limits.items():
-        if not 0.0 < most < (np.pi if name in angles else np.inf):
+    for name, largest in limits.items():
+        if not 0.0 < largest < (np.pi if name in angles else np.inf):
             raise ValueError(
-                f"limit {name} = {most:g}: must be > 0{' and < pi' if name in angles else ''}, and"
-                " finite"
+                f"limit {name} = {largest:g}: must be > 0{' and < pi' if name in angles else ''},"
+                " and finite"
             )
+    # An angle is at most a limit below pi exactly if its cosine is at least the limit's cosine.
     return {
         f"cos_{name}" if name in angles else name: (
-            [float(np.cos(most)), None] if name in angles else [-most, most]
+            [float(np.cos(largest)), None] if name in angles else [-largest, largest]
         )
-        for name, most in limits.items()
+        for name, largest in limits.items()
     }
 
 
-def _told(fields: Mapping[str, Any] | None) -> dict[str, Any]:
+def _with_digest(fields: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return fields with their digest."""
     digest = hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
     return {"fields": fields, "sha256": digest}

@@ -1,4 +1,4 @@
-"""A folder with all that a controller needs of a policy: an ONNX model, which any runtime reads, and its contract."""
+"""Export of a policy into a folder with an ONNX model, C code and the contract."""
 
 import json
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ import numpy as np
 
 from codrl_mj.deploy.c_code import c_files, check_board
 from codrl_mj.deploy.contract import Contract
-from codrl_mj.deploy.network import Network, network_of
+from codrl_mj.deploy.network import Network, extract_network
 from codrl_mj.deploy.tiles import Tiles
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs.files import writing_folder
@@ -17,19 +17,24 @@ from codrl_mj.runs.policies import Policy, check_spaces
 
 ONNX, TABLE = "policy.onnx", "table.csv"
 OPSET = 17
-IR = 9  # read by onnxruntime 1.16 and later
+"""Version of the ONNX operators."""
+IR = 9
+"""Version of the ONNX file format, which onnxruntime 1.16 and later read."""
 
 
-def onnx_model(network: Network | Tiles, about: Mapping[str, Any]) -> Any:
-    """The model: `observation`, float32 (N, k), to `action`, float32 (N, m) or int64 (N,).
+def onnx_model(network: Network | Tiles, metadata: Mapping[str, Any]) -> Any:
+    """Return the ONNX model from `observation`, float32 (N, k), to `action`.
+
+    The action is float32 (N, m), or int64 (N,) for discrete actions.
 
     Args:
         network: the policy.
-        about: its metadata, by name; what is no text is kept as JSON.
+        metadata: metadata by name; values other than text are stored as JSON.
 
     Returns:
         An `onnx.ModelProto` that `onnx.checker` accepts.
     """
+    # Only the export needs onnx.
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
@@ -37,16 +42,16 @@ def onnx_model(network: Network | Tiles, about: Mapping[str, Any]) -> Any:
     nodes: list[Any] = []
 
     def node(kind: str, *inputs: str | np.ndarray, **attributes: Any) -> str:
-        """Another node, by names of what goes in, or constants; the name of what it gives."""
+        """Add a node with inputs by name or as constants, and return the name of its output."""
         names = []
-        for one in inputs:
-            names.append(one if isinstance(one, str) else f"constant_{len(constants)}")
-            if not isinstance(one, str):
-                constants.append(numpy_helper.from_array(np.ascontiguousarray(one), names[-1]))
+        for operand in inputs:
+            names.append(operand if isinstance(operand, str) else f"constant_{len(constants)}")
+            if not isinstance(operand, str):
+                constants.append(numpy_helper.from_array(np.ascontiguousarray(operand), names[-1]))
         nodes.append(helper.make_node(kind, names, [f"values_{len(nodes)}"], **attributes))
         return str(nodes[-1].output[0])
 
-    network.graph(node)
+    network.add_to_graph(node)
     nodes[-1].output[0] = "action"
     kind, shape = (
         (TensorProto.INT64, ["N"])
@@ -72,7 +77,7 @@ def onnx_model(network: Network | Tiles, about: Mapping[str, Any]) -> Any:
     )
     texts = {
         name: value if isinstance(value, str) else json.dumps(value)
-        for name, value in about.items()
+        for name, value in metadata.items()
     }
     helper.set_model_props(model, texts)
     onnx.checker.check_model(model, full_check=True)
@@ -90,59 +95,59 @@ def export(
     board: str | None = None,
     limits: Mapping[str, float] | None = None,
 ) -> Contract:
-    """Write `policy.onnx`, `contract.json` and C99 into a new folder, whole or not at all.
+    """Write `policy.onnx`, `contract.json` and C99 code into a new folder atomically.
 
-    The C is `controller.h`, `controller.c` and `main.c`, which computes the golden commands again;
-    the loops are in it where all motors have the same `codrl_mj.actuators.Drive`, `Servo` or the
-    paper's `DCMotorActuator`.
+    The C code is `controller.h`, `controller.c` and `main.c`, which recomputes the golden commands.
+    It includes the loops if all motors have the same `codrl_mj.actuators.Drive`, `Servo` or paper's
+    `DCMotorActuator`.
 
     Args:
-        policy: as `codrl_mj.runs.policies.load_policy` returns it, of PPO, SAC, TD3, DDPG, DQN
-            or SARSA, whose weights are written as `table.csv` too.
-        env: what it was trained in.
-        agent: the name of what trained it.
+        policy: as `codrl_mj.runs.policies.load_policy` returns it, of PPO, SAC, TD3, DDPG, DQN or
+            SARSA. SARSA's weights are also written as `table.csv`.
+        env: the environment of the training.
+        agent: name of the agent that trained the policy.
         out: the folder; it must not exist, or be empty.
-        episodes: how many are run for the golden numbers.
-        seed: of the first of them.
-        double: whether the C computes in double, not float.
-        board: what it is to fit, one of `codrl_mj.deploy.c_code.BOARDS`; None for any.
-        limits: as for `Contract.of`.
+        episodes: number of episodes for the golden values.
+        seed: seed of the first episode.
+        double: True if the C computes in double, False for float.
+        board: board that the policy must fit, of `codrl_mj.deploy.c_code.BOARDS`; None for any.
+        limits: as for `Contract.from_policy`.
 
     Returns:
-        The contract, as it was written.
+        The written contract.
 
     Raises:
-        FileExistsError: the folder holds something.
-        ValueError: the policy cannot be exported, does not fit the board, or what was written does
-            not act as it does.
+        FileExistsError: the folder is not empty.
+        ValueError: the policy cannot be exported, does not fit the board, or acts differently once
+            exported.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(
-            f"--out {out}: it exists, and is no empty folder: name another, or delete it"
+            f"--out {out}: it exists and is not an empty folder: name another, or delete it"
         )
     check_spaces(policy, env)
-    network = network_of(policy)
+    network = extract_network(policy)
     if board is not None:
         check_board(board, network, double)
-    contract = Contract.of(policy, env, agent, episodes, seed, limits, double)
-    about: dict[str, Any] = {
+    contract = Contract.from_policy(policy, env, agent, episodes, seed, limits, double)
+    metadata: dict[str, Any] = {
         name: getattr(contract, name)
         for name in ("task", "agent", "rate", "observations", "actions", "versions")
     }
     golden = contract.golden
-    acted = network(np.array(golden["observations"], np.float32))
-    if (worst := np.abs(acted - np.array(golden["actions"])).max()) > golden["tolerance"]:
+    actions = network(np.array(golden["observations"], np.float32))
+    if (max_error := np.abs(actions - np.array(golden["actions"])).max()) > golden["tolerance"]:
         raise ValueError(
-            f"the exported policy's actions differ by {worst:.3g} from the policy's own, must be at"
-            f" most {golden['tolerance']:g}: it is not what its class says"
+            f"the exported policy's actions differ by {max_error:.3g} from the original's, must be"
+            f" at most {golden['tolerance']:g}: its class computes something else"
         )
     with writing_folder(out) as folder:
-        (folder / ONNX).write_bytes(onnx_model(network, about).SerializeToString())
+        (folder / ONNX).write_bytes(onnx_model(network, metadata).SerializeToString())
         contract.write(folder)
         for name, content in c_files(network, contract).items():
             (folder / name).write_text(content)
         if isinstance(network, Tiles):
             (folder / TABLE).write_text(
-                network.as_csv([one["name"] for one in contract.observations])
+                network.as_csv([entry["name"] for entry in contract.observations])
             )
     return contract

@@ -1,4 +1,7 @@
-"""The loops behind a policy as numbers, for a controller that closes them: the drive's, the servo's, the paper's."""
+"""Parameters of the loops behind a policy, for a controller that closes them.
+
+They are the loops of the drive, the servo and the paper's actuator.
+"""
 
 import contextlib
 from typing import Any
@@ -10,38 +13,42 @@ from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 from codrl_mj.envs.config import EnvConfig
 
 
-def current_loop(env: EnvConfig) -> dict[str, Any] | None:
-    """The numbers of the loop that all motors share; None where there is none to be computed on a board.
+def loop_parameters(env: EnvConfig) -> dict[str, Any] | None:
+    """Return the parameters of the loop that all motors share; None if a board cannot close it.
 
-    Those of a `codrl_mj.actuators.Drive` at 25 degC, whose gains are computed as it computes them,
-    of a `Servo`, or of the paper's `DCMotorActuator`. Amperes for a command, limits [A] and [V], gains,
-    and the rate of its samples [Hz].
+    The actuators must be a `codrl_mj.actuators.Drive`, whose gains are computed in the same way, at
+    25 degC; a `Servo`; or the paper's `DCMotorActuator`. The parameters are the current for a
+    command, limits [A] and [V], gains, and the sample rate [Hz].
     """
     first: Any = env.actuators[0]
-    asked = ("position", "velocity") if type(first) is Servo else ("force", "current")
+    actions = ("position", "velocity") if type(first) is Servo else ("force", "current")
+    # A subclass may have another loop, so the types must be equal.
     if type(first) not in (Drive, Servo, DCMotorActuator) or any(
-        one != first for one in env.actuators
+        actuator != first for actuator in env.actuators
     ):
         return None
-    if env.action not in asked:
+    if env.action not in actions:
         return None
     motor, loop = first.motor, first.controller
-    forced = env.action == "force"
+    commands_force = env.action == "force"
     shared = {
-        "unit": "N or N*m" if forced else "A",
-        "amperes": first.arm_radius / motor.torque_constant if forced else 1.0,
+        "unit": "N or N*m" if commands_force else "A",
+        "amperes": first.arm_radius / motor.torque_constant if commands_force else 1.0,
         "most": None,
+        # An infinite limit could not be written as a constant in C.
         "voltage": min(first.voltage_limit, 1e30),
         "servo": None,
     }
     if type(first) is DCMotorActuator:
-        with contextlib.closing(env.make()) as made:
-            model = getattr(made.unwrapped, "model", None)
+        # The paper's loop is sampled at the engine's step, which only the model knows.
+        with contextlib.closing(env.make()) as instance:
+            model = getattr(instance.unwrapped, "model", None)
         return (
             None
             if model is None
             else shared | _paper_loop(first, float(model.opt.timestep) / loop.substeps)
         )
+    # Gains of zero stand for gains that are designed from the bandwidth.
     kp, ki = loop.kp, loop.ki / loop.sample_rate
     if loop.kp == 0.0 and loop.ki == 0.0:
         bandwidth = 2.0 * np.pi * (loop.bandwidth or DEFAULT_BANDWIDTH * loop.sample_rate)
@@ -64,12 +71,11 @@ def current_loop(env: EnvConfig) -> dict[str, Any] | None:
 
 
 def _paper_loop(actuator: DCMotorActuator, period: float) -> dict[str, Any]:
-    """The numbers of `codrl_mj.actuators.electrical_step` at its electrical step [s]; None: no limit."""
+    """Return the parameters of `actuators.electrical_step` at a period [s]; None: no limit."""
     loop, supply = actuator.controller, actuator.supply
     limits = {"voltage": actuator.voltage_limit, "most_voltage": loop.max_voltage}
-    if (
-        supply is not None and supply.resistance
-    ):  # it sags from what the supply has without a current
+    # With a resistance the limit sags from the supply's open-circuit voltage.
+    if supply is not None and supply.resistance:
         limits["voltage"] = supply.voltage if np.isfinite(supply.voltage) else loop.max_voltage
     return {name: value if np.isfinite(value) else None for name, value in limits.items()} | {
         "kind": "pid",
@@ -84,7 +90,10 @@ def _paper_loop(actuator: DCMotorActuator, period: float) -> dict[str, Any]:
 
 
 def _outer_loops(servo: Servo) -> dict[str, Any]:
-    """The numbers of a servo's loops at the rotor, as `codrl_mj.actuators.servo.demand` has them; None: no limit."""
+    """Return the parameters of a servo's loops at the rotor; None: no limit.
+
+    They are those of `codrl_mj.actuators.servo.demand`.
+    """
     loop, ratio = servo.loop, servo.motor.gear_ratio
     gain = loop.velocity_gain / ratio**2
     limits = {"fastest": loop.max_velocity * ratio, "most": loop.max_torque / ratio}

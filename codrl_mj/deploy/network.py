@@ -1,6 +1,6 @@
-"""A trained policy as what it computes, without the library that trained it: factors, dense layers, and an end.
+"""Weights of a trained policy, without the library that trained it: scaling, layers and bounds.
 
-Imports nothing heavy: torch's tensors come in, numpy's arrays stay.
+The module imports no large library: torch's tensors are converted to numpy arrays.
 """
 
 import dataclasses
@@ -18,64 +18,69 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "ReLU": lambda values: np.maximum(values, 0.0),
     "Identity": lambda values: values,
 }
-"""By the name of torch's class."""
+"""Name of torch's class -> activation function."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Layer:
-    """activation(weight @ x + bias)."""
+    """A dense layer, activation(weight @ x + bias)."""
 
     weight: np.ndarray
-    """Shape (out, in), float32."""
+    """Weights, shape (out, in), float32."""
     bias: np.ndarray
-    """Shape (out,), float32."""
+    """Biases, shape (out,), float32."""
     activation: str
-    """One of `ACTIVATIONS`."""
+    """Name from `ACTIVATIONS`."""
 
 
 class Normalization(NamedTuple):
-    """Observation statistics of `VecNormalize`: (x - mean)/deviation, clipped to +-`clip`, in double."""
+    """Statistics of `VecNormalize`: (x - mean)/deviation, clipped to +-`clip`, in double."""
 
     mean: np.ndarray
-    """Shape (k,), float64."""
+    """Mean, shape (k,), float64."""
     deviation: np.ndarray
-    """Standard deviation, its epsilon included, shape (k,), float64."""
+    """Standard deviation, including the epsilon, shape (k,), float64."""
     clip: float
     """Largest normalized value."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """A policy that takes its most likely action: an observation (k,) to an action.
+    """A deterministic policy, which takes its most likely action for an observation (k,).
 
-    The observation is normalized if the training's was, multiplied by `factors`, goes through the
-    layers, and what they give is multiplied by `gains`. Of a box it is then brought between `low`
-    and `high`: clipped or, `squashed`, by (y + 1)/2 of the way. Without bounds the action is the
-    index of the largest.
+    The observation is normalized if it was in the training, multiplied by `factors`, and passed
+    through the layers, whose output is multiplied by `gains`. For a box action y the output is then
+    clipped to `low` and `high` or, if `squashed`, mapped from -1 to 1 onto them. Without bounds the
+    action is the index of the largest output.
     """
 
     factors: np.ndarray
-    """Shape (k,), float32."""
+    """Factors of the observation, shape (k,), float32."""
     layers: tuple[Layer, ...]
-    """From the observation to the action."""
+    """Layers from the observation to the action."""
     gains: np.ndarray
-    """Shape (m,), float32."""
+    """Factors of the output, shape (m,), float32."""
     low: np.ndarray | None
-    """Least action, shape (m,), float32; None where actions are discrete."""
+    """Smallest action, shape (m,), float32; None for discrete actions."""
     high: np.ndarray | None
-    """Largest action, likewise."""
+    """Largest action, shape (m,), float32; None for discrete actions."""
     squashed: bool
-    """Whether the layers end in -1 to 1, which stand for `low` and `high`."""
+    """True if the output range of -1 to 1 is mapped onto `low` and `high`."""
     normalization: Normalization | None = None
-    """Statistics of the observations; None where they are taken as they come."""
+    """Statistics that normalize the observation; None for no normalization."""
 
-    def graph(self, node: Any) -> str:
-        """The name of what an ONNX graph gives that computes it, by `node(kind, *inputs, **attributes)`."""
+    def add_to_graph(self, node: Any) -> str:
+        """Add the policy's nodes to an ONNX graph and return the name of the output.
+
+        Args:
+            node: function `node(kind, *inputs, **attributes)` that adds a node.
+        """
         values = "observation"
         if (norm := self.normalization) is not None:
+            # ONNX's type 11 is double, type 1 is float.
             values = node(
                 "Div", node("Sub", node("Cast", values, to=11), norm.mean), norm.deviation
-            )  # 11: double
+            )
             values = node("Min", node("Max", values, np.full(1, -norm.clip)), np.full(1, norm.clip))
             values = node("Cast", values, to=1)
         values = node("Mul", values, self.factors)
@@ -94,7 +99,7 @@ class Network:
         return str(node("Add", node("Mul", share, self.high - self.low), self.low))
 
     def __call__(self, observations: np.ndarray, kind: Any = np.float32) -> np.ndarray:
-        """Actions (N, m), or their indices (N,), of observations (N, k), computed in numbers of a `kind`."""
+        """Return actions (N, m) or indices (N,) for observations (N, k), in numbers of `kind`."""
         values = observations
         if (norm := self.normalization) is not None:
             values = np.clip((values - norm.mean) / norm.deviation, -norm.clip, norm.clip)
@@ -115,50 +120,53 @@ class Network:
 
     @property
     def width(self) -> int:
-        """The most numbers between two layers."""
+        """Largest number of values between two layers."""
         return max(len(self.factors), *(len(layer.bias) for layer in self.layers))
 
     @property
     def choices(self) -> int:
-        """How many numbers the last layer gives."""
+        """Number of outputs of the last layer."""
         return len(self.gains)
 
     @property
-    def working(self) -> int:
-        """Numbers that a step keeps beside the weights."""
+    def num_working_values(self) -> int:
+        """Number of values that a step stores in addition to the weights."""
+        # A layer needs its inputs and its outputs at the same time.
         return 2 * self.width
 
     @property
     def size(self) -> int:
-        """How many weights, biases and statistics there are."""
+        """Number of weights, biases and statistics."""
         statistics = 0 if self.normalization is None else 2 * len(self.normalization.mean)
         return statistics + sum(layer.weight.size + layer.bias.size for layer in self.layers)
 
-    def first_step(self, index: int) -> dict[str, float | None]:
-        """Return what is done to an entry of the observation before the first layer, as a contract has it."""
+    def input_scaling(self, index: int) -> dict[str, float | None]:
+        """Return the scaling of an observation entry before the first layer, for the contract."""
         factor, norm = float(self.factors[index]), self.normalization
         if norm is None:
             return {"scale": factor, "offset": 0.0}
         mean, deviation = float(norm.mean[index]), float(norm.deviation[index])
-        told = {
+        statistics = {
             "mean": mean,
             "variance": deviation**2,
             "clip": norm.clip if np.isfinite(norm.clip) else None,
         }
-        return {"scale": factor / deviation, "offset": -factor * mean / deviation, **told}
+        return {"scale": factor / deviation, "offset": -factor * mean / deviation, **statistics}
 
 
-def network_of(policy: Policy) -> Network | Tiles:
-    """What a policy computes: dense layers, of Stable-Baselines3's PPO, SAC, TD3, DDPG or DQN; or the tiles of SARSA.
+def extract_network(policy: Policy) -> Network | Tiles:
+    """Extract the dense layers of a Stable-Baselines3 policy, or the tiles of SARSA.
 
     Args:
-        policy: as `codrl_mj.runs.policies.load_policy` returns it.
+        policy: a policy of PPO, SAC, TD3, DDPG, DQN or SARSA, as
+            `codrl_mj.runs.policies.load_policy` returns it.
 
     Raises:
-        ValueError: it is none of these, or has parts that are no factors and dense layers.
+        ValueError: the policy is of another class, or has parts other than factors and dense
+            layers.
     """
     if isinstance(policy, NormalizedPolicy):
-        network, rms = network_of(policy.policy), policy.statistics
+        network, rms = extract_network(policy.policy), policy.statistics
         if not rms.norm_obs or isinstance(network, Tiles):
             return network
         deviation = np.sqrt(rms.obs_rms.var + rms.epsilon)
@@ -166,6 +174,7 @@ def network_of(policy: Policy) -> Network | Tiles:
             network, normalization=Normalization(rms.obs_rms.mean, deviation, float(rms.clip_obs))
         )
 
+    # The imports are local because SARSA's policy does not need Stable-Baselines3.
     from codrl_mj.agents.sarsa_algorithm import TileCodingPolicy
 
     if isinstance(policy, TileCodingPolicy):
@@ -177,59 +186,62 @@ def network_of(policy: Policy) -> Network | Tiles:
     from stable_baselines3.sac.policies import SACPolicy
     from stable_baselines3.td3.policies import TD3Policy
 
-    one: Any = policy
-    squashed = isinstance(one, SACPolicy | TD3Policy)
-    if isinstance(one, ActorCriticPolicy) and not one.squash_output:
+    # The attributes differ from class to class, hence Any.
+    model: Any = policy
+    squashed = isinstance(model, SACPolicy | TD3Policy)
+    if isinstance(model, ActorCriticPolicy) and not model.squash_output:
         extractor, parts = (
-            one.pi_features_extractor,
-            [*one.mlp_extractor.policy_net, one.action_net],
+            model.pi_features_extractor,
+            [*model.mlp_extractor.policy_net, model.action_net],
         )
-    elif isinstance(one, SACPolicy):
-        extractor, parts = one.actor.features_extractor, [*one.actor.latent_pi, one.actor.mu]
-    elif isinstance(one, TD3Policy):
-        extractor, parts = one.actor.features_extractor, [*one.actor.mu]
-    elif isinstance(one, DQNPolicy):
-        extractor, parts = one.q_net.features_extractor, [*one.q_net.q_net]
+    elif isinstance(model, SACPolicy):
+        extractor, parts = model.actor.features_extractor, [*model.actor.latent_pi, model.actor.mu]
+    elif isinstance(model, TD3Policy):
+        extractor, parts = model.actor.features_extractor, [*model.actor.mu]
+    elif isinstance(model, DQNPolicy):
+        extractor, parts = model.q_net.features_extractor, [*model.q_net.q_net]
     else:
         raise ValueError(
-            f"policy: a {type(one).__name__} cannot be exported: it must be of PPO, SAC, TD3, DDPG"
-            " or DQN, which are dense layers, or SARSA's"
+            f"policy: a {type(model).__name__} cannot be exported: it must be of PPO, SAC, TD3,"
+            " DDPG or DQN, with dense layers, or of SARSA"
         )
-    seen, acts = one.observation_space, one.action_space
-    if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
-        raise ValueError(f"policy: observations are {seen}: must be vectors")
+    observation_space, action_space = model.observation_space, model.action_space
+    if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
+        raise ValueError(f"policy: observations are {observation_space}: must be vectors")
     layers = _layers(parts)
-    if isinstance(one, SACPolicy):  # its distribution ends in it
+    # SAC's most likely action is the tanh of the mean, which its distribution applies.
+    if isinstance(model, SACPolicy):
         layers[-1] = dataclasses.replace(layers[-1], activation="Tanh")
-    scales, gains = getattr(extractor, "factors", None), getattr(one, "largest", None)
+    scales, gains = getattr(extractor, "factors", None), getattr(model, "largest", None)
     outputs = len(layers[-1].bias)
     return Network(
-        np.ones(seen.shape, np.float32) if scales is None else scales.numpy().copy(),
+        np.ones(observation_space.shape, np.float32) if scales is None else scales.numpy().copy(),
         tuple(layers),
         np.ones(outputs, np.float32) if gains is None else gains.numpy().astype(np.float32),
-        acts.low.astype(np.float32) if isinstance(acts, spaces.Box) else None,
-        acts.high.astype(np.float32) if isinstance(acts, spaces.Box) else None,
+        action_space.low.astype(np.float32) if isinstance(action_space, spaces.Box) else None,
+        action_space.high.astype(np.float32) if isinstance(action_space, spaces.Box) else None,
         squashed,
     )
 
 
-def _layers(parts: list[Any]) -> list[Layer]:
-    """Dense layers with the activations that follow them."""
-    found: list[Layer] = []
-    for part in parts:
-        kind = type(part).__name__
+def _layers(modules: list[Any]) -> list[Layer]:
+    """Return the dense layers of a list of modules, with the activations that follow them."""
+    layers: list[Layer] = []
+    for module in modules:
+        kind = type(module).__name__
         if kind == "Linear":
-            found.append(
+            layers.append(
                 Layer(
-                    part.weight.detach().numpy().copy(),
-                    part.bias.detach().numpy().copy(),
+                    module.weight.detach().numpy().copy(),
+                    module.bias.detach().numpy().copy(),
                     "Identity",
                 )
             )
-        elif kind in ACTIVATIONS and found and found[-1].activation == "Identity":
-            found[-1] = dataclasses.replace(found[-1], activation=kind)
+        elif kind in ACTIVATIONS and layers and layers[-1].activation == "Identity":
+            layers[-1] = dataclasses.replace(layers[-1], activation=kind)
         else:
             raise ValueError(
-                f"policy: a layer is {part}: must be Linear, or {', '.join(ACTIVATIONS)} after one"
+                f"policy: a layer is {module}: must be Linear, or {', '.join(ACTIVATIONS)} after"
+                " a Linear"
             )
-    return found
+    return layers

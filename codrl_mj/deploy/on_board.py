@@ -1,9 +1,9 @@
-"""The current loop of the exported C in the simulation's motor: each sample is asked of a process, the winding is here.
+"""Simulated motors whose current loop is computed by the exported C, in another process.
 
-A family's own step runs with one function of it replaced: where `Drive` and `Servo` compute samples
-of their loop, and the paper's `DCMotorActuator` its one, these ask for a voltage and bring it to the
-winding. Nothing else of a motor changes. The loop's memory goes with each sample and comes back,
-since the engine may ask for a step twice.
+A family's step runs with a single function replaced: instead of computing the voltage of a sample,
+`Drive`, `Servo` and the paper's `DCMotorActuator` request it from the process and apply it to the
+winding. Nothing else of a motor changes. The state of the loop is sent with each sample and
+returned, because the engine may evaluate a step twice.
 """
 
 import contextlib
@@ -23,14 +23,16 @@ from codrl_mj.compile_cache import external
 from codrl_mj.engine.families import family_replaced
 from codrl_mj.engine.memory import entry_address, f64, named_address, u64
 
-WITHIN = 5000
-"""Milliseconds after which a sample counts as not answered."""
+TIMEOUT_MS = 5000
+"""Time after which a sample counts as unanswered [ms]."""
+# POLLIN in the `events` of a `pollfd`, which follow its 32-bit file descriptor.
 _POLL_IN = 1 << 32
-_TABLE = np.zeros(
-    32
-)  # these, and 1: what `poll` is told; from 8 on a sample, from 16 on its answer
+# Compiled code has no access to Python objects. It shares this table: the settings and counters
+# below, the `pollfd` at 1, a sample from 8 on and its answer from 16 on.
+_TABLE = np.zeros(32)
 _table_at = named_address("codrl_mj_board", _TABLE.ctypes.data)
 _TO, _AMPERES, _CURRENT, _VOLTAGE, _SAMPLES, _LOST = 0, 2, 3, 4, 5, 6
+# The C library of this process, whose functions compiled code can call.
 _C: Any = ctypes.CDLL(None)
 _size = types.uintp
 _write = external("codrl_mj_board_write", _C.write, types.int64(types.int32, _size, _size))
@@ -38,36 +40,48 @@ _read = external("codrl_mj_board_read", _C.read, types.int64(types.int32, _size,
 _poll = external("codrl_mj_board_poll", _C.poll, types.int32(_size, types.uint64, types.int32))
 
 
-def rounded(value: float, step: float) -> float:
-    """A value as a converter with such a step sees it; 0: as it is."""
+def quantized(value: float, step: float) -> float:
+    """Return a value rounded to multiples of a step; a step of 0 leaves it unchanged."""
     return step * math.floor(value / step + 0.5) if step > 0.0 else value
 
 
-def asked_of_board(
-    reference: float, measured: float, speed: float, integral: float, kept: float
+def sample_on_board(
+    reference: float, measured: float, speed: float, integral: float, memory: float
 ) -> tuple[float, float, float]:
-    """The voltage [V] of a sample and the loop's memory after it, by [A], [A], [rad/s] and its memory; 0 V if none."""
+    """Request a sample of the loop from the board; the voltage is 0 without an answer.
+
+    Args:
+        reference: reference current [A].
+        measured: measured current [A].
+        speed: rotor speed [rad/s].
+        integral: state of the loop.
+        memory: second state of the loop.
+
+    Returns:
+        The voltage [V] and the two states after the sample.
+    """
     table = f64(_table_at())
     table[8], table[9], table[10] = (
         reference / table[_AMPERES],
-        rounded(measured, table[_CURRENT]),
+        quantized(measured, table[_CURRENT]),
         speed,
     )
-    table[11], table[12] = integral, kept
+    table[11], table[12] = integral, memory
     table[_SAMPLES] += 1.0
-    got = 0
+    received = 0
+    # After a lost answer the later ones would belong to other samples, so nothing is sent any more.
     if table[_LOST] == 0.0 and _write(int(table[_TO]), entry_address(table, 8), 40) == 40:
-        while got < 24 and _poll(entry_address(table, 1), 1, WITHIN) > 0:
+        # A pipe may deliver the 24 bytes of an answer in several parts.
+        while received < 24 and _poll(entry_address(table, 1), 1, TIMEOUT_MS) > 0:
             count = _read(
-                u64(_table_at())[1] & 0xFFFFFFFF, entry_address(table, 16) + got, 24 - got
-            )
+                u64(_table_at())[1] & 0xFFFFFFFF, entry_address(table, 16) + received, 24 - received)
             if count <= 0:
                 break
-            got += count
-    if got < 24:
+            received += count
+    if received < 24:
         table[_LOST] = 1.0
-        return 0.0, integral, kept
-    return rounded(table[16], table[_VOLTAGE]), table[17], table[18]
+        return 0.0, integral, memory
+    return quantized(table[16], table[_VOLTAGE]), table[17], table[18]
 
 
 def run_over(
@@ -75,39 +89,49 @@ def run_over(
     resistance: float,
     samples: int,
     winding: Winding,
-    closed: bool,  # noqa: ARG001 - it is
-    asked: float,
+    closed: bool,  # noqa: ARG001 - the loop is closed on the board
+    command: float,
     speed: float,
 ) -> tuple[Winding, float, float, int, float, float]:
-    """`codrl_mj.actuators.shaft.run_over` of a loop that is closed on the board, sample by sample."""
+    """Replace `codrl_mj.actuators.shaft.run_over`: the board closes the loop, sample by sample."""
+    # Over a sample the voltage is constant, so the current decays exponentially from its value to
+    # its steady state. `decayed` is the share of the distance that it covers.
     x = resistance / (parameters.sample_rate * parameters.inductance)
-    lost = -math.expm1(-x)
+    decayed = -math.expm1(-x)
     back_emf = parameters.back_emf_constant * speed
     current, integral, pending = winding
-    saturated, mean, volts, power, heat = 0, 0.0, 0.0, 0.0, 0.0
+    num_saturated, current_sum, voltage_sum, power_sum, heat_sum = 0, 0.0, 0.0, 0.0, 0.0
     for _ in range(samples):
         limit = max(parameters.supply_voltage - parameters.supply_resistance * abs(current), 0.0)
-        applied, integral, pending = asked_of_board(asked, current, speed, integral, pending)
+        applied, integral, pending = sample_on_board(command, current, speed, integral, pending)
         applied = min(max(applied, -limit), limit)
-        saturated += abs(applied) >= limit
+        num_saturated += abs(applied) >= limit
         if parameters.deadband > 0.0:
             applied = math.copysign(max(abs(applied) - parameters.deadband, 0.0), applied)
-        reached = (applied - back_emf) / resistance
-        off = current - reached
-        within = reached + off * lost / x  # the sample's mean current
-        heat += (
-            reached * reached + off * (2.0 * reached * lost + off * lost * (1.0 - 0.5 * lost)) / x
+        steady_current = (applied - back_emf) / resistance
+        deviation = current - steady_current
+        # The mean over the sample of the exponential decay to the steady current.
+        mean_current = steady_current + deviation * decayed / x
+        heat_sum += (
+            steady_current * steady_current
+            + deviation
+            * (2.0 * steady_current * decayed + deviation * decayed * (1.0 - 0.5 * decayed))
+            / x
         )
-        mean, volts, power = mean + within, volts + applied, power + applied * within
-        current = reached + off * (1.0 - lost)
+        current_sum, voltage_sum, power_sum = (
+            current_sum + mean_current,
+            voltage_sum + applied,
+            power_sum + applied * mean_current,
+        )
+        current = steady_current + deviation * (1.0 - decayed)
     after = Winding(current, integral, pending)
     return (
         after,
-        mean / samples,
-        volts / samples,
-        saturated,
-        power / samples,
-        resistance * heat / samples,
+        current_sum / samples,
+        voltage_sum / samples,
+        num_saturated,
+        power_sum / samples,
+        resistance * heat_sum / samples,
     )
 
 
@@ -122,10 +146,10 @@ def electrical_step(
     sensor_error: float,
     limit: float,
 ) -> tuple[float, float, float, float]:
-    """`codrl_mj.actuators.electrical_step` of a loop on the board."""
-    asked = desired_torque / parameters.torque_constant
-    voltage, integral, error = asked_of_board(
-        asked, current + sensor_error, speed, integral, previous_error
+    """Replace `codrl_mj.actuators.electrical_step`: the board computes the voltage."""
+    reference = desired_torque / parameters.torque_constant
+    voltage, integral, error = sample_on_board(
+        reference, current + sensor_error, speed, integral, previous_error
     )
     voltage = min(max(voltage, -limit), limit)
     back_emf = parameters.back_emf_constant * speed
@@ -136,22 +160,23 @@ def electrical_step(
     return current, integral, error, voltage
 
 
-def _with(function: Any, **others: Any) -> Any:
-    """A function of which some globals are others."""
+def _replace_globals(function: Any, **replacements: Any) -> Any:
+    """Return a copy of a function with some of its globals replaced."""
     return FunctionType(
         function.__code__,
-        {**function.__globals__, **others},
+        {**function.__globals__, **replacements},
         function.__name__,
         function.__defaults__,
     )
 
 
+# A copy of the module, in which `turn` calls the `run_over` of this module.
 _shaft = ModuleType("codrl_mj.actuators.shaft")
-vars(_shaft).update(vars(shaft), turn=_with(shaft.turn, run_over=run_over))
+vars(_shaft).update(vars(shaft), turn=_replace_globals(shaft.turn, run_over=run_over))
 _ADVANCE = {
-    Drive: _with(drive.advance, _advance=_with(drive._advance, shaft=_shaft)),
-    Servo: _with(servo.advance, shaft=_shaft),
-    DCMotorActuator: _with(current_loop.advance, electrical_step=electrical_step),
+    Drive: _replace_globals(drive.advance, _advance=_replace_globals(drive._advance, shaft=_shaft)),
+    Servo: _replace_globals(servo.advance, shaft=_shaft),
+    DCMotorActuator: _replace_globals(current_loop.advance, electrical_step=electrical_step),
 }
 
 
@@ -163,19 +188,19 @@ def loop_on_board(
     current_step: float = 0.0,
     voltage_step: float = 0.0,
 ) -> Iterator[np.ndarray]:
-    """Let motors of a family ask a process for the voltage of each sample, in a `with` block.
+    """Let motors of a family request the voltage of each sample from a process in a `with` block.
 
     Args:
         family: `Drive`, `Servo` or `DCMotorActuator`.
-        process: with pipes, of the program that `board.c` becomes with `BOARD_DRIVE`.
-        amperes: what a command of one asks for [A].
-        current_step: of the converter that measures the current [A]; 0 for none.
-        voltage_step: of the voltages that the bridge can have [V]; 0 for none.
+        process: process with pipes, of the program that `board.c` becomes with `BOARD_DRIVE`.
+        amperes: current for a command of 1 [A].
+        current_step: resolution of the measured current [A]; 0 for none.
+        voltage_step: resolution of the bridge's voltage [V]; 0 for none.
 
     Returns:
-        Where samples are counted, and whether one was not answered: a view of two numbers.
+        A view of two numbers: the number of samples, and 1 if one was not answered.
     """
-    one = type(
+    board_family = type(
         family.__name__, (family,), {"advance": staticmethod(_ADVANCE[family]), "family": ""}
     )
     _TABLE[:] = 0.0
@@ -186,5 +211,5 @@ def loop_on_board(
         voltage_step,
     )
     _TABLE[1:2].view(np.uint64)[0] = process.stdout.fileno() | _POLL_IN
-    with family_replaced(family, one):
+    with family_replaced(family, board_family):
         yield _TABLE[_SAMPLES : _LOST + 1]

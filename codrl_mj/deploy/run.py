@@ -1,4 +1,4 @@
-"""A real board behind a serial port: watched, or told to drive, over the exported wire. What it says becomes a log."""
+"""Monitoring and driving of a real board at a serial port, and the log of its answers."""
 
 import contextlib
 import csv
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.deploy.contract import Contract
-from codrl_mj.deploy.log import columns, motor_columns
+from codrl_mj.deploy.log import column_names, motor_column_names
 from codrl_mj.deploy.wire import (
     BEYOND,
     DAMAGED,
@@ -26,21 +26,21 @@ from codrl_mj.deploy.wire import (
 )
 from codrl_mj.runs.files import writing
 
-MOST_MISSED = 3
-"""Frames in a row without an answer, after which a board is no longer told to drive."""
+MAX_MISSED = 3
+"""Number of consecutive frames without an answer after which a run that drives is ended."""
 
 
 class BoardRun(NamedTuple):
-    """How it went."""
+    """Result of a run of a board."""
 
     rows: int
-    """Answers that were logged."""
+    """Number of logged answers."""
     missed: int
-    """Frames without an answer."""
+    """Number of frames without an answer."""
     late: int
-    """Frames that came to the board later than its contract allows."""
-    why: str
-    """What ended it."""
+    """Number of frames that reached the board later than the contract allows."""
+    reason: str
+    """Reason for the end of the run."""
 
 
 def run_board(
@@ -53,39 +53,38 @@ def run_board(
     ended: Callable[[], bool] = lambda: False,
     on_answer: Callable[[Answer], None] | None = None,
 ) -> BoardRun:
-    """Ask a board for its observations and commands at the policy's rate, until told otherwise.
+    """Request a board's observations and commands at the policy's rate until the run is ended.
 
-    It ends with a frame that puts the command to that for safety. Told to drive, it ends by itself
-    as soon as something is wrong: here again, whatever the C finds.
+    The last frame sets the safe command. A run that drives also ends as soon as something is wrong;
+    this is checked in Python in addition to the checks of the C.
 
     Args:
-        folder: what `codrl_mj.deploy.export` wrote, and the board runs.
+        folder: a folder that `codrl_mj.deploy.export` wrote and that the board runs.
         port: serial port, such as `/dev/ttyACM0`.
-        log: CSV file for what it says, as `check_log` reads it, with the motors' voltage, current
+        log: CSV file for the answers, as `check_log` reads it, with the motors' voltage, current
             and position.
-        drive: whether the board gives the commands to its drive; else it only says which they would
-            be.
-        seconds: how long at most [s].
-        baud: bits a second.
-        ended: asked before each frame whether to end.
-        on_answer: told of each answer.
+        drive: True if the board gives the commands to its drive; otherwise it only reports them.
+        seconds: longest duration [s].
+        baud: bits per second.
+        ended: predicate that is called before each frame; True ends the run.
+        on_answer: callback for each answer.
 
     Raises:
         FileNotFoundError: the folder has no contract.
         RuntimeError: the board has no sensors, or there is none at the port.
     """
     contract = Contract.read(folder)
-    rows, missed, in_a_row, late, why = 0, 0, 0, 0, ""
-    with _opened(port, baud) as line, writing(log) as part, part.open("w", newline="") as file:
+    rows, missed, num_consecutive, late, reason = 0, 0, 0, 0, ""
+    with _open_port(port, baud) as line, writing(log) as part, part.open("w", newline="") as file:
         table = csv.writer(file)
-        table.writerow(columns(contract) + motor_columns(contract))
+        table.writerow(column_names(contract) + motor_column_names(contract))
         wire = Wire(contract, line.fileno(), line.fileno())
-        asking = _asked(
+        exchanges = _exchange_frames(
             contract, wire, DRIVE if drive else WATCH, lambda now: ended() or now >= seconds
         )
         try:
-            for now, answer in asking:
-                in_a_row = 0 if answer else in_a_row + 1
+            for now, answer in exchanges:
+                num_consecutive = 0 if answer else num_consecutive + 1
                 missed += answer is None
                 if answer is not None:
                     if answer.status & NO_SENSORS:
@@ -93,83 +92,102 @@ def run_board(
                             f"{port}: the board has no sensors: give it wire_sense (docs/deploy.md)"
                         )
                     late += bool(answer.status & LATE)
-                    if not answer.status & DAMAGED:  # whose bytes are no observation
+                    # A damaged frame has no valid observation.
+                    if not answer.status & DAMAGED:
                         rows += 1
                         table.writerow(
                             [now, *answer.observation, *answer.command, *answer.motors.ravel()]
                         )
                     if on_answer is not None:
                         on_answer(answer)
-                if drive and (why := _wrong(contract, answer, in_a_row)):
+                if drive and (reason := _stop_reason(contract, answer, num_consecutive)):
                     break
-        except (KeyboardInterrupt, OSError) as error:  # what was logged is kept
-            why = f"interrupted: {error or type(error).__name__}"
+        # The run ends normally, so that the log is kept.
+        except (KeyboardInterrupt, OSError) as error:
+            reason = f"interrupted: {error or type(error).__name__}"
         finally:
+            # Closing the generator sends the frame with the safe command.
             with contextlib.suppress(OSError, RuntimeError):
-                asking.close()
-    return BoardRun(rows, missed, late, why or "told to")
+                exchanges.close()
+    return BoardRun(rows, missed, late, reason or "requested")
 
 
-def _asked(
+def _exchange_frames(
     contract: Contract, wire: Wire, kind: int, ended: Callable[[float], bool]
 ) -> Generator[tuple[float, Answer | None]]:
-    """Time [s] and answer of a frame each at the policy's rate, until it ended; then one that puts it to safety."""
-    nothing, within, period = (
+    """Yield the time [s] and the answer of each frame, sent at the policy's rate.
+
+    When the run ends or the generator is closed, a last frame sets the safe command.
+    """
+    zeros, timeout, period = (
         np.zeros(len(contract.observations)),
         float(contract.late["after"]),
         1.0 / contract.rate,
     )
-    began = due = time.monotonic()
+    start = due = time.monotonic()
     sequence = 0
     try:
-        while not ended(now := time.monotonic() - began):
-            sequence, stamp = sequence + 1, int(1e6 * now) + 1
+        while not ended(elapsed := time.monotonic() - start):
+            sequence, stamp = sequence + 1, int(1e6 * elapsed) + 1
             yield (
                 stamp / 1e6,
-                wire.asked(wire.frame(sequence, stamp, nothing, kind), sequence, within),
+                wire.request(wire.frame(sequence, stamp, zeros, kind), sequence, timeout),
             )
             due += period
             wait = due - time.monotonic()
-            if wait < -period:  # after a pause no burst of frames
+            # After a pause the missed frames are not sent in a burst.
+            if wait < -period:
                 due -= wait
             time.sleep(max(0.0, wait))
     finally:
-        stamp = int(1e6 * (time.monotonic() - began)) + 2
-        wire.asked(wire.frame(sequence + 1, stamp, nothing, WATCH), sequence + 1, within)
+        stamp = int(1e6 * (time.monotonic() - start)) + 2
+        wire.request(wire.frame(sequence + 1, stamp, zeros, WATCH), sequence + 1, timeout)
 
 
-def _opened(port: str, baud: int) -> Any:
-    """The serial port."""
+def _open_port(port: str, baud: int) -> Any:
+    """Open the serial port."""
+    # pyserial is optional.
     import serial
 
     try:
         return serial.Serial(port, baud, timeout=0, exclusive=True)
     except serial.SerialException as error:
         raise RuntimeError(
-            f"--port {port}: {error}; is the board plugged in, and may you open it?"
+            f"--port {port}: {error}; is the board plugged in, and may you open the port?"
         ) from None
 
 
-def _wrong(contract: Contract, answer: Answer | None, in_a_row: int) -> str:
-    """Why a board must not go on to drive; empty where it may."""
+def _stop_reason(contract: Contract, answer: Answer | None, num_consecutive: int) -> str:
+    """Return the reason why a board must stop driving, or ""."""
     if answer is None:
-        return f"{in_a_row} frames in a row had no answer" if in_a_row >= MOST_MISSED else ""
+        return (
+            f"{num_consecutive} frames in a row had no answer"
+            if num_consecutive >= MAX_MISSED
+            else ""
+        )
     if answer.status & OLD:
-        return "the board took a frame for old: it heard of a later time, before this run: reset it"
+        return (
+            "the board took a frame for old: it has had a frame of a later time, before this run:"
+            " reset it"
+        )
     if answer.status & (DAMAGED | NOT_FINITE):
         return (
             "the board took a frame for damaged"
             if answer.status & DAMAGED
-            else "a sensor says no finite number"
+            else "a sensor's value is not finite"
         )
-    if answer.status & BEYOND or not contract.within(answer.observation[np.newaxis])[0]:
-        names = [one["name"] for one in contract.observations]
+    if answer.status & BEYOND or not contract.is_within_limits(answer.observation[np.newaxis])[0]:
+        names = [entry["name"] for entry in contract.observations]
         return (
             "beyond the limits:"
             f" {dict(zip(names, answer.observation.round(4).tolist(), strict=True))}"
         )
-    bounds = [one.get("levels") or [one.get("least"), one.get("most")] for one in contract.actions]
-    most = [math.inf if None in some else max(map(abs, some)) for some in bounds]
-    if not (np.abs(answer.command) <= np.array(most) * (1.0 + 1e-6)).all():
-        return f"the command is {answer.command.tolist()}, beyond what the policy was trained with"
+    bounds = [
+        action.get("levels") or [action.get("least"), action.get("most")]
+        for action in contract.actions
+    ]
+    largest = [math.inf if None in values else max(map(abs, values)) for values in bounds]
+    # The comparison is negated so that a NaN also ends the run.
+    if not (np.abs(answer.command) <= np.array(largest) * (1.0 + 1e-6)).all():
+        return f"the command is {answer.command.tolist()}, beyond the bounds of the training"
     return ""

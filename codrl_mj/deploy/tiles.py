@@ -1,4 +1,4 @@
-"""Tile-coding SARSA's policy as what it computes, for other runtimes and for whoever wants to read it."""
+"""Table of a tile-coding SARSA policy, for other runtimes and as a readable CSV file."""
 
 import csv
 import dataclasses
@@ -13,62 +13,71 @@ from codrl_mj.agents.tile_coding import TileCoder, choose_actions
 
 @dataclasses.dataclass(frozen=True)
 class Tiles:
-    """A policy that takes the action whose weights add up to most in the tiles of an observation."""
+    """A policy that takes the action with the largest sum of weights in an observation's tiles."""
 
     coder: TileCoder
-    """Which tiles an observation (k,) lies in, one of each tiling."""
+    """Function from an observation (k,) to its tiles, one in each tiling."""
     table: np.ndarray
     """Weights, shape (tiles, actions), float64."""
     factors: np.ndarray
-    """Ones, shape (k,): observations are taken as they come."""
+    """Factors of the observation, all 1, shape (k,)."""
 
-    low = high = None  # actions are discrete
+    # Discrete actions have no bounds; `Network` has these attributes.
+    low = high = None
 
     def __call__(self, observations: np.ndarray, kind: Any = np.float32) -> np.ndarray:  # noqa: ARG002 - as a `Network`
-        """Indices (N,) of the actions for observations (N, k); tiles and weights are doubles in any case."""
+        """Return action indices (N,) for observations (N, k), always computed in double."""
         return choose_actions(
             observations, self.coder, self.table, True, 0.0, np.random.default_rng(0)
         )
 
-    def graph(self, node: Any) -> str:
-        """The name of what an ONNX graph gives that computes it, by `node(kind, *inputs, **attributes)`."""
+    def add_to_graph(self, node: Any) -> str:
+        """Add the policy's nodes to an ONNX graph and return the name of the output.
+
+        Args:
+            node: function `node(kind, *inputs, **attributes)` that adds a node.
+        """
         coder, angles = self.coder, self.angles
-        entries = node("Cast", "observation", to=11)  # 11, 7: double, int64
+        # ONNX's type 11 is double, type 7 is int64, type 1 is float.
+        entries = node("Cast", "observation", to=11)
         sides = [node("Gather", entries, coder.entries[:angles, k], axis=1) for k in (0, 1)]
-        further = node("Gather", entries, coder.entries[angles:, 0], axis=1)
-        # ONNX has no atan2: half a turn more where the cosine is negative, to the side of the sine
+        axes = node("Gather", entries, coder.entries[angles:, 0], axis=1)
+        # ONNX has no atan2: where the cosine is negative, half a turn in the direction of the sine
+        # is added to the arctangent.
         if angles:
             zero, turn = np.zeros(1), np.full(1, np.pi)
-            side = node("Where", node("Less", sides[1], zero), -turn, turn)
-            more = node("Where", node("Less", sides[0], zero), side, zero)
-            quarter = node(
-                "Cast", node("Div", sides[1], sides[0]), to=1
-            )  # onnxruntime has it in float alone
-            angle = node("Add", node("Cast", node("Atan", quarter), to=11), more)
-            further = node("Concat", angle, further, axis=1)
-        place = node("Floor", node("Mul", node("Sub", further, coder.low), coder.quanta))
-        place = node("Min", node("Max", place, np.zeros(1)), coder.last.astype(np.float64))
-        quanta = node("Unsqueeze", node("Cast", place, to=7), np.array([1]))
+            signed_turn = node("Where", node("Less", sides[1], zero), -turn, turn)
+            half_turn = node("Where", node("Less", sides[0], zero), signed_turn, zero)
+            # onnxruntime has Atan only in float.
+            tangent = node("Cast", node("Div", sides[1], sides[0]), to=1)
+            angle = node("Add", node("Cast", node("Atan", tangent), to=11), half_turn)
+            axes = node("Concat", angle, axes, axis=1)
+        quantized = node("Floor", node("Mul", node("Sub", axes, coder.low), coder.quanta))
+        quantized = node("Min", node("Max", quantized, np.zeros(1)), coder.last.astype(np.float64))
+        quanta = node("Unsqueeze", node("Cast", quantized, to=7), np.array([1]))
         cells = node("Div", node("Add", quanta, coder.displacements), np.array([1 << coder.shift]))
         steps = node("Mul", node("Mod", cells, coder.cells), coder.strides)
         within = node("ReduceSum", steps, np.array([2]), keepdims=0)
-        first = np.arange(1 << coder.shift) * (coder.size >> coder.shift)
-        weights = node("Gather", self.table, node("Add", within, first), axis=0)
+        tiling_starts = np.arange(1 << coder.shift) * (coder.size >> coder.shift)
+        weights = node("Gather", self.table, node("Add", within, tiling_starts), axis=0)
         return str(
             node(
                 "ArgMax", node("ReduceSum", weights, np.array([1]), keepdims=0), axis=1, keepdims=0
             )
         )
 
-    def first_step(self, index: int) -> dict[str, float | None]:
-        """As of a `Network`."""
+    def input_scaling(self, index: int) -> dict[str, float | None]:
+        """Return the scaling of an observation entry, for the contract; see `Network`."""
         return {"scale": float(self.factors[index]), "offset": 0.0}
 
     def as_csv(self, names: Sequence[str]) -> str:
-        """The table: a row a tile, with its tiling, its place along each axis and the weight of each action.
+        """Return the table with a row for each tile: tiling, index on each axis, weight per action.
 
-        An axis is an entry of the observation, by its name, or an angle, of which two entries are
-        cosine and sine.
+        An axis is an entry of the observation, or an angle, of which two entries are the cosine and
+        the sine.
+
+        Args:
+            names: names of the observation's entries.
         """
         axes = [
             names[first].removeprefix("cos_" if second >= 0 else "")
@@ -89,20 +98,20 @@ class Tiles:
 
     @property
     def angles(self) -> int:
-        """How many axes are angles; each has the observation's next two entries, its cosine and sine."""
+        """Number of axes that are angles; they come first and have two entries, cosine and sine."""
         return int((self.coder.entries[:, 1] >= 0).sum())
 
     @property
     def choices(self) -> int:
-        """How many actions there are."""
+        """Number of actions."""
         return self.table.shape[1]
 
     @property
-    def working(self) -> int:
-        """Numbers that a step keeps beside the table."""
+    def num_working_values(self) -> int:
+        """Number of values that a step stores in addition to the table."""
         return 1 << self.coder.shift
 
     @property
     def size(self) -> int:
-        """How many weights there are."""
+        """Number of weights."""
         return self.table.size

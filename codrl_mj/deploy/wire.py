@@ -1,4 +1,4 @@
-"""Frames between a host and an exported controller, as the exported `wire.h` describes them, over a stream of bytes."""
+"""Frames between a host and an exported controller over a byte stream; see `wire.h`."""
 
 import binascii
 import contextlib
@@ -13,96 +13,106 @@ import numpy as np
 from codrl_mj.deploy.contract import Contract
 
 ASK, WATCH, DRIVE = 0, 1, 2
-"""What is asked for: the policy's command for the observation that is sent; that for the
-controller's own observation, which it does not give to the drive; or does.
+"""Kinds of frames.
+
+ASK requests the policy's command for the observation in the frame; WATCH requests the command for
+the controller's sensors, without giving it to the drive; DRIVE also gives it to the drive.
 """
 DAMAGED, OLD, NOT_FINITE, LATE, BEYOND, NO_SENSORS = (1 << bit for bit in range(6))
 REFUSED = DAMAGED | OLD | NOT_FINITE
-"""Bits of an answer's status with which the policy was not asked for the frame's sake."""
-ANSWER_WITHIN = 5.0
-"""Seconds after which a frame counts as not answered."""
+"""Status bits of frames that the controller refused, so that the policy was not evaluated."""
+ANSWER_TIMEOUT = 5.0
+"""Time after which a frame counts as unanswered [s]."""
 _START = b"\xa5\x5a"
+"""First two bytes of a frame."""
 
 
 class Answer(NamedTuple):
-    """What came back."""
+    """Answer of a controller to a frame."""
 
     sequence: int
-    """That of the frame, modulo 256."""
+    """Number of the frame, modulo 256."""
     status: int
-    """Bits of `DAMAGED` and so on."""
+    """Bits such as `DAMAGED`."""
     observation: np.ndarray
-    """That which the policy took, shape (k,)."""
+    """Observation that the policy used, shape (k,)."""
     command: np.ndarray
-    """In the units of the contract, shape (m,)."""
+    """Command in the units of the contract, shape (m,)."""
     motors: np.ndarray
-    """Voltage [V], current [A] and position of the rotor [rad] of each motor, shape (m, 3); 0 where not measured."""
+    """Voltage [V], current [A] and rotor angle [rad] of each motor, shape (m, 3); 0 if unknown."""
 
 
 class Wire:
-    """One end of it."""
+    """The host's end of a connection to a controller."""
 
-    def __init__(self, contract: Contract, to: int, back: int) -> None:
-        """Speak to a controller through two file descriptors, which may be the same."""
+    def __init__(self, contract: Contract, write_fd: int, read_fd: int) -> None:
+        """Use two file descriptors, which may be the same, for writing and for reading."""
         kind = "d" if contract.controller["real"] == "double" else "f"
         self._sizes = len(contract.observations), len(contract.actions)
         self._request = struct.Struct(f"<BBI{self._sizes[0]}{kind}")
         self._answer = struct.Struct(f"<BBI{self._sizes[0] + 4 * self._sizes[1]}{kind}")
-        self._to, self._back, self._got = to, back, bytearray()
+        self._write_fd, self._read_fd, self._buffer = write_fd, read_fd, bytearray()
 
     def frame(self, sequence: int, stamp: int, observation: np.ndarray, kind: int = ASK) -> bytes:
-        """A frame with an observation (k,), at a time [us]."""
+        """Return the bytes of a frame with an observation (k,) and a time [us]."""
         return _framed(
             self._request.pack(sequence % 256, kind, stamp % 2**32, *observation.tolist())
         )
 
-    def asked(self, frame: bytes, sequence: int, within: float = ANSWER_WITHIN) -> Answer | None:
-        """Send a frame, and what comes back within some time [s]; None for nothing, or what is damaged.
+    def request(
+        self, frame: bytes, sequence: int, timeout: float = ANSWER_TIMEOUT
+    ) -> Answer | None:
+        """Send a frame and return the answer; None without one in time, or if it is damaged.
+
+        Args:
+            frame: the bytes of a frame.
+            sequence: number of the frame.
+            timeout: longest wait for an answer [s].
 
         Raises:
             RuntimeError: the controller ended.
         """
-        with contextlib.suppress(BrokenPipeError):  # reading says that it ended
-            os.write(self._to, frame)
-        while (answer := self._read(sequence, within)) is not None:
-            if (
-                answer.sequence == sequence % 256 or answer.status & DAMAGED
-            ):  # and not one that came too late
+        # If the controller has ended, the read below raises the error.
+        with contextlib.suppress(BrokenPipeError):
+            os.write(self._write_fd, frame)
+        while (answer := self._read(sequence, timeout)) is not None:
+            # Late answers to earlier frames are skipped. The number of a damaged frame is unknown.
+            if answer.sequence == sequence % 256 or answer.status & DAMAGED:
                 return answer
         return None
 
-    def _read(self, sequence: int, within: float) -> Answer | None:
-        """The next answer."""
-        size, got, damaged = self._answer.size + 4, self._got, False
-        until = time.monotonic() + within
+    def _read(self, sequence: int, timeout: float) -> Answer | None:
+        """Return the next undamaged answer, or None."""
+        size, buffer, damaged = self._answer.size + 4, self._buffer, False
+        deadline = time.monotonic() + timeout
         while True:
-            begin = got.find(_START)
-            del got[
-                : begin if begin >= 0 else len(got) - got.endswith(_START[:1])
-            ]  # noise before it
-            if len(got) >= size:
-                content = bytes(got[2 : size - 2])
-                damaged = got[:size] != _framed(content)
-                del got[
-                    : 1 if damaged else size
-                ]  # within what is damaged may be the start of one that is not
+            # Remove noise before the start. A last byte that may begin a start is kept.
+            start = buffer.find(_START)
+            del buffer[: start if start >= 0 else len(buffer) - buffer.endswith(_START[:1])]
+            if len(buffer) >= size:
+                content = bytes(buffer[2 : size - 2])
+                damaged = buffer[:size] != _framed(content)
+                # Damaged bytes may contain the start of an undamaged answer.
+                del buffer[: 1 if damaged else size]
                 if not damaged:
                     break
-            elif damaged and not got:
+            elif damaged and not buffer:
                 return None
             else:
-                ready = select.select([self._back], [], [], max(0.0, until - time.monotonic()))[0]
+                ready = select.select(
+                    [self._read_fd], [], [], max(0.0, deadline - time.monotonic())
+                )[0]
                 if not ready:
                     return None
-                more = os.read(self._back, size)
-                if not more:
+                received = os.read(self._read_fd, size)
+                if not received:
                     raise RuntimeError(f"the board's program ended at frame {sequence}")
-                got += more
-        answered, status, _, *numbers = self._answer.unpack(content)
-        seen, command, motors = np.split(np.array(numbers), np.cumsum(self._sizes))
-        return Answer(answered, status, seen, command, motors.reshape(-1, 3))
+                buffer += received
+        number, status, _, *numbers = self._answer.unpack(content)
+        observation, command, motors = np.split(np.array(numbers), np.cumsum(self._sizes))
+        return Answer(number, status, observation, command, motors.reshape(-1, 3))
 
 
 def _framed(content: bytes) -> bytes:
-    """A frame: its start, what it says, and their checksum (CRC-16/CCITT, from 0xFFFF)."""
+    """Return a frame: start, content, and the content's checksum (CRC-16/CCITT, from 0xFFFF)."""
     return _START + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF))

@@ -1,13 +1,13 @@
-"""The certificate that the port is right: named checks against oracles that are not ours, and faults that fail them."""
+"""Certificate of the port: checks against independent oracles, and faults that must fail them."""
 
 from codrl_mj.validation.certificate import GROUPS, Certificate, validate, validate_model
-from codrl_mj.validation.mutations import MUTATIONS, Caught, Mutation, try_mutations
+from codrl_mj.validation.mutations import MUTATIONS, Mutation, MutationResult, try_mutations
 from codrl_mj.validation.table import Check, Skipped
 
 __all__ = [
     "GROUPS",
     "MUTATIONS",
-    "Caught",
+    "MutationResult",
     "Certificate",
     "Check",
     "Mutation",

@@ -1,4 +1,4 @@
-"""The certificate: all groups of checks over all tasks, or over a user's own model, and what they found."""
+"""The certificate: the results of all groups of checks on tasks or on a user's model."""
 
 import copy
 import dataclasses
@@ -21,21 +21,19 @@ from codrl_mj.validation.table import REPORT, Check, Skipped
 
 GROUPS: dict[str, str] = {
     "dynamics": "Accelerations and single steps against the installed Gymnasium",
-    "trajectories": "Whole runs against the installed Gymnasium, and what chaos makes of rounding",
-    "convergence": (
-        "Ever smaller steps, ever faster loops: the order at which the solutions converge"
-    ),
-    "motor": "The motor and its current loop against closed forms and other people's motors",
-    "energy": "Every joule that goes in comes out",
-    "execution": "Batched, copied, restored, looked at: the same bits",
+    "trajectories": "Whole runs against the installed Gymnasium, and the growth of rounding errors",
+    "convergence": ("Orders of convergence as steps become smaller and current loops faster"),
+    "motor": "The motor and its current loop against closed forms and third-party motors",
+    "energy": "Energy balances of supply, motor and mechanics",
+    "execution": "Bitwise equality of batched, copied, restored and inspected simulations",
 }
-"""The parts of the certificate, in order, with what they are."""
+"""Title of each group of checks, in the order in which they run."""
 
 WITHOUT_TASK = ("motor",)
-"""Groups that are run once, whatever the tasks; and once more for every task that is not ours."""
+"""Groups that run once for all built-in tasks, and once more for each custom task."""
 
 DIVERGED = "runs to its end"
-"""Name of the check that fails where a simulation breaks down."""
+"""Name of the check that fails if a simulation diverges."""
 PACKAGES = (
     "codrl-mj",
     "mujoco",
@@ -50,44 +48,45 @@ PACKAGES = (
 
 @dataclasses.dataclass(frozen=True)
 class Certificate:
-    """What was checked, what was found, and with which software."""
+    """Results of all checks on a subject, with the versions of the software."""
 
     subject: str
-    """What was checked: tasks, or a model."""
+    """Names of the tasks or of the model that were checked."""
     checks: tuple[Check, ...]
-    """In the order of `GROUPS`."""
+    """Completed checks, in the order of `GROUPS`."""
     skipped: tuple[Skipped, ...]
-    """What was not checked, and why."""
+    """Checks that were not run, with the reasons."""
     quick: bool
-    """Whether it is the quick form: fewer states, runs and step sizes."""
+    """True for the quick form, which has fewer states, runs and step sizes."""
     seconds: float
-    """How long it took [s]."""
+    """Duration of all checks [s]."""
 
     @property
     def passed(self) -> bool:
-        """Whether every check passed, and there was one."""
+        """True if at least one check was run and all passed."""
         return bool(self.checks) and all(check.passed for check in self.checks)
 
     @property
     def verdict(self) -> str:
-        """In a few words how many checks failed, or passed."""
+        """Short text with the number of checks that failed or passed."""
         return verdict([check.passed for check in self.checks])
 
     def as_mapping(self) -> dict[str, Any]:
-        """Everything but the plots, for JSON; infinities and NaN as text."""
+        """Return all fields except the plots, for JSON; infinities and NaN become text."""
         checks: list[dict[str, Any]] = []
         for check in self.checks:
             row = {
-                one.name: getattr(check, one.name)
-                for one in dataclasses.fields(check)
-                if one.name != "plots"
+                field.name: getattr(check, field.name)
+                for field in dataclasses.fields(check)
+                if field.name != "plots"
             }
-            text = {
-                name: str(one)
-                for name, one in row.items()
-                if isinstance(one, float) and not math.isfinite(one)
+            # JSON has no infinities and no NaN.
+            nonfinite = {
+                name: str(value)
+                for name, value in row.items()
+                if isinstance(value, float) and not math.isfinite(value)
             }
-            checks.append(row | text | {"samples": int(check.samples), "passed": check.passed})
+            checks.append(row | nonfinite | {"samples": int(check.samples), "passed": check.passed})
         return {
             "format": "codrl_mj certificate 1",
             "subject": self.subject,
@@ -97,35 +96,38 @@ class Certificate:
             "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "versions": versions(),
             "checks": checks,
-            "skipped": [dataclasses.asdict(skip) for skip in self.skipped],
+            "skipped": [dataclasses.asdict(skipped) for skipped in self.skipped],
         }
 
 
 def verdict(passed: Sequence[bool]) -> str:
-    """In a few words how many of some checks failed, or passed."""
+    """Return a short text with the number of checks that failed or passed."""
     failed = passed.count(False)
     count = f"of {len(passed)} checks"
     return f"{failed} {count} FAILED" if failed or not passed else f"passed: {len(passed)} {count}"
 
 
 def versions() -> dict[str, str]:
-    """The versions of everything that a verdict depends on."""
-    found = {"Python": platform.python_version(), "platform": platform.platform(terse=True)}
+    """Return the versions of all software that the results depend on."""
+    versions_by_name = {
+        "Python": platform.python_version(),
+        "platform": platform.platform(terse=True),
+    }
     for package in PACKAGES:
         try:
-            found[package] = importlib.metadata.version(package)
+            versions_by_name[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+            versions_by_name[package] = "not installed"
+    return versions_by_name
 
 
 Outcomes = Iterator[Check | Skipped]
 Progress = Callable[[int, int, str], object]
-"""(parts done, parts in all, the part that begins) -> what nobody looks at."""
+"""Progress callback: (finished parts, total parts, next part) -> ignored."""
 
 
 def ignore_progress(*_: object) -> None:
-    """What is called where nobody listens."""
+    """Do nothing; the default progress callback."""
 
 
 def _certify(
@@ -135,57 +137,83 @@ def _certify(
     quick: bool,
     on_part: Progress,
 ) -> Certificate:
-    """Make the parts: a group, a task or model, and its outcomes as they come, which are then said to be of these.
+    """Run all parts and collect their results in a certificate.
 
-    A simulation that breaks down is a failed check, a missing library a skipped one.
+    A simulation that diverges becomes a failed check, a missing library a skipped check.
+
+    Args:
+        subject: name of the checked tasks or model.
+        parts: group, name of the task or model, and iterator of its results. Group and name are
+            written into each result.
+        skipped: checks that are known not to apply.
+        quick: True for the quick form.
+        on_part: progress callback.
     """
     started = time.perf_counter()
-    found: list[Check] = []
-    skips = list(skipped)
+    completed: list[Check] = []
+    all_skipped = list(skipped)
     for index, (group, task, outcomes) in enumerate(parts):
         on_part(index, len(parts), f"{group}, {task}" if task else group)
-        for outcome in _to_the_end(outcomes):
+        for outcome in _convert_errors(outcomes):
             if isinstance(outcome, Skipped):
-                skips.append(dataclasses.replace(outcome, group=group, task=task))
+                all_skipped.append(dataclasses.replace(outcome, group=group, task=task))
             else:
-                made = dataclasses.replace(outcome, group=group, task=task)
-                found.append(
-                    made
-                    if made.passed
-                    else dataclasses.replace(made, fault=made.fault or _fault(made))
+                completed_check = dataclasses.replace(outcome, group=group, task=task)
+                completed.append(
+                    completed_check
+                    if completed_check.passed
+                    else dataclasses.replace(
+                        completed_check,
+                        fault=completed_check.fault or _likely_cause(completed_check),
+                    )
                 )
     on_part(len(parts), len(parts), "done")
-    return Certificate(subject, tuple(found), tuple(skips), quick, time.perf_counter() - started)
+    return Certificate(
+        subject, tuple(completed), tuple(all_skipped), quick, time.perf_counter() - started
+    )
 
 
-_OWN = (
-    "an `advance` or a function of your own has to depend on its arguments alone; if it does,"
+_IMPURE_FUNCTION = (
+    "a custom `advance` or other custom function must depend on its arguments only; if it does,"
     f" {REPORT}"
 )
-_RUN = f"if it passes on a gentler run in Task.reference_states, this one was too violent; if not, {REPORT}"
-_TWIN = "your model and your twin differ: compare masses, gravity and the integrator"
-_FAULTS = {"dynamics": _TWIN, "trajectories": _TWIN, "convergence": _RUN, "energy": _RUN}
-"""Whose fault it is if a check of somebody's own task or model fails, by its group."""
+_VIOLENT_RUN = (
+    "if the check passes on a gentler run in Task.reference_states, this run was too violent; if not,"
+    f" {REPORT}"
+)
+_DIFFERENT_MODELS = (
+    "your model and your reference environment (Task.twin) differ: compare masses, gravity and the"
+    " integrator"
+)
+_LIKELY_CAUSES = {
+    "dynamics": _DIFFERENT_MODELS,
+    "trajectories": _DIFFERENT_MODELS,
+    "convergence": _VIOLENT_RUN,
+    "energy": _VIOLENT_RUN,
+}
+"""Group -> likely cause of a failed check on a custom task or model."""
 
 
-def _fault(check: Check) -> str:
-    """Return whose fault a failed check is, as far as its task and group tell."""
+def _likely_cause(check: Check) -> str:
+    """Return the likely cause of a failed check, derived from its task, name and group."""
     if not check.task or (check.task in TASKS and is_ours(TASKS[check.task])):
         return REPORT
     if check.name == DIVERGED or check.name.startswith("stable: "):
         return (
-            "your model or motor is not stable at this step: shorten it, or slow down the motor's"
-            " loop"
+            "your model or motor is not stable at this step: shorten the step, or slow down the"
+            " motor's loop"
         )
-    return _FAULTS.get(check.group, _OWN)
+    return _LIKELY_CAUSES.get(check.group, _IMPURE_FUNCTION)
 
 
-def _to_the_end(outcomes: Outcomes) -> Outcomes:
+def _convert_errors(outcomes: Outcomes) -> Outcomes:
+    """Yield the results; a missing library skips the rest, a divergence is a failed check."""
     try:
         yield from outcomes
     except ModuleNotFoundError as error:
         yield Skipped("the rest of the group", f"{error}: pip install 'codrl-mj[validate]'")
-    except ArithmeticError as error:  # a SimulationDivergedError is one
+    # SimulationDivergedError is a subclass of ArithmeticError.
+    except ArithmeticError as error:
         reason = f"{type(error).__name__}: {error}"
         yield Check(DIVERGED, "itself", 0.0, "", 1, math.inf, reason)
 
@@ -197,45 +225,45 @@ def validate(
     groups: Sequence[str] | None = None,
     on_part: Progress = ignore_progress,
 ) -> Certificate:
-    """Check that the port is right.
+    """Run the checks on tasks and return their certificate.
 
-    A task of one's own is put through all that applies to it: what needs a twin, or states and a
-    run of `Task.reference_states`, is skipped without them.
+    A custom task runs through all checks that apply to it. Checks that need a reference environment
+    (`Task.twin`), or the states and the run of `Task.reference_states`, are skipped if the task has none.
 
     Args:
-        tasks: a task, several, or None for all that are registered.
-        quick: fewer states, runs and step sizes: seconds instead of minutes.
-        groups: some of `GROUPS`; None for all of them.
-        on_part: called as each group and task begins.
+        tasks: name of a task, several names, or None for all registered tasks.
+        quick: True for fewer states, runs and step sizes: seconds instead of minutes.
+        groups: names from `GROUPS`; None for all.
+        on_part: progress callback, called before each group and task.
 
     Raises:
-        ValueError: an unknown task or group, or none.
+        ValueError: a task or group is unknown, or none is named.
     """
-    given = list(TASKS) if tasks is None else [tasks] if isinstance(tasks, str) else list(tasks)
-    if not given or (groups is not None and not list(groups)):
+    requested = list(TASKS) if tasks is None else [tasks] if isinstance(tasks, str) else list(tasks)
+    if not requested or (groups is not None and not list(groups)):
         raise ValueError(
-            f"tasks = {tasks!r}, groups = {groups!r}: must name one at least; None stands for all"
-            " of them"
+            f"tasks = {tasks!r}, groups = {groups!r}: must name at least one; None selects all"
         )
-    names = dict.fromkeys(find_task(name).name for name in given)
-    others = [name for name in names if TASKS[name] not in PAPER_TASKS]
-    chosen = list(GROUPS) if groups is None else list(groups)
-    for group in chosen:
+    names = dict.fromkeys(find_task(name).name for name in requested)
+    custom_tasks = [name for name in names if TASKS[name] not in PAPER_TASKS]
+    selected_groups = list(GROUPS) if groups is None else list(groups)
+    for group in selected_groups:
         if group not in GROUPS:
             raise ValueError(
                 f"unknown group of checks {group!r}: must be one of {', '.join(GROUPS)}"
             )
 
-    def of_task(group: str, task: str | None) -> Outcomes:
+    def run_group(group: str, task: str | None) -> Outcomes:
         module = "own_model" if group in WITHOUT_TASK and task is not None else group
-        # imported here: some need libraries that nothing else does
+        # The import is local because some groups need optional libraries. A missing library then
+        # skips its own group only (`_convert_errors`).
         yield from importlib.import_module(f"codrl_mj.validation.{module}").checks(task, quick)
 
     parts = [
-        (group, task or "", of_task(group, task))
+        (group, task or "", run_group(group, task))
         for group in GROUPS
-        if group in chosen
-        for task in ([None, *others] if group in WITHOUT_TASK else names)
+        if group in selected_groups
+        for task in ([None, *custom_tasks] if group in WITHOUT_TASK else names)
     ]
     subject = "all tasks" if len(names) == len(TASKS) else ", ".join(names)
     return _certify(subject, parts, (), quick, on_part)
@@ -248,17 +276,17 @@ def validate_model(
     quick: bool = False,
     on_part: Progress = ignore_progress,
 ) -> Certificate:
-    """Put a model of your own, with any number of our motors, through the checks that apply to it.
+    """Run the checks that apply to a custom model with codrl_mj motors.
 
     Args:
         model: a compiled model; it is not changed.
-        name: its name in the certificate.
-        quick: fewer simulations and steps.
-        on_part: called as each part begins.
+        name: name of the model in the certificate.
+        quick: True for fewer simulations and steps.
+        on_part: progress callback, called before each part.
 
     Raises:
-        ValueError: the model has no motor of ours, or one that is not as it should be.
-        CallbackInUseError: another library's MuJoCo callback is installed where ours has to go.
+        ValueError: the model has no codrl_mj motor, or one with invalid data.
+        CallbackInUseError: another library has installed the MuJoCo callback that codrl_mj needs.
     """
     if not model.nactuator:
         raise ValueError(
@@ -267,17 +295,20 @@ def validate_model(
         )
     if not motors(model):
         raise ValueError(
-            f"the model has no motor of codrl_mj among its {model.nactuator} actuators: put some in"
+            f"the model has no motor of codrl_mj among its {model.nactuator} actuators: add motors"
             " with codrl_mj.add_motors"
         )
     subject = copy.copy(model)
-    subject.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # it is left to diverge
+    # With autoreset the engine would silently restart a diverged simulation, and the divergence
+    # would go unnoticed.
+    subject.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     install_callbacks(subject)
     parts = [
         ("motor", name, own_model.motor_checks(subject, quick)),
         ("execution", name, execution.model_checks(subject, quick, execution.FULL_STATE)),
     ]
-    unknown = [
-        Skipped("all checks", reason, group, name) for group, reason in own_model.UNKNOWN.items()
+    not_applicable = [
+        Skipped("all checks", reason, group, name)
+        for group, reason in own_model.NOT_APPLICABLE.items()
     ]
-    return _certify(name, parts, unknown, quick, on_part)
+    return _certify(name, parts, not_applicable, quick, on_part)

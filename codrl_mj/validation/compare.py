@@ -1,6 +1,6 @@
-"""What is compared, and how: relative to its size, angles on the circle, a NaN worse than anything.
+"""Relative differences of states, and oracles read from Gymnasium's environments.
 
-And with what: Gymnasium's equations of motion, read off its environments.
+Differences are relative to the size of an entry; angles are compared on the circle.
 """
 
 import itertools
@@ -14,24 +14,27 @@ from codrl_mj.actuators import ActuatorModel, CurrentLoop, DCMotorActuator, spec
 from codrl_mj.physics import AnalyticPhysics, MujocoPhysics, SimulationConfig
 from codrl_mj.tasks import Task, resolve_actuators
 
-NO_TWIN = (
-    "it rebuilds no environment of Gymnasium's: there is no second implementation of its mechanics"
+NO_REFERENCE_ENV = (
+    "the task has no reference environment (Task.twin): there is no second implementation of its"
+    " mechanics"
 )
+"""Reason for skipping checks that need a reference environment."""
 PHYSICS = (("MuJoCo", MujocoPhysics), ("analytic", AnalyticPhysics))
-STAND_IN = "default current loop"
-"""What stands in for the paper's actuator where a task has none."""
+FALLBACK_ACTUATOR = "default current loop"
+"""Name of the actuator that replaces the paper's actuator in tasks without one."""
 
 
 def differences(task: Task, ours: np.ndarray, oracle: np.ndarray) -> np.ndarray:
-    """|ours - oracle| / max(1, |oracle|), entry by entry, of states of shape (..., n).
+    """Return |ours - oracle| / max(1, |oracle|) for each entry of states of shape (..., n).
 
-    Entries that the task wraps are compared on the circle while both lie within [-pi, pi].
+    Angles that the task wraps are compared on the circle while both lie within [-pi, pi].
     """
     gap = np.abs(ours - oracle)
     for entry in task.wrapped:
+        # An angle outside of [-pi, pi] was not wrapped. Comparing it on the circle would hide that.
         inside = np.maximum(np.abs(ours[..., entry]), np.abs(oracle[..., entry])) <= np.pi
-        turn = np.abs(2 * np.pi - gap[..., entry])
-        gap[..., entry] = np.where(inside, np.minimum(gap[..., entry], turn), gap[..., entry])
+        other_way = np.abs(2 * np.pi - gap[..., entry])
+        gap[..., entry] = np.where(inside, np.minimum(gap[..., entry], other_way), gap[..., entry])
     return gap / np.maximum(1.0, np.abs(oracle))
 
 
@@ -40,16 +43,23 @@ def is_ours(task: Task) -> bool:
     return task.reward.__module__.startswith("codrl_mj.")
 
 
-def without_oracle(task: Task) -> str:
-    """Why a task cannot be compared with Gymnasium step by step; empty if it can."""
-    several = "it has several motors, and commands are made for one" if len(task.motors) > 1 else ""
-    return NO_TWIN if task.reference_env is None else several
+def missing_oracle_reason(task: Task) -> str:
+    """Return the reason why a task cannot be compared with Gymnasium step by step, or ""."""
+    reason = (
+        "the task has several motors, and the commands are made for one motor"
+        if len(task.motors) > 1
+        else ""
+    )
+    return NO_REFERENCE_ENV if task.reference_env is None else reason
 
 
-def both(
+def physics_pair(
     task: Task, actuator: ActuatorModel, integrator: str, max_force: float | None = None
 ) -> tuple[MujocoPhysics, AnalyticPhysics]:
-    """The task in MuJoCo, and on Gymnasium's equations; `max_force` changes MuJoCo's limit of the desired force."""
+    """Return a task's simulations in MuJoCo and with Gymnasium's equations.
+
+    `max_force` replaces MuJoCo's limit of the desired force.
+    """
     steps = task.num_inner_steps(actuator, None, None)
     limits = task.max_forces if max_force is None else np.array([max_force])
     return (
@@ -58,14 +68,17 @@ def both(
     )
 
 
-def physics_of(task: Task) -> tuple[tuple[str, type], ...]:
-    """The physics that a task can be simulated by, MuJoCo first."""
+def physics_classes(task: Task) -> tuple[tuple[str, type], ...]:
+    """Return the names and classes of the physics that can simulate a task, MuJoCo first."""
     return PHYSICS if task.reference_env is not None else PHYSICS[:1]
 
 
-def actuators_named(name: str, task: Task) -> tuple[Any, ...]:
-    """One actuator for each motor of a task: a named one, or `STAND_IN`, sampled as often as it needs to be stable."""
-    if name != STAND_IN:
+def named_actuators(name: str, task: Task) -> tuple[Any, ...]:
+    """Return the named actuator for each motor of a task.
+
+    `FALLBACK_ACTUATOR` is sampled as often as it needs to be stable.
+    """
+    if name != FALLBACK_ACTUATOR:
         return resolve_actuators(name, task)
     timestep, actuator = task.step_duration / task.motor_inner_steps, DCMotorActuator()
     while not spectral_radius(actuator, timestep) < 1.0:
@@ -75,53 +88,57 @@ def actuators_named(name: str, task: Task) -> tuple[Any, ...]:
     return (actuator,) * len(task.motors)
 
 
-def actuators_of(task: Task) -> tuple[DCMotorActuator, ...]:
-    """The paper's actuators of a task, one for each motor; of a task that has none, those that stand in for them."""
-    return task.paper or actuators_named(STAND_IN, task)
+def paper_actuators(task: Task) -> tuple[DCMotorActuator, ...]:
+    """Return the paper's actuators of a task, or `FALLBACK_ACTUATOR` for each motor."""
+    return task.paper or named_actuators(FALLBACK_ACTUATOR, task)
 
 
-def forces_of(task: Task, shares: np.ndarray) -> np.ndarray:
-    """Desired forces, row by row what `Physics.step` takes, from shares of the largest, shape (steps * motors,)."""
+def scaled_forces(task: Task, shares: np.ndarray) -> np.ndarray:
+    """Return desired forces for `Physics.step`, one row a step, from shares of the largest force.
+
+    `shares` has the shape (steps * motors,).
+    """
     forces = task.max_forces * shares.reshape(-1, len(task.motors))
     return forces[:, 0] if len(task.motors) == 1 else forces
 
 
-BOUNDS = {
+STATE_BOUNDS = {
     "max_speed": math.inf,
     "_max_speed": math.inf,
     "min_position": -math.inf,
     "max_position": math.inf,
 }
-"""Attributes of environments and their twins that bound a state, and what bounds none."""
+"""Attributes that bound the states of environments -> values that bound nothing."""
 
 Equations = Callable[[np.ndarray, Any], np.ndarray]
-"""(mechanical state, force [N or N*m], of several motors an array) -> its time derivative."""
+"""(mechanical state, force [N or N*m], an array for several motors) -> derivative of the state."""
 
 
 def gymnasium_equations(task: Task, dt: float | None = None) -> Equations:
-    """The right-hand side of the task's equations of motion, read off the environment, which nothing bounds here.
+    """Return the right-hand side of a task's equations of motion, read from its environment.
 
-    No equation is written down here. A twin may have its right-hand side as a method (Acrobot). The
-    others take Euler steps, whose new velocity is v + a*dt, linear in dt: one step of the
-    environment gives a = (v_new - v)/dt, and the derivative of a position is its velocity. dt [s]
-    is a power of two, or None for one of at most a quarter of an environment step.
+    No equation is copied. A reference environment may have its right-hand side as a method
+    (Acrobot). The others take Euler steps, whose new velocity is v + a*dt, linear in dt: one step
+    of the environment gives a = (v_new - v)/dt, and the derivative of a position is its velocity.
+    The environment's bounds are removed. dt [s] is a power of two, or None for the largest one that
+    is at most a quarter of an environment step.
     """
     assert task.reference_env is not None
-    driver: Any = task.reference_env()
-    if hasattr(driver, "derivative"):
-        return driver.derivative
-    for owner, name in itertools.product((driver, getattr(driver, "env", None)), BOUNDS):
+    # A reference environment has few declared attributes; bounds are found by their names.
+    env: Any = task.reference_env()
+    if hasattr(env, "derivative"):
+        return env.derivative
+    for owner, name in itertools.product((env, getattr(env, "env", None)), STATE_BOUNDS):
         if hasattr(owner, name):
-            setattr(owner, name, BOUNDS[name])
+            setattr(owner, name, STATE_BOUNDS[name])
+    # A division by a power of two is exact, so that (v_new - v)/dt adds no rounding error.
     step = 2.0 ** math.floor(math.log2(task.step_duration / 4)) if dt is None else dt
     qpos, qvel, integrator = list(task.qpos), list(task.qvel), task.integrators[0]
 
     def derivative(state: np.ndarray, force: float) -> np.ndarray:
         change = np.empty_like(state)
         change[qpos] = state[qvel]
-        change[qvel] = (
-            np.asarray(driver(state, force, step, integrator))[qvel] - state[qvel]
-        ) / step
+        change[qvel] = (np.asarray(env(state, force, step, integrator))[qvel] - state[qvel]) / step
         return change
 
     return derivative

@@ -1,10 +1,10 @@
-"""As the step shrinks, MuJoCo and Gymnasium's dynamics become one solution, at the order their integrators promise.
+"""Orders at which MuJoCo and Gymnasium's dynamics converge to one solution as the step shrinks.
 
-The solution is scipy's, of equations taken from Gymnasium (`gymnasium_equations`), or, of a task
-that has no twin there, of the accelerations that MuJoCo finds: that checks its integrator and the
-motors. With the ideal actuator the Euler variants promise first order and RK4, under a force held
-over the step, fourth. With a motor all promise first order: its winding takes Euler steps, and its
-torque is held over the mechanical step.
+The solution is scipy's, of the equations that Gymnasium's environment has (`gymnasium_equations`).
+For a task without a reference environment it is the solution of MuJoCo's accelerations, which
+checks the integrator and the motors. With the ideal actuator the Euler variants promise first order
+and RK4, under a force held over the step, fourth. With a motor all promise first order: its winding
+takes Euler steps, and its torque is held over the mechanical step.
 
 The runs stay away from bounds and walls (`free_run`): a clip is not smooth, and the step at which
 it acts moves with the step size. What happens at the bounds is compared step by step elsewhere.
@@ -36,33 +36,36 @@ from codrl_mj.physics import (
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.tasks import PAPER_TASKS, Task, find_task
 from codrl_mj.validation.compare import (
-    NO_TWIN,
+    NO_REFERENCE_ENV,
     Equations,
-    actuators_named,
-    actuators_of,
-    forces_of,
     gymnasium_equations,
     is_ours,
-    physics_of,
+    named_actuators,
+    paper_actuators,
+    physics_classes,
+    scaled_forces,
 )
 from codrl_mj.validation.table import (
     ORDER_TOLERANCE,
     REPORT,
     Case,
     Check,
-    Family,
+    ConvergenceSeries,
     Skipped,
     check,
-    of_order,
-    order,
+    order_case,
+    order_check,
 )
 
 
 def free_run(task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The run of `Task.reference_states`, the same every time; of a task that has none, a few steps from one of its starts.
+    """Return initial state and forces of the run of `Task.reference_states`, or of a few steps without one.
 
-    Its initial state, the desired forces, full either way and each held for one environment step,
-    and the first of these, over which energies are balanced.
+    The run is the same on every call.
+
+    Returns:
+        Initial state; desired forces, the largest in either direction, each held for one
+        environment step; and the first of these forces, over which energies are balanced.
     """
     trials = task.reference_states
     steps, balanced = (6, 2) if trials is None else (trials.steps, trials.balanced_steps)
@@ -71,17 +74,20 @@ def free_run(task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if trials is None
         else np.array(trials.start)
     )
-    forces = forces_of(task, np.random.default_rng(3).choice([-1.0, 1.0], steps * len(task.motors)))
+    forces = scaled_forces(
+        task, np.random.default_rng(3).choice([-1.0, 1.0], steps * len(task.motors))
+    )
     return start, forces, forces[:balanced]
 
 
-def obstacle(task: Task) -> str:
-    """Why the run of somebody's task is not smooth; empty if it is."""
-    if task in PAPER_TASKS:  # whose runs are tested
+def nonsmooth_reason(task: Task) -> str:
+    """Return the reason why the run of a custom task is not smooth, or "" if it is smooth."""
+    # The runs of built-in tasks are covered by the tests.
+    if task in OURS:
         return ""
     start, forces, _ = free_run(task)
     free = dataclasses.replace(task, step_duration=task.step_duration / 16, constrain=None)
-    physics = MujocoPhysics(SimulationConfig(free, actuators_named("ideal", task)))
+    physics = MujocoPhysics(SimulationConfig(free, named_actuators("ideal", task)))
     physics.reset(start)
     for force in forces.repeat(16, axis=0):
         try:
@@ -91,19 +97,19 @@ def obstacle(task: Task) -> str:
         if physics.data.nefc:
             return (
                 "a contact, a limit, friction or another constraint acts in the run: name another"
-                " in Task.reference_states"
+                " run in Task.reference_states"
             )
         if task.constrain is not None:
-            kept = np.array(task.constrain(physics.state, free.step_duration))
-            if not np.array_equal(kept, physics.state):
-                return "the run meets the task's bounds: name another in Task.reference_states"
+            constrained = np.array(task.constrain(physics.state, free.step_duration))
+            if not np.array_equal(constrained, physics.state):
+                return "the run meets the task's bounds: name another run in Task.reference_states"
     return ""
 
 
-def _states(
+def _simulated_states(
     kind: type, task: Task, actuators: Sequence[ActuatorModel], inner_steps: int, integrator: str
 ) -> np.ndarray:
-    """Mechanical states after each environment step of the task's free run."""
+    """Return the mechanical states after each environment step of the task's free run."""
     start, forces, _ = free_run(task)
     physics = kind(SimulationConfig(task, actuators, inner_steps, integrator))
     physics.reset(start)
@@ -118,15 +124,15 @@ def _states(
 
 
 def _error(states: np.ndarray, solution: np.ndarray) -> float:
-    """Largest difference of any entry, relative to the entry's largest size in the run."""
+    """Return the largest difference of any entry, relative to its largest size in the run."""
     return float((np.abs(states - solution).max(axis=0) / np.abs(solution).max(axis=0)).max())
 
 
 def engine_equations(task: Task) -> Equations:
-    """The accelerations that MuJoCo's `mj_forward` finds, whatever its integrator makes of them."""
+    """Return equations of motion with the accelerations of `mj_forward`, without its integrator."""
     model = task_model(
         SimulationConfig(
-            task, actuators_named("ideal", task), max_forces=np.full(len(task.motors), 1e9)
+            task, named_actuators("ideal", task), max_forces=np.full(len(task.motors), 1e9)
         )
     )
     install_callbacks(model)
@@ -152,24 +158,28 @@ def solve(
     inner_steps: int = 0,
     fourth: bool = False,
 ) -> np.ndarray:
-    """Mechanical states, shape (steps, n), at the ends of the environment steps, the forces held over each.
+    """Return the mechanical states at the ends of the environment steps, shape (steps, n).
 
-    They are found by scipy's DOP853 at a relative tolerance of 1e-12; with `inner_steps` by as many
-    textbook steps: Gymnasium's Runge-Kutta of fourth order, or Euler's.
+    Each force is held for one environment step. The solver is scipy's DOP853 at a relative
+    tolerance of 1e-12. With `inner_steps` > 0 that number of textbook steps is taken in an
+    environment step instead: Gymnasium's fourth-order Runge-Kutta if `fourth`, otherwise Euler.
 
-    With motors they are joined by those of each circuit and its analogue PI loop, L di/dt = u -
-    kE*omega - R*i, u = kP*e + kI*I + kFF*i_ref (+ kE*omega), dI/dt = e, torque = kT*i; such a loop
-    has no derivative gain and no filter, is never saturated, and starts at rest.
+    With motors the state includes each circuit and its continuous PI loop, L di/dt = u - kE*omega -
+    R*i, u = kP*e + kI*I + kFF*i_ref (+ kE*omega), dI/dt = e, torque = kT*i. Such a loop has no
+    derivative gain and no filter, is never saturated, and starts at rest.
     """
-    size, motors = len(start), [one for one in actuators if isinstance(one, DCMotorActuator)]
+    size, motors = (
+        len(start),
+        [actuator for actuator in actuators if isinstance(actuator, DCMotorActuator)],
+    )
 
     def derivative(_: float, state: np.ndarray, desired: np.ndarray) -> np.ndarray:
         delivered, electrical = [*desired], []
-        for at, actuator in enumerate(motors):
+        for motor_index, actuator in enumerate(motors):
             motor, loop = actuator.motor, actuator.controller
-            current, integral = state[size + 2 * at : size + 2 * at + 2]
-            reference = desired[at] * motor.arm_radius / motor.torque_constant
-            back_emf = motor.back_emf_constant * state[task.speed_indices[at]] / motor.arm_radius
+            current, integral = state[size + 2 * motor_index : size + 2 * motor_index + 2]
+            reference = desired[motor_index] * motor.arm_radius / motor.torque_constant
+            back_emf = motor.back_emf_constant * state[task.speed_indices[motor_index]] / motor.arm_radius
             error = reference - current
             voltage = (
                 loop.kp * error
@@ -181,90 +191,96 @@ def solve(
                 (voltage - back_emf - motor.resistance * current) / motor.inductance,
                 error,
             ]
-            delivered[at] = motor.torque_constant * current / motor.arm_radius
+            delivered[motor_index] = motor.torque_constant * current / motor.arm_radius
         force = delivered[0] if len(delivered) == 1 else np.array(delivered)
         return np.concatenate([equations(state[:size], force), electrical])
 
     state, rows = np.concatenate([start, np.zeros(2 * len(motors))]), []
     span, step = (0.0, task.step_duration), task.step_duration / max(inner_steps, 1)
     for force in forces:
-        given = (np.atleast_1d(force),)
+        force_args = (np.atleast_1d(force),)
+        # Each environment step is solved separately because the force jumps between two of them.
         if not inner_steps:
-            found = integrate.solve_ivp(
-                derivative, span, state, "DOP853", rtol=1e-12, atol=1e-15, args=given
+            solution = integrate.solve_ivp(
+                derivative, span, state, "DOP853", rtol=1e-12, atol=1e-15, args=force_args
             )
-            state = found.y[:, -1]
-        slope = functools.partial(derivative, 0.0, desired=given[0])
+            state = solution.y[:, -1]
+        slope = functools.partial(derivative, 0.0, desired=force_args[0])
         for _ in range(inner_steps):
             state = rk4(slope, state, [0.0, step]) if fourth else state + step * slope(state)
         rows.append(state[:size])
     return np.array(rows)
 
 
-def analogues(task: Task) -> tuple[DCMotorActuator, ...]:
-    """The task's actuators without derivative, limit and back-EMF compensation: their loops have a smooth limit.
+def continuous_actuators(task: Task) -> tuple[DCMotorActuator, ...]:
+    """Return the task's actuators with loops that have a smooth continuous limit.
 
-    The paper's kD is a difference of two samples, whose limit is an impulse wherever the command
-    jumps; the compensation would hide the back-EMF.
+    They have no derivative gain, voltage limit, integral leak and back-EMF compensation. The
+    paper's kD is a difference of two samples, whose limit is an impulse wherever the command jumps;
+    the compensation would hide the back-EMF.
     """
     smooth = {"kd": 0.0, "max_voltage": math.inf, "bemf_compensation": False, "integral_leak": 0.0}
     changes = {f"controller.{name}": value for name, value in smooth.items()}
-    return tuple(one.replaced(changes) for one in actuators_of(task))
+    return tuple(actuator.replaced(changes) for actuator in paper_actuators(task))
 
 
-def halvings(task: Task, most: int = 4) -> range:
-    """Return how many times more the steps of a run are halved, in turn, until its errors show an order."""
+def halving_range(task: Task, max_halvings: int = 4) -> range:
+    """Return the numbers of extra halvings of the steps that are tried until the order shows."""
+    # Without `Task.trials` the run is arbitrary and may be violent: it begins with finer steps.
     first = (
         2 if task.reference_states is None else 0
-    )  # in a run that nobody chose the first steps are finer
-    return range(first, first + (1 if is_ours(task) else most + 1), 2)
+    return range(first, first + (1 if is_ours(task) else max_halvings + 1), 2)
 
 
-def refined(task: Task, judged: Callable[[int], Case], most: int = 4) -> Case:
-    """Return what is found at the coarsest steps at which errors have the promised order, or at the finest."""
-    for finer in halvings(task, most):
-        case = judged(finer)
+def coarsest_passing(task: Task, evaluate: Callable[[int], Case], max_halvings: int = 4) -> Case:
+    """Return the case of the coarsest steps with the promised order, or of the finest steps."""
+    for extra_halvings in halving_range(task, max_halvings):
+        case = evaluate(extra_halvings)
         if case.gaps <= ORDER_TOLERANCE:
             break
     return case
 
 
-def blamed(
-    task: Task, outcome: Check, judged: Callable[[int], tuple[float, str]], promised: float
+def attribute_failure(
+    task: Task, outcome: Check, evaluate: Callable[[int], tuple[float, str]], promised: float
 ) -> Check | Skipped:
-    """Return a failed check of somebody's task with whose fault it is: the run's, if textbook steps fail it as well."""
+    """Add the cause to a failed check of a custom task; skip it if textbook steps fail as well."""
     if outcome.passed or is_ours(task):
         return outcome
-    distance, found = min(map(judged, halvings(task)))
+    distance, finding = min(map(evaluate, halving_range(task)))
     if distance <= ORDER_TOLERANCE:
         return dataclasses.replace(
-            outcome, fault=f"textbook steps of such sizes have this order: {REPORT}"
+            outcome, fault=f"textbook steps of the same size have this order: {REPORT}"
         )
-    why = (
-        f"{found}, where {promised:g} was promised: the run is too violent for these steps, or not"
-        " smooth"
+    reason = (
+        f"{finding}, where {promised:g} was promised: the run is too violent for these steps, or"
+        " not smooth"
     )
     return Skipped(
-        outcome.name, f"{why}. Name a gentler one in Task.reference_states, or a smaller max_force"
+        outcome.name, f"{reason}. Name a gentler run in Task.reference_states, or a smaller max_force"
     )
 
 
-def _counts(
-    task: Task, fourth: bool, motors: Sequence[Motor], finer: int, quick: bool
+def _step_counts(
+    task: Task, fourth: bool, motors: Sequence[Motor], extra_halvings: int, quick: bool
 ) -> np.ndarray:
-    """Return the integration steps in an environment step, which are compared."""
+    """Return the numbers of integration steps in an environment step that are compared."""
     if fourth:
-        return 2 ** (np.arange(2, 6 if quick else 7) + finer)
+        return 2 ** (np.arange(2, 6 if quick else 7) + extra_halvings)
     if not motors:
-        return 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + finer)
-    # A quarter of the winding's time constant, and shorter; in a run that nobody chose also of the
-    # motion's.
-    resolved = task.step_duration / (min(motor.electrical_time_constant for motor in motors) / 4)
-    first = math.ceil(math.log2(max(resolved, 4))) + finer - halvings(task)[0]
-    return 2 ** (first + (np.arange(0, 4) if quick else np.arange(1, 6)))
+        return 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + extra_halvings)
+    # Steps of a quarter of the winding's time constant, and shorter. Without `Task.trials` they are
+    # also short for the motion (`halving_range`).
+    steps_per_quarter = task.step_duration / (
+        min(motor.electrical_time_constant for motor in motors) / 4
+    )
+    first_exponent = (
+        math.ceil(math.log2(max(steps_per_quarter, 4))) + extra_halvings - halving_range(task)[0]
+    )
+    return 2 ** (first_exponent + (np.arange(0, 4) if quick else np.arange(1, 6)))
 
 
-@check("convergence", order("order, {integrator}, {case}", "DOP853 at 1e-12 on {whose}"))
+@check("convergence", order_check("order, {integrator}, {case}", "DOP853 at 1e-12 on {equations}"))
 def order_in_the_step(
     task: Task,
     case: str,
@@ -274,38 +290,44 @@ def order_in_the_step(
     counts: Callable[[int], np.ndarray],
     promised: float,
 ) -> Iterator[Case]:
-    """The solution's errors vanish as the integrator promises."""
+    """Check that the errors of the solution vanish at the integrator's order."""
 
-    def judged(finer: int) -> Case:
-        families = []
-        for label, kind in physics_of(task):
+    def evaluate(extra_halvings: int) -> Case:
+        series = []
+        for label, kind in physics_classes(task):
             errors = [
-                _error(_states(kind, task, actuators, int(one), integrator), solution)
-                for one in counts(finer)
+                _error(_simulated_states(kind, task, actuators, int(count), integrator), solution)
+                for count in counts(extra_halvings)
             ]
-            steps = task.step_duration / counts(finer)
-            families.append(Family(label, steps, np.array(errors), 1e-12))  # the solution's
+            steps = task.step_duration / counts(extra_halvings)
+            # The reference solution itself has errors of 1e-12.
+            series.append(ConvergenceSeries(label, steps, np.array(errors), 1e-12))
         title, y_label = (
             f"{task.name}, {integrator}, {case}",
             "largest error of the state [relative]",
         )
-        return of_order(promised, families, title, "integration step [s]", y_label)
+        return order_case(promised, series, title, "integration step [s]", y_label)
 
-    yield refined(task, judged)
+    yield coarsest_passing(task, evaluate)
 
 
 @check(
-    "convergence", order("rate in the loop's bandwidth", "{whose} with the desired force itself")
+    "convergence",
+    order_check("rate in the loop's bandwidth", "{equations} with the desired force itself"),
 )
 def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
-    """The lag is resolved by two integration steps at every bandwidth; both runs take the same steps."""
-    integrator, physics = task.integrators[0], physics_of(task)
-    motors = [Motor(arm_radius=actuator.motor.arm_radius) for actuator in actuators_of(task)]
+    """Check that the actuated task approaches the ideal one at first order in the loop's lag.
 
-    def judged(finer: int) -> Case:
+    Two integration steps resolve the lag at every bandwidth; both runs take the same steps.
+    """
+    integrator, physics = task.integrators[0], physics_classes(task)
+    motors = [Motor(arm_radius=actuator.motor.arm_radius) for actuator in paper_actuators(task)]
+
+    def evaluate(extra_halvings: int) -> Case:
+        # Time constants tau of the current loop [s].
         lags = task.step_duration / 2 ** (
-            (np.arange(3, 7) if quick else np.arange(4, 9)) + finer
-        )  # tau [s]
+            (np.arange(3, 7) if quick else np.arange(4, 9)) + extra_halvings
+        )
         errors: dict[str, list[float]] = {label: [] for label, _ in physics}
         for lag in lags:
             count = round(2 * task.step_duration / lag)
@@ -314,69 +336,85 @@ def rate_in_the_bandwidth(task: Task, quick: bool) -> Iterator[Case]:
                 kp=kp, ki=kp * motors[0].resistance / motors[0].inductance, max_voltage=math.inf
             )
             actuators = [DCMotorActuator(motor, loop) for motor in motors]
-            ideal = _states(physics[-1][1], task, actuators_named("ideal", task), count, integrator)
+            ideal = _simulated_states(
+                physics[-1][1], task, named_actuators("ideal", task), count, integrator
+            )
             for label, kind in physics:
                 errors[label].append(
-                    _error(_states(kind, task, actuators, count, integrator), ideal)
+                    _error(_simulated_states(kind, task, actuators, count, integrator), ideal)
                 )
         bandwidth = 1 / (2 * np.pi * lags)
-        families = [Family(label, bandwidth, np.array(found)) for label, found in errors.items()]
+        series = [
+            ConvergenceSeries(label, bandwidth, np.array(values))
+            for label, values in errors.items()
+        ]
         title = f"{task.name}: the actuated task approaches the ideal one"
         x_label = "bandwidth of the current loop [Hz]"
-        return of_order(
-            -1.0, families, title, x_label, "largest difference of the state [relative]"
+        return order_case(
+            -1.0, series, title, x_label, "largest difference of the state [relative]"
         )
 
-    yield refined(task, judged)
+    yield coarsest_passing(task, evaluate)
 
 
-def _textbook(
-    task: Task, solved: Any, solution: np.ndarray, counts: Any, promised: float, finer: int
+def _textbook_distance(
+    task: Task,
+    solve_with: Any,
+    solution: np.ndarray,
+    counts: Any,
+    promised: float,
+    extra_halvings: int,
 ) -> Any:
-    """Return how far textbook steps of the same equations are from the promised order, and the finding in words."""
-    errors = [_error(solved(int(count)), solution) for count in counts(finer)]
-    return Family(
-        "textbook steps", task.step_duration / counts(finer), np.array(errors), 1e-12
-    ).judged(promised)
+    """Return the distance of textbook steps from the promised order, and a description of it."""
+    errors = [_error(solve_with(int(count)), solution) for count in counts(extra_halvings)]
+    return ConvergenceSeries(
+        "textbook steps", task.step_duration / counts(extra_halvings), np.array(errors), 1e-12
+    ).distance_from(promised)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
-    """The checks of convergence."""
+    """Run the convergence checks of a task."""
     task = find_task(task_name)
-    reason = obstacle(task)
+    reason = nonsmooth_reason(task)
     if reason:
         yield Skipped("all checks", reason)
         return
     if task.reference_env is None:
-        yield Skipped("equations of motion that are not MuJoCo's", NO_TWIN)
-        equations, whose, named = engine_equations(task), "MuJoCo's own accelerations", "MuJoCo"
+        yield Skipped("equations of motion that are not MuJoCo's", NO_REFERENCE_ENV)
+        equations, description, implementation = (
+            engine_equations(task),
+            "MuJoCo's own accelerations",
+            "MuJoCo",
+        )
     else:
-        equations, whose, named = (
+        equations, description, implementation = (
             gymnasium_equations(task),
             f"the equations of {task.oracle}",
             task.oracle,
         )
     start, forces, _ = free_run(task)
     for case, actuators in (
-        ("ideal actuator", actuators_named("ideal", task)),
-        ("motor in the loop", analogues(task)),
+        ("ideal actuator", named_actuators("ideal", task)),
+        ("motor in the loop", continuous_actuators(task)),
     ):
-        solved = functools.partial(solve, task, equations, start, forces, actuators)
+        solve_task = functools.partial(solve, task, equations, start, forces, actuators)
         solution, motors = (
-            solved(),
-            [one.motor for one in actuators if isinstance(one, DCMotorActuator)],
+            solve_task(),
+            [actuator.motor for actuator in actuators if isinstance(actuator, DCMotorActuator)],
         )
-        said = whose if case == "ideal actuator" else f"{whose} and of the motor"
+        oracle = description if case == "ideal actuator" else f"{description} and of the motor"
         for integrator in task.integrators:
             fourth = integrator == "rk4" and not motors
             promised, counts = (
                 4.0 if fourth else 1.0,
-                functools.partial(_counts, task, fourth, motors, quick=quick),
+                functools.partial(_step_counts, task, fourth, motors, quick=quick),
             )
-            steps = functools.partial(solved, fourth=fourth)
-            textbook = functools.partial(_textbook, task, steps, solution, counts, promised)
+            solve_textbook = functools.partial(solve_task, fourth=fourth)
+            textbook = functools.partial(
+                _textbook_distance, task, solve_textbook, solution, counts, promised
+            )
             for outcome in order_in_the_step(
-                task, case, integrator, actuators, solution, counts, promised, whose=said
+                task, case, integrator, actuators, solution, counts, promised, equations=oracle
             ):
-                yield blamed(task, outcome, textbook, promised)
-    yield from rate_in_the_bandwidth(task, quick, whose=named)
+                yield attribute_failure(task, outcome, textbook, promised)
+    yield from rate_in_the_bandwidth(task, quick, equations=implementation)

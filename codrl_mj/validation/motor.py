@@ -1,28 +1,28 @@
-"""The motor as it runs inside MuJoCo, callbacks and all, against oracles that are not ours.
+"""Comparison of the motor as it runs inside MuJoCo, callbacks included, with independent oracles.
 
-`motor_loops` has the current loop against linear systems theory, `own_model` what can be asked of
-any family of actuators, `drives` what bench motors are compared with. Here is the motor without its
-loop, driven by a voltage: MuJoCo's native `<dcmotor>`, gym-electric-motor, and a datasheet. Torques
-are read where the engine applies them.
+This module has the motor without its loop, driven by a voltage, against MuJoCo's native
+`<dcmotor>`, gym-electric-motor and a datasheet. `motor_loops` compares the current loop with linear
+systems theory, `own_model` has the checks that apply to any family of actuators, and
+`motor_catalogue` compares off-the-shelf motors. Torques are read where the engine applies them.
 
 MuJoCo's motor integrates the winding differently. With the speed held over a step, the native motor
-is exact, i' = i_inf + (i - i_inf) exp(-R dt/L), and ours takes Euler steps. Hence two comparisons:
-at an inductance of R dt/(1 - exp(-R dt/L)) one Euler step *is* the exact one, so that the two
-motors must be equal to rounding; and at the true inductance ours converges to the native one at
-first order in the substeps.
+is exact, i' = i_inf + (i - i_inf) exp(-R dt/L), and our motor takes Euler steps. Hence two
+comparisons: at an inductance of R dt/(1 - exp(-R dt/L)) one Euler step *is* the exact one, so that
+the two motors must be equal to rounding; and at the true inductance our motor converges to the
+native one at first order in the substeps.
 
 Under `implicitfast` the engine adds the slope of the native motor's torque over speed, kT kE/R (1 -
-exp(-R dt/L)), to the velocity's implicit matrix. Ours has no such slope. It shrinks with the step
-and acts over a step, so that the difference vanishes at second order; on a locked rotor there is
-none.
+exp(-R dt/L)), to the velocity's implicit matrix. Our motor has no such slope. It shrinks with the
+step and acts over a step, so that the difference vanishes at second order; on a locked rotor there
+is none.
 
-Under RK4 the native motor is no oracle: the engine advances its current at every stage, and a step
-ends with a current that no exponential has. `rk4_check` measures it beside ours, which holds the
-force over the step and stays exact.
+Under RK4 the native motor is no oracle: the engine advances its current at every stage, and the
+current at the end of a step lies on no exponential. `rk4_check` measures it beside our motor, which
+holds the force over the step and stays exact.
 
-gym-electric-motor (https://github.com/upb-lea/gym-electric-motor) is a simulator of drives written
-by others. It is no dependency of the package, because it installs pytest and coverage; where it is
-absent its check is left out.
+gym-electric-motor (https://github.com/upb-lea/gym-electric-motor) is a third-party simulator of
+electric drives. It is not a dependency of the package, because it installs pytest and coverage; its
+check is skipped if it is not installed.
 
 A datasheet promises, in steady state, u = R*i + kE*omega and torque = kT*i: a straight line of
 torque over speed through the stall torque kT*u/R and the no-load speed u/kE, beyond which the
@@ -39,46 +39,54 @@ import numpy as np
 
 from codrl_mj.actuators import DCMotorActuator, Motor
 from codrl_mj.validation.motor_catalogue import drive_checks
-from codrl_mj.validation.motor_loops import analogue, sampled_checks
+from codrl_mj.validation.motor_loops import order_to_closed_form, sampled_checks
 from codrl_mj.validation.own_model import compiled_checks
 from codrl_mj.validation.rotors import (
     FREE,
-    HELD,
+    LOCKED,
     SWINGING,
     Loop,
     Record,
     Rotor,
-    drive,
-    driven_by_voltage,
-    motors_on,
+    build_rotors,
+    simulate,
     standard_loops,
+    voltage_actuator,
 )
-from codrl_mj.validation.table import Case, Check, Family, Skipped, check, of_order, order
+from codrl_mj.validation.table import (
+    Case,
+    Check,
+    ConvergenceSeries,
+    Skipped,
+    check,
+    order_case,
+    order_check,
+)
 from codrl_mj.viz.pages.plots import Curve, Plot
 
 MOTORS: dict[str, Motor] = {
     "paper": Motor(),
     "small": Motor(resistance=2.0, inductance=0.02, torque_constant=0.5, back_emf_constant=0.5),
 }
-"""The motors compared: the paper's, and one whose parameters all differ from each other."""
+"""Motors that are compared: the paper's, and one whose parameters all differ from each other."""
 
-_ON: tuple[tuple[Rotor, str], ...] = (
-    (HELD, "Euler"),
-    (HELD, "implicitfast"),
+_NATIVE_CASES: tuple[tuple[Rotor, str], ...] = (
+    (LOCKED, "Euler"),
+    (LOCKED, "implicitfast"),
     (FREE, "Euler"),
     (SWINGING, "Euler"),
 )
 
 
-def exact(motor: Motor, timestep: float) -> DCMotorActuator:
-    """A motor of ours under a voltage, whose inductance makes its Euler step the exact one of the given motor."""
+def exact_euler_actuator(motor: Motor, timestep: float) -> DCMotorActuator:
+    """Return a voltage-driven motor whose Euler step equals the exact step of the given motor."""
     decay = 1.0 - math.exp(-timestep * motor.resistance / motor.inductance)
-    return driven_by_voltage(
+    return voltage_actuator(
         dataclasses.replace(motor, inductance=motor.resistance * timestep / decay)
     )
 
 
-def _both(
+def _compare_with_native(
     rotor: Rotor,
     motor: Motor,
     actuator: DCMotorActuator,
@@ -87,13 +95,18 @@ def _both(
     count: int,
     integrator: str = "Euler",
 ) -> tuple[Record, Record, np.ndarray]:
-    """Ours and the native motor, and their differences of angle, speed and current, relative to max(1, size).
+    """Simulate our motor and the native one under the same voltages.
 
-    Both are under `count` random voltages in +-4 V, each held for `hold` steps.
+    Both get `count` random voltages in +-4 V, each held for `hold` steps.
+
+    Returns:
+        The records of our motor and of the native one, and the largest difference of angle, speed
+        and current after each step, relative to max(1, size).
     """
     volts = np.random.default_rng(0).uniform(-4.0, 4.0, count).repeat(hold)
     ours, native = (
-        drive(motors_on(rotor, [one], timestep, integrator), volts) for one in (actuator, motor)
+        simulate(build_rotors(rotor, [simulated], timestep, integrator), volts)
+        for simulated in (actuator, motor)
     )
     pairs = zip(ours[:3], native[:3], strict=True)
     return (
@@ -111,88 +124,106 @@ def _both(
         1e-10,
     ),
 )
-def same_map(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
-    """Tolerance 1e-10: rounding of some 100 steps of a coupled, stable system."""
+def equal_to_native(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
+    """Compare the two motors at the inductance at which one Euler step is exact.
+
+    Tolerance 1e-10: rounding of some 100 steps of a coupled, stable system.
+    """
     shares = (0.1, 1.0) if quick else (0.01, 0.1, 0.3, 1.0)
-    for (name, motor), (rotor, integrator), share in itertools.product(motors.items(), _ON, shares):
+    for (name, motor), (rotor, integrator), share in itertools.product(
+        motors.items(), _NATIVE_CASES, shares
+    ):
         timestep = share * motor.electrical_time_constant
         count = 20 if quick else 100
-        ours, native, difference = _both(
-            rotor, motor, exact(motor, timestep), timestep, 5, count, integrator
+        ours, native, difference = _compare_with_native(
+            rotor, motor, exact_euler_actuator(motor, timestep), timestep, 5, count, integrator
         )
-        at = (
+        description = (
             f"{name} motor, {rotor.name}, {integrator}, dt = {share:g} L/R, step"
             f" {difference.argmax() + 1}"
         )
         time = np.arange(1, len(difference) + 1) * timestep
-        theirs = Curve("<dcmotor>", time, native.current[:, 0], reference=True)
-        curves = (Curve("ours", time, ours.current[:, 0]), theirs)
+        native_curve = Curve("<dcmotor>", time, native.current[:, 0], reference=True)
+        curves = (Curve("ours", time, ours.current[:, 0]), native_curve)
         plot = Plot("Current on the swinging load, Euler", "time [s]", "current [A]", curves)
         yield Case(
             difference,
-            at,
+            description,
             plots=(plot,) if (name, rotor, share) == ("paper", SWINGING, 0.1) else (),
         )
 
 
 @check(
     "motor",
-    order(
+    order_check(
         "native <dcmotor>, Euler, order in the substeps",
         "MuJoCo's <dcmotor> at the true inductance",
     ),
 )
-def substeps(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
-    """First order in the substeps, at the true inductance."""
-    counts, families = 2 ** np.arange(4, 8 if quick else 11), []
-    for (name, motor), rotor in itertools.product(motors.items(), (HELD, FREE, SWINGING)):
+def order_in_substeps(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
+    """Check that the difference is of first order in the substeps, at the true inductance."""
+    counts, series = 2 ** np.arange(4, 8 if quick else 11), []
+    for (name, motor), rotor in itertools.product(motors.items(), (LOCKED, FREE, SWINGING)):
         timestep = 0.2 * motor.electrical_time_constant
-        actuators = [driven_by_voltage(motor, int(count)) for count in counts]
-        errors = [_both(rotor, motor, one, timestep, 5, 20)[-1].max() for one in actuators]
-        families.append(Family(f"{name}, {rotor.name}", timestep / counts, np.array(errors)))
+        actuators = [voltage_actuator(motor, int(count)) for count in counts]
+        errors = [
+            _compare_with_native(rotor, motor, actuator, timestep, 5, 20)[-1].max()
+            for actuator in actuators
+        ]
+        series.append(
+            ConvergenceSeries(f"{name}, {rotor.name}", timestep / counts, np.array(errors))
+        )
     title = "Ours against <dcmotor>, Euler"
-    yield of_order(1.0, families, title, "electrical substep [s]", "largest difference [relative]")
+    yield order_case(1.0, series, title, "electrical substep [s]", "largest difference [relative]")
 
 
 @check(
     "motor",
-    order(
+    order_check(
         "native <dcmotor>, implicitfast, order in the step", "MuJoCo's <dcmotor> at the same step"
     ),
 )
-def implicitfast(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
-    """Second order in the step."""
-    divisors, families = 2 ** np.arange(5, 9 if quick else 11), []
+def order_under_implicitfast(motors: Mapping[str, Motor], quick: bool) -> Iterator[Case]:
+    """Check that the difference under `implicitfast` is of second order in the step."""
+    divisors, series = 2 ** np.arange(5, 9 if quick else 11), []
     for (name, motor), rotor in itertools.product(motors.items(), (FREE, SWINGING)):
         steps, errors = motor.electrical_time_constant / divisors, []
         for divisor, timestep in zip(divisors, steps, strict=True):
-            both = _both(
-                rotor, motor, exact(motor, timestep), timestep, int(divisor), 10, "implicitfast"
+            comparison = _compare_with_native(
+                rotor,
+                motor,
+                exact_euler_actuator(motor, timestep),
+                timestep,
+                int(divisor),
+                10,
+                "implicitfast",
             )
-            errors.append(both[-1].max())
-        families.append(Family(f"{name}, {rotor.name}", steps, np.array(errors)))
+            errors.append(comparison[-1].max())
+        series.append(ConvergenceSeries(f"{name}, {rotor.name}", steps, np.array(errors)))
     title = "Ours against <dcmotor>, implicitfast"
-    yield of_order(2.0, families, title, "step [s]", "largest difference [relative]")
+    yield order_case(2.0, series, title, "step [s]", "largest difference [relative]")
 
 
 @check("motor", Check("RK4, locked rotor", "exponential of the RL circuit", 1e-12))
 def rk4_check(quick: bool) -> Iterator[Case]:
-    """Our current under RK4 against the exponential, on a locked rotor at 1 V; tolerance 1e-12 of the current.
+    """Compare our current under RK4 with the exponential, on a locked rotor at 1 V.
 
-    The native motor's error at the same steps is shown beside it and is no part of the verdict.
+    Tolerance 1e-12 of the current. The native motor's error at the same steps is only reported.
     """
     motor = Motor()
     shares = np.array([0.1, 0.3, 1.0]) if quick else np.geomspace(0.1, 1.0, 9)
     ours, native = np.empty((2, len(shares)))
-    for at, share in enumerate(shares):
+    for index, share in enumerate(shares):
         timestep = float(share) * motor.electrical_time_constant
         volts = np.ones(math.ceil(3.0 / share))
         currents = (1.0 / motor.resistance) * (1.0 - np.exp(-share * np.arange(1, len(volts) + 1)))
-        ours[at], native[at] = (
+        ours[index], native[index] = (
             np.abs(
-                drive(motors_on(HELD, [one], timestep, "RK4"), volts).current[:, 0] / currents - 1.0
+                simulate(build_rotors(LOCKED, [simulated], timestep, "RK4"), volts).current[:, 0]
+                / currents
+                - 1.0
             ).max()
-            for one in (exact(motor, timestep), motor)
+            for simulated in (exact_euler_actuator(motor, timestep), motor)
         )
     native_error = (
         f"; <dcmotor> reads {native[0]:.1%} wrong at dt = {shares[0]:g} L/R, {native[-1]:.0%} at"
@@ -210,24 +241,25 @@ def rk4_check(quick: bool) -> Iterator[Case]:
         x_log=True,
         y_log=True,
     )
-    yield Case(ours, lambda at: f"dt = {shares[at]:.3g} L/R{native_error}", plots=(plot,))
+    yield Case(ours, lambda index: f"dt = {shares[index]:.3g} L/R{native_error}", plots=(plot,))
 
 
-# -- gym-electric-motor ------------------------------------------------------------------------------------------
+# -- gym-electric-motor ----------------------------------------------------------------------------
 
 SUPPLY = 12.0
 """Supply voltage [V]."""
 PERIOD = 0.05
-"""How long each voltage is held [s]."""
+"""Duration for which each voltage is held [s]."""
 
 
 def gem_run(motor: Motor, inertia: float, voltages: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Speed [rad/s] and current [A] of gym-electric-motor's drive after each voltage's period.
+    """Return speed [rad/s] and current [A] of gym-electric-motor's drive after each voltage.
 
-    Its whole chain runs: ideal supply, continuous four-quadrant converter,
+    The complete drive is simulated: ideal supply, continuous four-quadrant converter,
     `DcPermanentlyExcitedMotor`, whose one constant psi_e is both kT and kE, inertial load, and
-    scipy's DOP853 at 1e-11. A voltage is held over its period.
+    scipy's DOP853 at 1e-11. Each voltage is held for `PERIOD`.
     """
+    # gym-electric-motor is optional.
     from gym_electric_motor.physical_systems import (
         converters,
         electric_motors,
@@ -259,84 +291,96 @@ def gem_run(motor: Motor, inertia: float, voltages: np.ndarray) -> tuple[np.ndar
 
 @check(
     "motor",
-    order(
+    order_check(
         "gym-electric-motor, order in the step", "gym-electric-motor's DcPermanentlyExcitedMotor"
     ),
 )
 def gem_check(motor: Motor, quick: bool) -> Iterator[Case]:
-    """Convergence of speed and current to gym-electric-motor's at first order in the step, Euler on a free rotor."""
+    """Check that speed and current converge to gym-electric-motor's at first order in the step.
+
+    The integrator is Euler, on a free rotor.
+    """
     voltages = np.random.default_rng(1).uniform(-SUPPLY, SUPPLY, 20 if quick else 40)
     speed, current = gem_run(motor, FREE.inertia, voltages)
     counts = 2 ** np.arange(4, 8 if quick else 11)
     errors = np.empty((2, len(counts)))
-    for at, count in enumerate(counts.tolist()):
-        found = drive(
-            motors_on(FREE, [driven_by_voltage(motor)], PERIOD / count), voltages.repeat(count)
+    for index, count in enumerate(counts.tolist()):
+        record = simulate(
+            build_rotors(FREE, [voltage_actuator(motor)], PERIOD / count), voltages.repeat(count)
         )
-        errors[:, at] = [
-            np.abs(ours[count - 1 :: count, 0] - theirs).max()
-            for ours, theirs in ((found.speed, speed), (found.current, current))
+        errors[:, index] = [
+            np.abs(ours[count - 1 :: count, 0] - oracle).max()
+            for ours, oracle in ((record.speed, speed), (record.current, current))
         ]
     steps = PERIOD / counts
-    families = [
-        Family(label, steps, one)
-        for label, one in zip(("speed [rad/s]", "current [A]"), errors, strict=True)
+    series = [
+        ConvergenceSeries(label, steps, quantity_errors)
+        for label, quantity_errors in zip(("speed [rad/s]", "current [A]"), errors, strict=True)
     ]
     title = "Ours against gym-electric-motor, free rotor"
-    yield of_order(1.0, families, title, "step [s]", "largest difference [rad/s, A]")
+    yield order_case(1.0, series, title, "step [s]", "largest difference [rad/s, A]")
 
 
-# -- a datasheet's numbers -----------------------------------------------------------------------------------------
+# -- a datasheet's numbers -------------------------------------------------------------------------
 
 VOLTAGE = 6.0
-"""Supply of every measurement [V]."""
+"""Supply voltage of every measurement [V]."""
 TOLERANCE = 1e-9
+"""Tolerance of steady-state values, relative."""
 _LINE = "u = R i + kE omega, torque = kT i in steady state"
 
 
 @check("motor", Check("torque-speed line and power, stall to regeneration", _LINE, TOLERANCE))
 def torque_speed_line(motors: Mapping[str, Motor]) -> Iterator[Case]:
-    """The torque-speed line, stall to regeneration; without a back-EMF it is measured at rest alone.
+    """Compare the torque-speed line and the power, from stall to regeneration.
 
-    Tolerance 1e-9: the measurements wait for 40 electrical (no load: 40 mechanical) time constants,
-    exp(-40) = 4e-18, and an Euler step has the circuit's own fixed point.
+    Without a back-EMF there is no no-load speed, and all measurements are at rest. Tolerance 1e-9:
+    the measurements wait for 40 electrical (no load: 40 mechanical) time constants, exp(-40) =
+    4e-18, and an Euler step has the same fixed point as the circuit.
     """
-    shares = np.array(
-        [-0.5, 0.0, 0.5, 1.0, 1.5]
-    )  # of the no-load speed: reversed, stall, driving, no load, dragged
+    # Shares of the no-load speed: reversed, stall, driving, no load, dragged.
+    shares = np.array([-0.5, 0.0, 0.5, 1.0, 1.5])
     names = ("reversed", "stall", "driving", "no load", "regenerating")
     for name, motor in motors.items():
         timestep = 0.2 * motor.electrical_time_constant
-        spins = motor.back_emf_constant > 0
-        top = VOLTAGE / motor.back_emf_constant * motor.arm_radius if spins else 0.0  # of the joint
-        model = motors_on(HELD, [driven_by_voltage(motor)] * len(shares), timestep)
-        speeds = np.tile(shares * top, (200, 1))
-        run = drive(model, np.full(len(speeds), VOLTAGE), speeds)
+        has_back_emf = motor.back_emf_constant > 0
+        # The no-load speed of the joint.
+        no_load_speed = (
+            VOLTAGE / motor.back_emf_constant * motor.arm_radius if has_back_emf else 0.0
+        )
+        model = build_rotors(LOCKED, [voltage_actuator(motor)] * len(shares), timestep)
+        speeds = np.tile(shares * no_load_speed, (200, 1))
+        run = simulate(model, np.full(len(speeds), VOLTAGE), speeds)
         line = (
             motor.torque_constant
             / motor.arm_radius
             * VOLTAGE
             / motor.resistance
-            * (1.0 - shares * spins)
+            * (1.0 - shares * has_back_emf)
         )
         torque, stall = run.torque[-1], float(np.abs(line).max())
         power = VOLTAGE * run.current[-1]
-        drawn = VOLTAGE**2 / motor.resistance * (1.0 - shares * spins)
-        where = [f"{name}, {part}{at}" for part in ("", "power, ") for at in names]
-        gaps = np.append(np.abs(torque - line) / stall, np.abs(power - drawn) / np.abs(drawn).max())
+        expected_power = VOLTAGE**2 / motor.resistance * (1.0 - shares * has_back_emf)
+        descriptions = [f"{name}, {part}{region}" for part in ("", "power, ") for region in names]
+        gaps = np.append(
+            np.abs(torque - line) / stall,
+            np.abs(power - expected_power) / np.abs(expected_power).max(),
+        )
         curves = (
-            Curve("MuJoCo", shares * top, torque),
-            Curve("kT (u - kE omega)/R", shares * top, line, True),
+            Curve("MuJoCo", shares * no_load_speed, torque),
+            Curve("kT (u - kE omega)/R", shares * no_load_speed, line, True),
         )
         plot = Plot(
             f"Torque over speed at {VOLTAGE:g} V, {name}", "speed [rad/s]", "torque [N m]", curves
         )
-        yield Case(gaps, where.__getitem__, plots=(plot,) if name == next(iter(motors)) else ())
+        yield Case(
+            gaps, descriptions.__getitem__, plots=(plot,) if name == next(iter(motors)) else ()
+        )
 
 
 @check("motor", Check("no-load speed and current", "u/kE, and none", TOLERANCE))
 def no_load(motors: Mapping[str, Motor]) -> Iterator[Case]:
-    """The free no-load speed of those that have one."""
+    """Compare the no-load speed and current of the motors with a back-EMF."""
     for name, motor in motors.items():
         if motor.back_emf_constant == 0:
             continue
@@ -344,12 +388,14 @@ def no_load(motors: Mapping[str, Motor]) -> Iterator[Case]:
         mechanical = FREE.inertia * motor.resistance / product
         timestep = 0.05 * min(motor.electrical_time_constant, mechanical)
         steps = int(40 * (2 * motor.electrical_time_constant + mechanical) / timestep)
-        run = drive(
-            motors_on(FREE, [driven_by_voltage(motor)], timestep),
+        run = simulate(
+            build_rotors(FREE, [voltage_actuator(motor)], timestep),
             np.full(min(steps, 40_000), VOLTAGE),
         )
-        top = VOLTAGE / motor.back_emf_constant * motor.arm_radius
-        yield Case(abs(run.speed[-1, 0] / top - 1.0), f"{name}: {run.speed[-1, 0]:.6g} rad/s")
+        no_load_speed = VOLTAGE / motor.back_emf_constant * motor.arm_radius
+        yield Case(
+            abs(run.speed[-1, 0] / no_load_speed - 1.0), f"{name}: {run.speed[-1, 0]:.6g} rad/s"
+        )
         yield Case(
             abs(run.current[-1, 0]) * motor.resistance / VOLTAGE, f"{name}: current without load"
         )
@@ -357,16 +403,17 @@ def no_load(motors: Mapping[str, Motor]) -> Iterator[Case]:
 
 @check("motor", Check("stall torque at the voltage limit", "kT u_max/R", TOLERANCE))
 def voltage_limit(loops: Mapping[str, Loop]) -> Iterator[Case]:
-    """Stall torque at the voltage that controller and supply leave, in both directions, under a command far beyond it.
+    """Compare the stall torque at the voltage limit of controller and supply, in both directions.
 
-    A loop asked for 1000 times its stall current saturates whatever its gains, so that the torque
-    must be kT*u_max/R. Loops without a limit, or without a gain, never do and are left out. The
-    tolerance is that of the other constants.
+    The command is 1000 times the stall torque, so that the loop saturates whatever its gains and
+    the torque must be kT*u_max/R. Loops without a limit, or without a gain, never saturate and are
+    skipped. The tolerance is that of the other constants.
     """
     for name, loop in loops.items():
         motor, gains, supply = loop.actuator.motor, loop.actuator.controller, loop.actuator.supply
         limit = gains.max_voltage
         if supply is not None:
+            # The supply's resistance and the winding divide the voltage.
             open_circuit = limit if math.isinf(supply.voltage) else supply.voltage
             limit = min(
                 limit, open_circuit * motor.resistance / (motor.resistance + supply.resistance)
@@ -377,24 +424,24 @@ def voltage_limit(loops: Mapping[str, Loop]) -> Iterator[Case]:
         stall = motor.torque_constant * limit / motor.resistance
         for sign in (1.0, -1.0):
             controls = np.full(steps, 1000.0 * sign * stall)
-            torque = drive(
-                motors_on(HELD, [loop.actuator], loop.timestep), controls, np.zeros(steps)
+            torque = simulate(
+                build_rotors(LOCKED, [loop.actuator], loop.timestep), controls, np.zeros(steps)
             ).torque[-1, 0]
             error = abs(float(torque) * motor.arm_radius / (sign * stall) - 1.0)
             yield Case(error, f"{name}, {torque:.6g} N m at {sign * limit:g} V")
 
 
-# -- the group -----------------------------------------------------------------------------------------------------
+# -- the group -------------------------------------------------------------------------------------
 
 
 def checks(task_name: str | None = None, quick: bool = False) -> Iterator[Check | Skipped]:
-    """The checks of the motor, with the loop of one task alone, or with every task's and one with every feature."""
+    """Run the motor checks with the loop of one task, or with all `standard_loops`."""
     loops = standard_loops()
-    yield from checks_of(loops if task_name is None else {task_name: loops[task_name]}, quick)
+    yield from loop_checks(loops if task_name is None else {task_name: loops[task_name]}, quick)
     yield from compiled_checks(quick)
     yield from drive_checks(quick)
-    for compared in (same_map, substeps, implicitfast):
-        yield from compared(MOTORS, quick)
+    for native_check in (equal_to_native, order_in_substeps, order_under_implicitfast):
+        yield from native_check(MOTORS, quick)
     yield from rk4_check(quick)
     if importlib.util.find_spec("gym_electric_motor"):
         yield from gem_check(Motor(), quick)
@@ -403,10 +450,10 @@ def checks(task_name: str | None = None, quick: bool = False) -> Iterator[Check 
         yield Skipped(subject, "gym-electric-motor is not installed")
 
 
-def checks_of(loops: Mapping[str, Loop], quick: bool = False) -> Iterator[Check]:
-    """Those checks that apply to any motors, such as a user's own: all but the comparisons with fixed motors."""
+def loop_checks(loops: Mapping[str, Loop], quick: bool = False) -> Iterator[Check]:
+    """Run the checks that apply to any motors: all but the comparisons of fixed motors."""
     motors = {name: loop.actuator.motor for name, loop in loops.items()}
-    yield from analogue(loops, quick)
+    yield from order_to_closed_form(loops, quick)
     yield from sampled_checks(loops, quick)
     yield from voltage_limit(loops)
     yield from torque_speed_line(motors)

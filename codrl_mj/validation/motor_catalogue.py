@@ -1,16 +1,16 @@
-"""Off-the-shelf motors, in every task, against Gymnasium's equations with a rotor, a gear and friction on the joint.
+"""Comparison of off-the-shelf motors in every task with Gymnasium's equations plus a drive.
 
-Gymnasium's environments have no place for what a drive adds to its joint. Their equations, linear
-in the force, have: with a_0 the joint's acceleration under no force and w its slope over the force,
-an inertia A, a damping D and a friction f make it a = a_0 + w (F + f - D v - A a), so that the
-unmodified environment under the force in brackets moves as the joint with the rotor does. MuJoCo's
-Euler takes the damping at the new speed: A + h D in the place of A. Friction is MuJoCo's as its
-documentation has it (Computation, "Friction loss"; Modeling, "Solver parameters"), which for one
-joint is a closed form.
+Gymnasium's environments have no rotor inertia, gear or friction on the joint. Because their
+equations are linear in the force, these can be added from outside: with a_0 the joint's
+acceleration under no force and w its slope over the force, an inertia A, a damping D and a friction
+f make it a = a_0 + w (F + f - D v - A a), so that the unmodified environment under the force in
+brackets moves as the joint with the rotor does. MuJoCo's Euler takes the damping at the new speed:
+A + h D replaces A. Friction follows MuJoCo's documentation (Computation, "Friction loss"; Modeling,
+"Solver parameters"), which for one joint is a closed form.
 
-The motor of the oracle is written here anew: the winding by scipy's matrix exponential, sample by
-sample under a PI loop that cancels its pole. Nothing of `codrl_mj.actuators` is in it but the
-numbers of a `Drive`.
+The oracle's motor is a second implementation: the winding by scipy's matrix exponential, sample by
+sample under a PI loop that cancels its pole. It uses nothing of `codrl_mj.actuators` but the
+parameters of a `Drive`.
 """
 
 import math
@@ -25,10 +25,10 @@ from codrl_mj.catalogue import motor_names
 from codrl_mj.physics import MujocoPhysics, SimulationConfig, SimulationDivergedError
 from codrl_mj.tasks import Task
 from codrl_mj.validation.compare import differences, gymnasium_equations
-from codrl_mj.validation.rotors import HELD, drive, motors_on
+from codrl_mj.validation.rotors import LOCKED, build_rotors, simulate
 from codrl_mj.validation.table import Case, Check, check
 
-FITTED = {
+TASK_MOTORS = {
     "pendulum": ("maxon-ec45-flat-50w", {"gear_ratio": 30.0}, 20e3),
     "cartpole": ("maxon-dcx22l", {"gear_ratio": 5.0, "arm_radius": 0.02}, 20e3),
     "acrobot": ("cubemars-ak80-6", {"gear_efficiency": 1.0}, 20e3),
@@ -39,59 +39,72 @@ FITTED = {
         10e3,
     ),
 }
-"""Task -> a motor of the catalogue that can do it, its gear or wheel, and its drive's sample rate
-[Hz]. What a gear loses depends on what else moves the load, which the drive takes from the step
-before.
+"""Task -> a suitable motor of the catalogue, changes of its gear or wheel, sample rate [Hz].
+
+A gear's efficiency is set to 1 in some tasks: its loss depends on the other forces on the load,
+which the drive takes from the step before.
 """
-COLD = {
+NO_HEATING = {
     "thermal_resistance_winding": 0.0,
     "thermal_resistance_housing": 0.0,
     "max_temperature": math.inf,
 }
-"""A motor whose resistance stays."""
+"""Motor settings without heating, so that the resistance is constant."""
 
 
-def fitted(task: str) -> Drive:
-    """The drive of `FITTED` for a task."""
-    name, motor, rate = FITTED[task]
-    given = {"name": name, "motor": {**COLD, **motor}, "controller": {"sample_rate": rate}}
-    found: Drive = resolve(given, None, task)
-    return found
+def task_drive(task: str) -> Drive:
+    """Return the drive of `TASK_MOTORS` for a task."""
+    name, motor, rate = TASK_MOTORS[task]
+    fields = {"name": name, "motor": {**NO_HEATING, **motor}, "controller": {"sample_rate": rate}}
+    actuator: Drive = resolve(fields, None, task)
+    return actuator
 
 
-class Bench:
-    """A drive's winding and loop, sample by sample."""
+class DriveOracle:
+    """A second implementation of a drive's winding and current loop, sample by sample.
 
-    def __init__(self, one: Drive, timestep: float) -> None:
-        """At rest, with designed gains, back-calculation and a stiff supply; timestep: mechanical [s]."""
-        motor, sample = one.motor, 1.0 / one.controller.sample_rate
+    It has designed gains, back-calculation and a stiff supply.
+    """
+
+    def __init__(self, actuator: Drive, timestep: float) -> None:
+        """Start at rest; timestep: mechanical [s]."""
+        motor, sample = actuator.motor, 1.0 / actuator.controller.sample_rate
         self._motor, self._timestep = motor, timestep
-        self._voltage, self._most = one.voltage_limit, one.controller.max_current
+        self._voltage, self._max_current = actuator.voltage_limit, actuator.controller.max_current
         self._samples = round(timestep / sample)
         lag = [-motor.resistance / motor.inductance, 0.0, 1.0 / motor.inductance]
-        exact = expm(
-            np.array([lag, [1.0, 0.0, 0.0], [0.0] * 3]) * sample
-        )  # of current, charge and voltage
+        # The state is current, charge and voltage; the charge gives the sample's mean current.
+        exact = expm(np.array([lag, [1.0, 0.0, 0.0], [0.0] * 3]) * sample)
         self._winding = exact[:2].tolist()
-        share = 1.0 - math.exp(
-            -0.349
-        )  # the default bandwidth is 0.349 of the sample rate, in rad/s
-        self.ki = motor.resistance * share  # [V/A], per sample
-        self.kp = self.ki / math.expm1(motor.resistance * sample / motor.inductance)  # [V/A]
+        # The default bandwidth is 0.349 of the sample rate, in rad/s.
+        share = 1.0 - math.exp(-0.349)
+        # Gains in V/A, ki for one sample.
+        self.ki = motor.resistance * share
+        self.kp = self.ki / math.expm1(motor.resistance * sample / motor.inductance)
         self._current = self._integral = 0.0
 
     def torque(self, desired: float, speed: float) -> float:
-        """Mean torque [N*m] of the next step at the rotor, behind the gear, of a desired one at a speed [rad/s]."""
+        """Return the rotor's mean torque in the next step, after gear losses.
+
+        Args:
+            desired: desired torque at the rotor [N*m].
+            speed: speed of the rotor [rad/s].
+        """
         motor, charge, current, integral = self._motor, 0.0, self._current, self._integral
-        (decay, _, effect), (kept, _, passed) = self._winding
-        back_emf, kp, ki, most = motor.back_emf_constant * speed, self.kp, self.ki, self._voltage
-        reference = min(max(desired / motor.torque_constant, -self._most), self._most)
+        (decay, _, effect), (charge_per_current, _, charge_per_volt) = self._winding
+        back_emf, kp, ki, max_voltage = (
+            motor.back_emf_constant * speed,
+            self.kp,
+            self.ki,
+            self._voltage,
+        )
+        reference = min(max(desired / motor.torque_constant, -self._max_current), self._max_current)
         for _ in range(self._samples):
             error = reference - current
-            asked = kp * error + integral + ki * error + back_emf
-            applied = min(max(asked, -most), most)
-            integral += ki * error + (applied - asked) * ki / (kp + ki)
-            charge += kept * current + passed * (applied - back_emf)
+            voltage = kp * error + integral + ki * error + back_emf
+            applied = min(max(voltage, -max_voltage), max_voltage)
+            integral += ki * error + (applied - voltage) * ki / (kp + ki)
+            charge += charge_per_current * current + charge_per_volt * (applied - back_emf)
             current = decay * current + effect * (applied - back_emf)
         self._current, self._integral = current, integral
         torque = motor.torque_constant * charge / self._timestep
@@ -100,18 +113,19 @@ class Bench:
             if torque * speed > 0.0
             else 1.0 / motor.gear_efficiency - 1.0
         )
-        stops = (
+        # A gear loss can stop the rotor within a step, but not reverse it.
+        stopping = (
             motor.rotor_inertia * abs(speed) / self._timestep if motor.rotor_inertia else math.inf
         )
-        return torque - math.copysign(min(share * abs(torque), stops), speed) * (speed != 0.0)
+        return torque - math.copysign(min(share * abs(torque), stopping), speed) * (speed != 0.0)
 
 
-class Mechanics:
-    """Gymnasium's environment of a task, with what a drive adds to its joint."""
+class JointOracle:
+    """Gymnasium's environment of a task, with the inertia, damping and friction of a drive."""
 
-    def __init__(self, task: Task, one: Drive, timestep: float, integrator: str) -> None:
-        """Of a task with a twin and one motor, at an integration step [s]."""
-        motor, arm = one.motor, one.motor.arm_radius / one.motor.gear_ratio
+    def __init__(self, task: Task, actuator: Drive, timestep: float, integrator: str) -> None:
+        """Prepare a task with a reference environment and one motor; timestep: integration [s]."""
+        motor, arm = actuator.motor, actuator.motor.arm_radius / actuator.motor.gear_ratio
         self._armature, self._damping = (
             motor.rotor_inertia / arm**2,
             motor.viscous_friction / arm**2,
@@ -119,27 +133,25 @@ class Mechanics:
         self._friction = motor.coulomb_friction / arm
         self._task, self._timestep, self._integrator = task, timestep, integrator
         assert task.reference_env is not None
-        self._twin, self._equations, self._at = (
+        self._reference_env, self._equations, self._speed_index = (
             task.reference_env(),
             gymnasium_equations(task),
             task.speed_indices[0],
         )
         _, slope = self._linear(np.zeros(len(task.state_names)))
-        self._softness = (
-            (1.0 - 0.9) / 0.9 * slope / (1.0 + self._armature * slope)
-        )  # solimp's d at 0 is 0.9
-        self._stiffness = 2.0 / (
-            0.95 * max(0.02, 2.0 * timestep)
-        )  # solref's time constant; solimp's largest d
+        # MuJoCo's defaults: impedance d = 0.9 at zero violation (solimp), a time constant of 0.02 s
+        # but at least two steps (solref), and a largest impedance of 0.95.
+        self._softness = (1.0 - 0.9) / 0.9 * slope / (1.0 + self._armature * slope)
+        self._stiffness = 2.0 / (0.95 * max(0.02, 2.0 * timestep))
 
     def _linear(self, state: np.ndarray) -> tuple[float, float]:
-        """The joint's acceleration under no force, and its slope over the force."""
-        free = self._equations(state, 0.0)[self._at]
-        return float(free), float(self._equations(state, 1.0)[self._at] - free)
+        """Return the joint's acceleration under no force, and its slope over the force."""
+        free = self._equations(state, 0.0)[self._speed_index]
+        return float(free), float(self._equations(state, 1.0)[self._speed_index] - free)
 
     def _force(self, state: np.ndarray, force: float) -> float:
-        """The force under which Gymnasium's environment moves as the joint with the rotor does under `force`."""
-        (free, slope), speed = self._linear(state), float(state[self._at])
+        """Return the force that moves the plain environment as `force` moves joint and rotor."""
+        (free, slope), speed = self._linear(state), float(state[self._speed_index])
         force -= self._damping * speed
         smooth = (free + slope * force) / (1.0 + self._armature * slope)
         if self._friction:
@@ -151,11 +163,15 @@ class Mechanics:
         return force - inertia * (free + slope * force) / (1.0 + inertia * slope)
 
     def step(self, state: np.ndarray, force: float) -> np.ndarray:
-        """The state one integration step later, the force [N or N*m] held; in Gymnasium's bounds."""
+        """Return the state after a step under a force [N or N*m], within the bounds."""
         if self._integrator != "rk4":
-            return self._twin(state, self._force(state, force), self._timestep, self._integrator)
+            return self._reference_env(
+                state, self._force(state, force), self._timestep, self._integrator
+            )
         after = rk4(
-            lambda now: self._equations(now, self._force(now, force)), state, [0.0, self._timestep]
+            lambda stage: self._equations(stage, self._force(stage, force)),
+            state,
+            [0.0, self._timestep],
         )
         assert self._task.constrain is not None
         return np.array(self._task.constrain(after, self._timestep))
@@ -165,20 +181,26 @@ _TWIN = "Gymnasium {task.gymnasium_id} with a rotor on its joint, the winding by
 
 
 @check("trajectories", Check("run, {integrator}, {motor}", _TWIN, 1e-9))
-def fitted_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
-    """A run of a task with its drive of `FITTED`, which has that motor, in the engine, under bang-bang commands."""
-    one, generator = fitted(task.name), np.random.default_rng(0)
-    inner, arm, speed = task.motor_inner_steps, one.arm_radius, task.speed_indices[0]
-    longest = round((5e4 if quick else 5e5) / (task.step_duration * one.controller.sample_rate))
-    steps = min(
-        longest,
-        task.max_episode_steps or longest,
-        (task.reference_states and task.reference_states.horizon) or longest,
+def task_motor_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
+    """Compare a task's run with its drive of `TASK_MOTORS`, under random bang-bang commands."""
+    actuator, generator = task_drive(task.name), np.random.default_rng(0)
+    inner_steps, arm, speed_index = task.motor_inner_steps, actuator.arm_radius, task.speed_indices[0]
+    # The oracle computes every sample in Python, so their number is limited.
+    max_steps = round(
+        (5e4 if quick else 5e5) / (task.step_duration * actuator.controller.sample_rate)
     )
-    timestep, state = task.step_duration / inner, task.draw_initial_state(generator, None)
-    physics = MujocoPhysics(SimulationConfig(task, [one], inner, integrator))
+    steps = min(
+        max_steps,
+        task.max_episode_steps or max_steps,
+        (task.reference_states and task.reference_states.horizon) or max_steps,
+    )
+    timestep, state = task.step_duration / inner_steps, task.draw_initial_state(generator, None)
+    physics = MujocoPhysics(SimulationConfig(task, [actuator], inner_steps, integrator))
     physics.reset(state)
-    bench, mechanics = Bench(one, timestep), Mechanics(task, one, timestep, integrator)
+    winding, mechanics = (
+        DriveOracle(actuator, timestep),
+        JointOracle(task, actuator, timestep, integrator),
+    )
     gaps: list[np.ndarray] = []
     names, error = task.state_names, ""
     for force in task.max_force * generator.choice([-1.0, 1.0], steps):
@@ -187,10 +209,14 @@ def fitted_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
         except SimulationDivergedError as diverged:
             error = str(diverged)
             break
-        for _ in range(inner):
-            state = mechanics.step(state, bench.torque(force * arm, state[speed] / arm) / arm)
+        for _ in range(inner_steps):
+            state = mechanics.step(
+                state, winding.torque(force * arm, state[speed_index] / arm) / arm
+            )
         gaps.append(differences(task, physics.state, state))
-    yield Case(gaps, lambda at: f"{names[at % len(names)]} at step {at // len(names) + 1}", steps)
+    yield Case(
+        gaps, lambda index: f"{names[index % len(names)]} at step {index // len(names) + 1}", steps
+    )
     if error:
         yield Case(math.inf, error, 0)
 
@@ -208,35 +234,46 @@ def fitted_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
     ),
 )
 def drive_checks(quick: bool) -> Iterator[tuple[Case, ...]]:
-    """Every motor of the catalogue at held speeds in the engine: against its winding, and in closed form and stepped.
+    """Compare all motors of the catalogue, in the engine at held speeds, with two references.
 
-    Torques are measured against the stall torque: the closed form is good to 1e-13 of it, and so is
-    a sum of samples.
+    The references are the oracle's winding, and the same loops computed sample by sample in the
+    engine instead of in closed form. Errors are relative to the stall torque: the closed form is
+    accurate to 1e-13 of it, and so is a sum of samples.
     """
     timestep, steps, generator = 0.002, 20 if quick else 200, np.random.default_rng(0)
-    given = {"motor": COLD | {"load_inertia": math.inf}, "controller": {"sample_rate": 20e3}}
-    jumping = {name: resolve({"name": name, **given}, None, name) for name in motor_names()}
-    benches = [Bench(one, timestep) for one in jumping.values()]
+    fields = {"motor": NO_HEATING | {"load_inertia": math.inf}, "controller": {"sample_rate": 20e3}}
+    # Designed gains allow the closed form of a whole step. Explicit gains, even of the same values,
+    # make the engine compute every sample.
+    closed_form = {name: resolve({"name": name, **fields}, None, name) for name in motor_names()}
+    oracles = [DriveOracle(actuator, timestep) for actuator in closed_form.values()]
     stepping = [
-        one.replaced({"controller.kp": bench.kp, "controller.ki": bench.ki * 20e3})
-        for one, bench in zip(jumping.values(), benches, strict=True)
+        actuator.replaced({"controller.kp": oracle.kp, "controller.ki": oracle.ki * 20e3})
+        for actuator, oracle in zip(closed_form.values(), oracles, strict=True)
     ]
     stalls = np.array(
-        [one.motor.torque_constant * one.voltage_limit / one.motor.resistance for one in stepping]
+        [
+            actuator.motor.torque_constant * actuator.voltage_limit / actuator.motor.resistance
+            for actuator in stepping
+        ]
     )
-    fastest = np.array([one.voltage_limit / one.motor.back_emf_constant for one in stepping])
-    arms = np.array([one.arm_radius for one in stepping])
+    no_load_speeds = np.array(
+        [actuator.voltage_limit / actuator.motor.back_emf_constant for actuator in stepping]
+    )
+    arms = np.array([actuator.arm_radius for actuator in stepping])
     torques = generator.uniform(-1.5, 1.5, (steps, len(stalls))) * stalls
-    speeds = generator.uniform(-1.0, 1.0, torques.shape) * fastest
+    speeds = generator.uniform(-1.0, 1.0, torques.shape) * no_load_speeds
     ours, stepped = (
-        drive(motors_on(HELD, list(drives), timestep), torques, speeds * arms).torque * arms
-        for drives in (jumping.values(), stepping)
+        simulate(build_rotors(LOCKED, list(drives), timestep), torques, speeds * arms).torque * arms
+        for drives in (closed_form.values(), stepping)
     )
     exact = np.array(
         [
-            [bench.torque(*inputs) for bench, *inputs in zip(benches, *rows, strict=True)]
+            [oracle.torque(*inputs) for oracle, *inputs in zip(oracles, *rows, strict=True)]
             for rows in zip(torques.tolist(), speeds.tolist(), strict=True)
         ]
     )
-    names, gaps = list(jumping), (np.abs(ours - found) / stalls for found in (exact, stepped))
-    yield tuple(Case(found, lambda at: names[at % len(names)]) for found in gaps)
+    names, gaps = (
+        list(closed_form),
+        (np.abs(ours - reference) / stalls for reference in (exact, stepped)),
+    )
+    yield tuple(Case(gap, lambda index: names[index % len(names)]) for gap in gaps)

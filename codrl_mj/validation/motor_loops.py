@@ -1,7 +1,8 @@
-"""The current loop inside MuJoCo against linear systems theory: closed form, scipy and python-control.
+"""Comparison of the current loop inside MuJoCo with linear systems theory.
 
-Each oracle is built from the loop's equations (the paper, Algorithm 1 and appendix) by another
-library and in another form; nothing of `codrl_mj.actuators.current_loop` is in them.
+The oracles are a closed form, scipy and python-control. Each is built from the loop's equations
+(the paper, Algorithm 1 and appendix) by another library and in another form; none of them uses
+`codrl_mj.actuators.current_loop`.
 """
 
 import math
@@ -13,22 +14,30 @@ import numpy as np
 from scipy import linalg, signal
 
 from codrl_mj.actuators import DCMotorActuator
-from codrl_mj.validation.rotors import HELD, Loop, drive, motors_on, run, unlimited
-from codrl_mj.validation.table import Case, Check, Family, check, of_order, order
+from codrl_mj.validation.rotors import (
+    LOCKED,
+    Loop,
+    build_rotors,
+    linear_actuator,
+    simulate,
+    simulate_torques,
+)
+from codrl_mj.validation.table import Case, Check, ConvergenceSeries, check, order_case, order_check
 from codrl_mj.viz.pages.plots import Curve, Plot
 
-# -- The analogue loop that it samples ------------------------------------------------------------------------
+# -- The continuous loop that is sampled -----------------------------------------------------------
 
 
 def closed_form(
     actuator: DCMotorActuator, timestep: float, torques: np.ndarray, speed: float
 ) -> np.ndarray:
-    """Joint torque [N*m] of the analogue loop after each step [s], from rest: the matrix exponential.
+    """Return the joint torque [N*m] of the analog loop after each step [s], by matrix exponential.
 
     L di/dt = u - kE*omega - R*i,  u = kP*e + kI*I + kD*D + kFF*i_ref (+ kE*omega),  dI/dt = e -
     leak*I; with a filter D = (e - y)/Td and dy/dt = D; without one D = de/dt, which adds kD to L,
     and a step of i_ref makes the current jump by kD/(L + kD) of it. The voltage has no limit;
-    desired torques [N*m] are held over each step, and the joint keeps its speed [rad/s].
+    desired torques [N*m] are held over each step, the joint keeps its speed [rad/s], and the loop
+    starts at rest.
     """
     motor, loop = actuator.motor, actuator.controller
     filtered = loop.derivative_time_constant > 0
@@ -37,7 +46,7 @@ def closed_form(
     relaxation = 1 / loop.derivative_time_constant if filtered else 0.0
     voltage = 0.0 if loop.bemf_compensation else -motor.back_emf_constant * speed / motor.arm_radius
     feedback = loop.kp + derivative
-    # columns: current, integral, filtered error, reference, 1
+    # The columns are current, integral, filtered error, reference and the constant 1.
     system = np.zeros((5, 5))
     system[0] = [-motor.resistance - feedback, loop.ki, -derivative, feedback + loop.kff, voltage]
     system[0] /= inertia
@@ -59,46 +68,52 @@ _ORACLE = "matrix exponential of the RL circuit under the analogue PID (scipy.li
 
 @check(
     "motor",
-    order("closed form, order in the substeps", _ORACLE),
+    order_check("closed form, order in the substeps", _ORACLE),
     Check("closed form, limit of small substeps", _ORACLE, 1e-5, "N m"),
 )
-def analogue(loops: Mapping[str, Loop], quick: bool) -> Iterator[tuple[Case, ...]]:
-    """Convergence to the closed form at first order in the substeps, and the limit itself.
+def order_to_closed_form(loops: Mapping[str, Loop], quick: bool) -> Iterator[tuple[Case, ...]]:
+    """Check that the loop converges to the closed form at first order in the substeps.
+
+    The second row of results is the limit itself, by extrapolation.
 
     The limit is Richardson's 2 x(2N) - x(N), whose error is of second order: below 1e-5 of the
     desired 1 N m at the finest substep, 1/100 or less of every time constant here. A parameter off
     by 0.1 % moves it by more.
     """
-    families, limits, where = [], [], []
+    series, limits, descriptions = [], [], []
     for name, loop in loops.items():
         counts = loop.actuator.controller.substeps * 2 ** np.arange(5, 10 if quick else 12)
         steps = max(20, round(1.0 / loop.timestep))
         torques, speed = np.where(np.arange(steps) < steps // 2, 1.0, -0.5), 0.4
         exact = closed_form(loop.actuator, loop.timestep, torques, speed)
         runs = [
-            run(unlimited(loop, int(count)), loop.timestep, torques, np.full(steps, speed))
+            simulate_torques(
+                linear_actuator(loop, int(count)), loop.timestep, torques, np.full(steps, speed)
+            )
             for count in counts
         ]
-        errors = np.array([np.abs(run.torque[:, 0] - exact).max() for run in runs])
-        families.append(Family(name, loop.timestep / counts, errors))
+        errors = np.array([np.abs(record.torque[:, 0] - exact).max() for record in runs])
+        series.append(ConvergenceSeries(name, loop.timestep / counts, errors))
         limit = 2 * runs[-1].torque[:, 0] - runs[-2].torque[:, 0]
-        where.append(f"{name}, extrapolated from {counts[-2]} and {counts[-1]} substeps")
+        descriptions.append(f"{name}, extrapolated from {counts[-2]} and {counts[-1]} substeps")
         limits.append(np.abs(limit - exact).max())
     title = "Torque against the analogue loop's closed form"
-    order = of_order(1.0, families, title, "electrical substep [s]", "largest error [N m]")
-    yield order, Case(limits, lambda at: where[at])
+    order_result = order_case(1.0, series, title, "electrical substep [s]", "largest error [N m]")
+    yield order_result, Case(limits, lambda index: descriptions[index])
 
 
-# -- The sampled loop as a state-space system ----------------------------------------------------------------
+# -- The sampled loop as a state-space system ------------------------------------------------------
 
 
 def sampled_system(actuator: DCMotorActuator, timestep: float) -> Any:
-    """The loop sampled at its electrical step: inputs (i_ref, shaft speed), output the next current; a `dlti`."""
+    """Return the loop sampled at its electrical step, as a `dlti`.
+
+    Inputs are the reference current and the shaft speed, the output is the next current.
+    """
     motor, loop = actuator.motor, actuator.controller
     dt = timestep / loop.substeps
-    current, integral, past, reference, speed = np.eye(
-        5
-    )  # each signal as a row over (i, I, e_past, i_ref, omega)
+    # Each signal is a row of coefficients of (i, I, e_past, i_ref, omega).
+    current, integral, past, reference, speed = np.eye(5)
     error = reference - current
     integral = (integral + dt * error) / (1 + loop.integral_leak * dt)
     derivative = (error - past) / (dt + loop.derivative_time_constant)
@@ -120,15 +135,18 @@ def sampled_system(actuator: DCMotorActuator, timestep: float) -> Any:
     ),
 )
 def random_torques(loops: Mapping[str, Loop], steps: int) -> Iterator[Case]:
-    """Random desired torques and speeds: equal to rounding, which a stable loop does not amplify; tolerance 1e-10."""
+    """Compare the torque under random desired torques and speeds.
+
+    Tolerance 1e-10: a stable loop does not amplify rounding errors.
+    """
     for name, loop in loops.items():
         generator = np.random.default_rng(0)
         torques = np.repeat(generator.uniform(-1.0, 1.0, steps // 5), 5)
         speeds = generator.uniform(-3.0, 3.0, len(torques))
         substeps = loop.actuator.controller.substeps
-        actuator = unlimited(loop, substeps)
+        actuator = linear_actuator(loop, substeps)
         motor = actuator.motor
-        measured = run(actuator, loop.timestep, torques, speeds).torque[:, 0]
+        measured = simulate_torques(actuator, loop.timestep, torques, speeds).torque[:, 0]
         references = torques * motor.arm_radius / motor.torque_constant
         inputs = np.column_stack([references, speeds / motor.arm_radius]).repeat(substeps, axis=0)
         _, currents, _ = signal.dlsim(sampled_system(actuator, loop.timestep), inputs)
@@ -148,23 +166,26 @@ def random_torques(loops: Mapping[str, Loop], steps: int) -> Iterator[Case]:
         yield Case(errors, where, steps, (plot,) if name == list(loops)[-1] else ())
 
 
-# -- The sampled loop as blocks -------------------------------------------------------------------------------
+# -- The sampled loop as blocks --------------------------------------------------------------------
 
 
 def closed_loop(actuator: DCMotorActuator, timestep: float) -> Any:
-    """python-control's system from desired torque to kT times the current at the step's start, sampled at `timestep`.
+    """Return python-control's discrete system from desired torque to torque at the step's start.
 
+    The torque is kT times the current; the sampling period is `timestep`.
     The winding is python-control's forward-Euler sampling of 1/(L s + R), the integral its
     backward-difference sampling of 1/(s + leak), both as Algorithm 1 has them. The blocks are
     joined as state-space systems: transfer functions of poles close to 1 lose digits when their
     polynomials are multiplied.
     """
     motor, loop = actuator.motor, actuator.controller
-    dt, filtering = timestep, loop.derivative_time_constant  # one electrical step
+    # There is one electrical step in a mechanical step.
+    dt, filtering = timestep, loop.derivative_time_constant
     circuit = control.tf([1.0], [motor.inductance, motor.resistance])
     winding = control.ss(control.sample_system(circuit, dt, method="euler"))
     pid = control.ss([], [], [], loop.kp, dt)
-    if loop.ki > 0:  # a block with no gain would add its pole and nothing else
+    # A block without a gain would add a pole that nothing excites.
+    if loop.ki > 0:
         leaky = control.tf([1.0], [1.0, loop.integral_leak])
         pid = pid + loop.ki * control.ss(control.sample_system(leaky, dt, method="backward_diff"))
     if loop.kd > 0:
@@ -177,16 +198,15 @@ def closed_loop(actuator: DCMotorActuator, timestep: float) -> Any:
     Check("step response", "python-control, step_response of the discrete loop", 1e-10, "N m"),
 )
 def step_response(loops: Mapping[str, Loop]) -> Iterator[Case]:
-    """Equal to rounding; tolerance 1e-10 of the 1 N m desired."""
+    """Compare the step response of each loop; tolerance 1e-10 of the desired 1 N m."""
     for name, loop in loops.items():
         step, actuator = _electrical(loop)
         steps = max(40, round(2.0 / step))
         time = np.arange(1, steps + 1) * step
-        measured = run(actuator, step, np.ones(steps), np.zeros(steps)).torque[:, 0]
+        measured = simulate_torques(actuator, step, np.ones(steps), np.zeros(steps)).torque[:, 0]
         response = control.step_response(closed_loop(actuator, step), np.arange(steps + 1) * step)
-        oracle = np.ravel(response.outputs)[
-            1:
-        ]  # the torque of a step is that of the current at its end
+        # The engine's torque during a step is that of the current at the step's end.
+        oracle = np.ravel(response.outputs)[1:]
         errors = np.abs(measured - oracle)
         curves = (
             Curve("MuJoCo", time, measured),
@@ -205,12 +225,13 @@ _FREQUENCY = "python-control, the discrete loop's frequency response"
     Check("frequency response, phase", _FREQUENCY, 1e-5, "deg"),
 )
 def frequency_response(loops: Mapping[str, Loop], frequencies: int) -> Iterator[tuple[Case, ...]]:
-    """Magnitude and phase of desired -> actual torque, from sines driven through MuJoCo, one motor a frequency.
+    """Compare magnitude and phase from desired to actual torque, measured with sines in MuJoCo.
 
-    A sampled loop has an exact frequency response, so what is left is the transient, waited out
-    until it is 1e-10 of the amplitude, and the least-squares fit's rounding: 1e-6 dB and 1e-5
-    degrees, far within the 0.1 dB and 0.5 degrees at which an engineer would call two Bode plots
-    equal. A gain off by 0.1 % shows some 1e-3 dB; a step of delay shows up to 180 degrees.
+    Each frequency has its own motor. A sampled loop has an exact frequency response, so the
+    remaining errors are the transient, which has decayed to 1e-10 of the amplitude, and the
+    rounding of the least-squares fit: 1e-6 dB and 1e-5 degrees, far within the 0.1 dB and 0.5
+    degrees at which an engineer would call two Bode plots equal. A gain error of 0.1 % shows as
+    some 1e-3 dB, a step of delay as up to 180 degrees.
     """
     quantities: tuple[tuple[str, str, Callable[[np.ndarray], np.ndarray]], ...] = (
         ("magnitude", "dB", lambda response: 20 * np.log10(np.abs(response))),
@@ -220,43 +241,56 @@ def frequency_response(loops: Mapping[str, Loop], frequencies: int) -> Iterator[
     for name, loop in loops.items():
         step, actuator = _electrical(loop)
         nyquist = 0.5 / step
-        tested = np.geomspace(0.005 * nyquist, 0.97 * nyquist, frequencies)
+        tested_frequencies = np.geomspace(0.005 * nyquist, 0.97 * nyquist, frequencies)
         system = closed_loop(actuator, step)
-        rotation = np.exp(2j * np.pi * tested * step)
-        oracle = (
-            system(rotation) * rotation
-        )  # the torque of a step is that of the current at its end
+        rotation = np.exp(2j * np.pi * tested_frequencies * step)
+        # The engine's torque during a step is that of the current at the step's end.
+        oracle = system(rotation) * rotation
         ratio = (
-            _measured_response(actuator, step, tested, np.abs(control.poles(system)).max()) / oracle
+            _measured_response(
+                actuator, step, tested_frequencies, np.abs(control.poles(system)).max()
+            )
+            / oracle
         )
         cases = []
-        for (quantity, unit, of), lines in zip(quantities, curves, strict=True):
-            error = np.abs(of(ratio))
-            at = tested[int(np.argmax(error))]
-            lines.append(Curve(f"{name}, MuJoCo", tested, of(ratio * oracle)))
-            lines.append(Curve(f"{name}, python-control", tested, of(oracle), reference=True))
+        for (quantity, unit, quantity_of), lines in zip(quantities, curves, strict=True):
+            error = np.abs(quantity_of(ratio))
+            worst_frequency = tested_frequencies[int(np.argmax(error))]
+            lines.append(Curve(f"{name}, MuJoCo", tested_frequencies, quantity_of(ratio * oracle)))
+            lines.append(
+                Curve(
+                    f"{name}, python-control",
+                    tested_frequencies,
+                    quantity_of(oracle),
+                    reference=True,
+                )
+            )
             title = f"Frequency response, desired to actual torque: {quantity}"
-            plot = Plot(
-                title, "frequency [Hz]", f"{quantity} [{unit}]", tuple(lines), x_log=True
-            )  # of all loops
-            where = f"{name}, {at:.3g} Hz ({at / nyquist:.3g} of Nyquist)"
+            # The lines of all loops up to this one; the last plot has all of them.
+            plot = Plot(title, "frequency [Hz]", f"{quantity} [{unit}]", tuple(lines), x_log=True)
+            where = f"{name}, {worst_frequency:.3g} Hz ({worst_frequency / nyquist:.3g} of Nyquist)"
             cases.append(Case(error, where, plots=(plot,) if name == list(loops)[-1] else ()))
         yield tuple(cases)
 
 
 def _electrical(loop: Loop) -> tuple[float, DCMotorActuator]:
-    """The loop at its electrical step: the step, and the actuator with one of them to a mechanical step."""
-    return loop.timestep / loop.actuator.controller.substeps, unlimited(loop, 1)
+    """Return the loop's electrical step [s] and its actuator with one substep."""
+    return loop.timestep / loop.actuator.controller.substeps, linear_actuator(loop, 1)
 
 
 def _measured_response(
     actuator: DCMotorActuator, step: float, frequencies: np.ndarray, slowest: float
 ) -> np.ndarray:
-    """Complex amplitudes of the torques in MuJoCo under cosines of 1 N m; the slowest pole says how long to wait."""
+    """Return the complex amplitudes of the torques in MuJoCo under cosines of 1 N m.
+
+    `slowest` is the magnitude of the slowest pole, which gives the duration of the transient.
+    """
     settle = math.ceil(math.log(1e-10) / math.log(min(max(slowest, 0.5), 0.9999)))
     phases = 2 * np.pi * frequencies * step * np.arange(settle + 1200)[:, np.newaxis]
-    model = motors_on(HELD, [actuator] * len(frequencies), step)
-    torque = drive(model, np.cos(phases) * actuator.motor.arm_radius, np.zeros(len(phases))).torque
+    model = build_rotors(LOCKED, [actuator] * len(frequencies), step)
+    torque = simulate(
+        model, np.cos(phases) * actuator.motor.arm_radius, np.zeros(len(phases))
+    ).torque
     amplitudes = []
     for phase, values in zip(phases[settle:].T, torque[settle:].T, strict=True):
         (cosine, sine), *_ = np.linalg.lstsq(
@@ -267,7 +301,7 @@ def _measured_response(
 
 
 def sampled_checks(loops: Mapping[str, Loop], quick: bool) -> Iterator[Check]:
-    """What any stable loop is compared with, each check over all the given loops."""
+    """Run the checks that apply to any stable loop, each over all loops."""
     yield from random_torques(loops, 200 if quick else 1000)
     yield from step_response(loops)
     yield from frequency_response(loops, 8 if quick else 24)

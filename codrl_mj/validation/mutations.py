@@ -1,7 +1,7 @@
-"""The certificate put to the test: faults that somebody could have made, each of which must fail a named check.
+"""Mutation tests of the certificate: deliberate faults, each of which must fail a check.
 
-A fault is made in a model, in the package's own source text (an edit, compiled anew), or in how a
-simulation is driven, and is undone when the `with` block ends.
+A fault is made in a model, in the package's source text (an edit that is compiled), or in the
+stepping of a simulation, and is undone at the end of a `with` block.
 """
 
 import contextlib
@@ -41,7 +41,8 @@ Fault = contextlib.AbstractContextManager[object]
 
 @contextlib.contextmanager
 def _everywhere(name: str, original: Any, wrong: Any) -> Iterator[None]:
-    """Replace `original` by `wrong` in every module of the package that knows it as `name`."""
+    """Replace `original` by `wrong` in every module of the package that has it as `name`."""
+    # Modules that ran `from … import …` hold their own references.
     modules = [module for key, module in sys.modules.items() if key.startswith("codrl_mj")]
     with contextlib.ExitStack() as stack:
         for module in modules:
@@ -50,29 +51,30 @@ def _everywhere(name: str, original: Any, wrong: Any) -> Iterator[None]:
         yield
 
 
-# -- in a model ---------------------------------------------------------------------------------------------
+# -- in a model ------------------------------------------------------------------------------------
 
 
 Part = tuple[str, int | tuple[int, int] | None, float]
-"""(array of a model or its options, where in it, factor); of a plain number the place is None."""
+"""(array of a model or its options, index in it, factor); the index of a plain number is None."""
 
 
 @contextlib.contextmanager
 def wrong_model(*parts: Part) -> Iterator[None]:
-    """Every task's model is compiled with these parts of it scaled, those that it has."""
+    """Scale parts of every task's model; parts that a model does not have are skipped."""
     build = mjcf.task_model
 
     def build_wrong(*arguments: Any, **options: Any) -> mujoco.MjModel:
         model = build(*arguments, **options)
-        for field, at, factor in parts:
+        for field, index, factor in parts:
             owner = model.opt if hasattr(model.opt, field) else model
-            if at is None:
+            if index is None:
                 setattr(owner, field, getattr(owner, field) * factor)
             elif getattr(owner, field).size:
-                getattr(owner, field)[at] *= factor
+                getattr(owner, field)[index] *= factor
         return model
 
-    bare_model.cache_clear()  # what is kept of right models, and of wrong ones after it
+    # Models are cached: correct ones from before, and wrong ones from within the block.
+    bare_model.cache_clear()
     try:
         with _everywhere("task_model", build, build_wrong):
             yield
@@ -80,16 +82,18 @@ def wrong_model(*parts: Part) -> Iterator[None]:
         bare_model.cache_clear()
 
 
-# -- in the source text -------------------------------------------------------------------------------------
+# -- in the source text ----------------------------------------------------------------------------
 
 Edit = tuple[str, str]
-"""(text that occurs once, text to put there)."""
+"""(text that occurs once, its replacement)."""
 
 
-def edited(module: types.ModuleType, edits: Sequence[Edit]) -> types.ModuleType:
-    """A module made anew from another's source text, with the edits made, each of which must occur exactly once.
+def compile_edited(module: types.ModuleType, edits: Sequence[Edit]) -> types.ModuleType:
+    """Return a second copy of a module, compiled from its edited source text.
 
-    Otherwise it is a ValueError: the source has changed, and the mutation must follow.
+    Raises:
+        ValueError: the text of an edit does not occur exactly once. The source has changed, and the
+            mutation must follow it.
     """
     source = inspect.getsource(module)
     for old, new in edits:
@@ -104,20 +108,23 @@ def edited(module: types.ModuleType, edits: Sequence[Edit]) -> types.ModuleType:
 
 
 _HIDDEN = np.zeros(64)
-"""Memory that no simulation owns, one number for each actuator of a model."""
+"""Memory that all simulations share, one number for each actuator of a model."""
 
 
 @cache
 def _wrong_callbacks(edits: tuple[Edit, ...]) -> Callable[[], Any]:
-    wrong = edited(control, edits)
+    """Return the function that compiles the callbacks of the edited source."""
+    wrong = compile_edited(control, edits)
     wrong.HIDDEN = _HIDDEN.ctypes.data  # type: ignore[attr-defined]
     return wrong.compiled_motors
 
 
 @contextlib.contextmanager
 def wrong_callback(*edits: Edit) -> Iterator[None]:
-    """MuJoCo runs a callback that was compiled from edited source."""
+    """Let MuJoCo run a callback that is compiled from edited source."""
     names, _, remedy = control._GROUPS["motor"]
+    # An installed callback stays until it is uninstalled; the next simulation installs the wrong
+    # one.
     engine.uninstall()
     with mock.patch.dict(control._GROUPS, motor=(names, _wrong_callbacks(edits), remedy)):
         try:
@@ -130,8 +137,8 @@ def wrong_callback(*edits: Edit) -> Iterator[None]:
 def _wrong_families(
     module: types.ModuleType, edits: tuple[Edit, ...]
 ) -> tuple[type[ActuatorModel], ...]:
-    """The families of a module, made from its edited source."""
-    wrong = vars(edited(module, edits)).values()
+    """Return the actuator families of a module, compiled from its edited source."""
+    wrong = vars(compile_edited(module, edits)).values()
     return tuple(
         kind
         for kind in wrong
@@ -145,9 +152,10 @@ def _wrong_families(
 def wrong_loop(
     *edits: Edit, module: types.ModuleType = current_loop, everywhere: bool = False
 ) -> Iterator[None]:
-    """The callback runs a loop that was compiled from edited source; in Python it stays what it is.
+    """Let the callback run a loop that is compiled from edited source; plain Python stays correct.
 
-    With `everywhere` the plain-Python loop shares the fault: comparing the two cannot show it.
+    With `everywhere` the plain-Python loop has the same fault, so that a comparison of the two
+    cannot show it.
     """
     with contextlib.ExitStack() as stack:
         for family in _wrong_families(module, edits):
@@ -196,43 +204,46 @@ _SHARED_CURRENT: tuple[Edit, ...] = (
 )
 
 
-# -- in how a simulation is driven --------------------------------------------------------------------------
+# -- in the stepping of a simulation ---------------------------------------------------------------
 
 
 _STEP, _MAKE, _RESET = MujocoPhysics.step, MujocoPhysics.__init__, MujocoPhysics.reset
 
 
 def _late(self: Any, desired_force: float) -> Any:
+    """Take a step with the command of the step before."""
     force, self.waiting = getattr(self, "waiting", 0.0), desired_force
     return _STEP(self, force)
 
 
-def _explicit(self: Any, plant: Any) -> None:
-    other = "semi-implicit" if plant.integrator == "euler" else "euler"
-    _MAKE(self, dataclasses.replace(plant, integrator=other))
+def _explicit(self: Any, config: Any) -> None:
+    """Create the physics with the other Euler integrator."""
+    wrong_integrator = "semi-implicit" if config.integrator == "euler" else "euler"
+    _MAKE(self, dataclasses.replace(config, integrator=wrong_integrator))
 
 
 def _warm(self: Any, state: np.ndarray, key: float = 0.0) -> None:
+    """Reset the mechanics but not the motor."""
     motor = self.data.act.copy()
     _RESET(self, state, key)
     self.data.act[:] = motor
 
 
-# -- the list -----------------------------------------------------------------------------------------------
+# -- the list --------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class Mutation:
-    """A fault on purpose."""
+    """A deliberate fault."""
 
     name: str
-    """What is wrong."""
+    """Short description of the fault."""
     apply: Callable[[], Fault]
-    """Makes it, for the length of a `with` block."""
+    """Function that makes the fault for the duration of a `with` block."""
     groups: tuple[str, ...]
-    """The groups of checks that it is shown to."""
+    """Groups of checks that run with the fault."""
     tasks: tuple[str, ...] = tuple(task.name for task in PAPER_TASKS)
-    """The tasks in which it is a fault."""
+    """Tasks in which the fault has an effect."""
 
 
 _PHYSICS = ("dynamics", "trajectories")
@@ -244,8 +255,10 @@ _UNEQUAL_GAINS = tuple(
 _BOUNDED = tuple(task.name for task in PAPER_TASKS if task.constrain is not None)
 _RUNGE_KUTTA = tuple(task.name for task in PAPER_TASKS if "rk4" in task.integrators)
 _TURNING = ("pendulum", "cartpole", "acrobot")
-"""Where back-EMF counts: gains that follow the winding hide it from anything else, and the cars'
-motors hardly turn (a difference of 3e-10, where 1e-9 is allowed).
+"""Tasks whose runs show the back-EMF.
+
+Gains that follow the winding hide a wrong resistance from everything but the back-EMF, and the
+motors of the mountain cars hardly turn (a difference of 3e-10, where 1e-9 is allowed).
 """
 
 
@@ -346,33 +359,34 @@ MUTATIONS: tuple[Mutation, ...] = (
         ("execution",),
     ),
 )
-"""Every fault, and which groups are shown it."""
+"""All faults, with the groups of checks that run with them."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Caught:
-    """What a mutation did to the certificate."""
+class MutationResult:
+    """Result of the certificate under a mutation."""
 
     mutation: str
-    """Its name."""
+    """Name of the mutation."""
     task: str
-    """The task it was made in; empty for checks that need none."""
+    """Task with the fault; empty for checks that need no task."""
     failed: tuple[Check, ...]
-    """The checks that failed."""
-    made: int
-    """How many checks it was shown to."""
+    """Checks that failed."""
+    num_checks: int
+    """Number of checks that were run."""
 
     @property
-    def clearest(self) -> Check | None:
-        """The failed check that is farthest beyond its tolerance, a NaN being infinitely far; None if none failed."""
-        return max(self.failed, key=lambda check: check.beyond, default=None)
+    def clearest_failure(self) -> Check | None:
+        """Failed check that exceeds its tolerance by the largest ratio; None if none failed."""
+        return max(self.failed, key=lambda check: check.tolerance_ratio, default=None)
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """A fault may well overflow: that is what its checks are to say, and no warning besides."""
+    """Suppress warnings of overflows, which a fault may cause; the checks report them."""
     handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)  # its own prints and writes a file
+    # MuJoCo's default handler prints each warning and writes a log file.
+    mujoco.set_mju_user_warning(lambda _: None)
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore", RuntimeWarning)
@@ -381,14 +395,16 @@ def _quiet() -> Iterator[None]:
         mujoco.set_mju_user_warning(handler)
 
 
-def faulty(tasks: str | Sequence[str] | None = None) -> list[str]:
-    """The names of the tasks that faults are made in, all that there are or those given, which must be ours."""
+def mutation_tasks(tasks: str | Sequence[str] | None = None) -> list[str]:
+    """Return the names of the tasks in which faults are made; None selects all built-in tasks.
+
+    Raises:
+        ValueError: a task is not built in.
+    """
     names = [tasks] if isinstance(tasks, str) else list(tasks or Mutation.tasks)
     for name in names:
         if find_task(name) not in PAPER_TASKS:
-            raise ValueError(
-                f"task {name!r}: faults are made in these alone: {', '.join(Mutation.tasks)}"
-            )
+            raise ValueError(f"task {name!r}: faults are made only in {', '.join(Mutation.tasks)}")
     return names
 
 
@@ -396,18 +412,18 @@ def try_mutations(
     tasks: str | Sequence[str] | None = None,
     mutations: Sequence[Mutation] = MUTATIONS,
     on_part: Progress = ignore_progress,
-) -> list[Caught]:
-    """Make each fault in turn and see which checks of the quick certificate fail.
+) -> list[MutationResult]:
+    """Make each fault in turn and return the checks of the quick certificate that fail.
 
     Args:
-        tasks: a task of ours, several, or None for all of them.
-        mutations: the faults.
-        on_part: called as each begins, with (done, in all, name).
+        tasks: name of a built-in task, several names, or None for all.
+        mutations: faults to make.
+        on_part: progress callback, called before each fault with (finished, total, name).
 
     Raises:
-        ValueError: see `faulty`.
+        ValueError: see `mutation_tasks`.
     """
-    names = faulty(tasks)
+    names = mutation_tasks(tasks)
     results = []
     for index, mutation in enumerate(mutations):
         on_part(index, len(mutations), mutation.name)
@@ -417,20 +433,24 @@ def try_mutations(
         with mutation.apply(), _quiet():
             certificate = validate(affected, quick=True, groups=mutation.groups)
         for task in ([""] if set(WITHOUT_TASK) & set(mutation.groups) else []) + affected:
-            made = [check for check in certificate.checks if check.task == task]
-            failed = tuple(check for check in made if not check.passed)
-            results.append(Caught(mutation.name, task, failed, len(made)))
+            checks = [check for check in certificate.checks if check.task == task]
+            failed = tuple(check for check in checks if not check.passed)
+            results.append(MutationResult(mutation.name, task, failed, len(checks)))
     on_part(len(mutations), len(mutations), "done")
     return results
 
 
-def as_mapping(certificate: Certificate, caught: Sequence[Caught]) -> dict[str, Any]:
-    """What faults did, for JSON, beside what the certificate has; nothing where none was made."""
+def as_mapping(certificate: Certificate, results: Sequence[MutationResult]) -> dict[str, Any]:
+    """Return the results of the faults for JSON, beside the certificate's; empty without faults."""
     rows: list[dict[str, Any]] = []
-    for one in caught:
-        row: dict[str, Any] = {"mutation": one.mutation, "task": one.task, "made": one.made}
-        row["failed"] = [f"{check.group}: {check.name}" for check in one.failed]
-        if (clearest := one.clearest) is not None:
+    for result in results:
+        row: dict[str, Any] = {
+            "mutation": result.mutation,
+            "task": result.task,
+            "made": result.num_checks,
+        }
+        row["failed"] = [f"{check.group}: {check.name}" for check in result.failed]
+        if (clearest := result.clearest_failure) is not None:
             worst = clearest.worst if math.isfinite(clearest.worst) else str(clearest.worst)
             row |= {
                 "clearest": f"{clearest.group}: {clearest.name}",
@@ -438,14 +458,16 @@ def as_mapping(certificate: Certificate, caught: Sequence[Caught]) -> dict[str, 
                 "allowed": clearest.tolerance,
             }
         rows.append(row)
-    blind = [
+    undetected = [
         f"{check.group}: {check.task}: {check.name}"
-        for check in unfailed(certificate.checks, caught)
+        for check in undetected_checks(certificate.checks, results)
     ]
-    return {"mutations": rows, "failed by no mutation": blind} if rows else {}
+    return {"mutations": rows, "failed by no mutation": undetected} if rows else {}
 
 
-def unfailed(checks: Sequence[Check], caught: Sequence[Caught]) -> list[Check]:
-    """The checks that no mutation fails: they show nothing, and should go."""
-    seen = {(check.group, check.task, check.name) for outcome in caught for check in outcome.failed}
-    return [check for check in checks if (check.group, check.task, check.name) not in seen]
+def undetected_checks(checks: Sequence[Check], results: Sequence[MutationResult]) -> list[Check]:
+    """Return the checks that no mutation fails: they show nothing and should be removed."""
+    failed = {
+        (check.group, check.task, check.name) for outcome in results for check in outcome.failed
+    }
+    return [check for check in checks if (check.group, check.task, check.name) not in failed]

@@ -1,8 +1,8 @@
-"""The checks that apply to a user's own model, or a task's, with any number of our motors at either door.
+"""Checks of any model with codrl_mj motors, through the callbacks or the plugin.
 
-Actuators of any family run inside the engine, callback and all, beside the same functions in plain
-Python. A function of floats has one result, whoever compiled it: `compiled_checks` has a tolerance
-of no bit.
+Actuators of any family run inside the engine and, for comparison, as the same functions in plain
+Python. A function of floats must have the same result in both: `compiled_checks` tolerates no
+difference of a bit.
 """
 
 import copy
@@ -39,17 +39,25 @@ from codrl_mj.physics import SimulationConfig, install_callbacks, motors
 from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.variation import without_motors
 from codrl_mj.tasks import find_task, resolve_actuators
-from codrl_mj.validation.compare import STAND_IN, actuators_of
-from codrl_mj.validation.execution import UNIT, commands, differing
-from codrl_mj.validation.rotors import EVERY_FEATURE, SWINGING, Loop, motors_on
+from codrl_mj.validation.compare import FALLBACK_ACTUATOR, paper_actuators
+from codrl_mj.validation.execution import UNIT, commands, differs
+from codrl_mj.validation.rotors import EVERY_FEATURE, SWINGING, Loop, build_rotors
 from codrl_mj.validation.table import Case, Check, Skipped, check
 
 STEP_TOLERANCE = 1e-11
-"""The compiled loop may fuse a multiplication with an addition: 1e-16 a step, which a slow loop adds up."""
+"""Tolerance between compiled and plain-Python loops.
+
+The compiler may fuse a multiplication with an addition: 1e-16 a step, which a slow loop adds up.
+"""
 
 
-def load(path: Path) -> mujoco.MjModel:
-    """Compile an MJCF file; a FileNotFoundError or a ValueError where there is none that MuJoCo takes."""
+def load_model(path: Path) -> mujoco.MjModel:
+    """Compile an MJCF file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: MuJoCo cannot compile the model.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"no model at {path}")
     try:
@@ -58,84 +66,105 @@ def load(path: Path) -> mujoco.MjModel:
         raise ValueError(f"{path}: MuJoCo cannot compile this model: {error}") from None
 
 
-UNKNOWN = {
+NOT_APPLICABLE = {
     "dynamics": "no Gymnasium environment has these equations of motion",
     "trajectories": "no Gymnasium environment has these equations of motion",
     "convergence": "there is no second implementation of the mechanics to converge to",
-    "energy": "the losses of joints, contacts and constraints are not modelled here",
+    "energy": "the losses of joints, contacts and constraints are not modeled here",
 }
-"""Groups that need to know more of a model than its motors, and what."""
+"""Group that does not apply to a user's model -> reason."""
 
 
-KEY = SlotHeader._fields.index("noise_key")
+NOISE_KEY = SlotHeader._fields.index("noise_key")
+"""Index of the noise key in a motor's slot."""
 
 
-def entries(actuator: ActuatorModel) -> tuple[str, ...]:
-    """What `beside` compares, by name: states and signals after a step, and the torque that the engine took from it."""
+def compared_names(actuator: ActuatorModel) -> tuple[str, ...]:
+    """Return the names of the values that `compare_with_python` compares.
+
+    They are the states and signals after a step and the torque that the engine applied.
+    """
+    # mypy does not know the State and Signals classes that each family defines.
     return (*actuator.State._fields, *actuator.Signals._fields, "torque")  # type: ignore[attr-defined]
 
 
-def beside(
+def compare_with_python(
     model: mujoco.MjModel, actuators: Mapping[int, ActuatorModel], controls: np.ndarray
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Run a model from rest, and each actuator in Python under the inputs that the engine had for it.
+    """Run a model from rest, and each actuator in plain Python under the same inputs.
 
-    The actuators in Python, by index in the model, start at rest and are never corrected. At the
-    plugin's door the desired force is what the engine made of the model's actuator; at the
-    callback's it is the control itself, of shape (steps, nu). By index: what was found in the
-    engine and in Python, of shape (steps, k), columns as in `entries`.
+    The actuators in Python start at rest and are never corrected. With the plugin, the desired
+    force is the engine's force of the model's actuator; with the callbacks, it is the control.
+
+    Args:
+        model: a model with installed callbacks.
+        actuators: actuator by its index in the model.
+        controls: controls, shape (steps, nu).
+
+    Returns:
+        By actuator index, the values in the engine and in Python, each of shape (steps, k), with
+        columns as in `compared_names`.
     """
     data = mujoco.MjData(model)
     slot_of = motor_slots(data, actuators)
-    kinds: dict[int, Family] = {at: type(one) for at, one in actuators.items()}
-    parameters = {at: parameters_type(kinds[at])(*one.numbers) for at, one in actuators.items()}
-    states = {at: kind.State(*[0.0] * len(kind.State._fields)) for at, kind in kinds.items()}
-    found = {at: np.empty((2, len(controls), len(entries(one)))) for at, one in actuators.items()}
-    for at in actuators:
-        slot_of[at][KEY] = at + 1.0
+    families: dict[int, Family] = {index: type(actuator) for index, actuator in actuators.items()}
+    parameters = {
+        index: parameters_type(families[index])(*actuator.numbers)
+        for index, actuator in actuators.items()
+    }
+    states = {
+        index: kind.State(*[0.0] * len(kind.State._fields)) for index, kind in families.items()
+    }
+    results = {
+        index: np.empty((2, len(controls), len(compared_names(actuator))))
+        for index, actuator in actuators.items()
+    }
+    for index in actuators:
+        slot_of[index][NOISE_KEY] = index + 1.0
     for step, control in enumerate(controls):
         data.ctrl[:] = control
         before = copy.copy(data)
-        mujoco.mj_forward(
-            model, before
-        )  # what the callback is about to see, and the torque it makes
+        # The copy has the quantities that the callback is about to see, and the resulting torque.
+        mujoco.mj_forward(model, before)
         mujoco.mj_step(model, data)
-        for at, actuator in actuators.items():
-            output = model.actuator_outadr[at]
-            arm = (
-                1.0 if model.actuator_plugin[at] < 0 else actuator.arm_radius
-            )  # the callback's is in the gear
-            moving = (
+        for index, actuator in actuators.items():
+            output = model.actuator_outadr[index]
+            # With the callbacks the arm radius is part of the model's gear.
+            arm = 1.0 if model.actuator_plugin[index] < 0 else actuator.arm_radius
+            motion = (
                 float(before.actuator_length[output]) / arm,
                 float(before.actuator_velocity[output]) / arm,
             )
-            address, limited = model.actuator_ctrladr[at], model.actuator_forcelimited[output]
-            asked, range_ = float(control[address]), model.actuator_ctrlrange[address]
-            asked = float(np.clip(asked, *range_)) if model.actuator_ctrllimited[address] else asked
-            if model.actuator_plugin[at] < 0 or actuator.MOTION:
-                desired = asked / arm
+            address, limited = model.actuator_ctrladr[index], model.actuator_forcelimited[output]
+            command, range_ = float(control[address]), model.actuator_ctrlrange[address]
+            command = (
+                float(np.clip(command, *range_)) if model.actuator_ctrllimited[address] else command
+            )
+            if model.actuator_plugin[index] < 0 or actuator.MOTION:
+                desired = command / arm
             else:
-                desired = float(slot_of[at][slot_size(kinds[at])]) * arm
+                desired = float(slot_of[index][slot_size(families[index])]) * arm
             inertia = (
                 shaft_inertia(model, before, output, 1.0 / arm) if actuator.INERTIA else math.inf
             )
-            inputs = Inputs(desired, *moving, before.time, at + 1.0, inertia)
-            states[at], torque, signals = actuator.advance(
-                parameters[at], model.opt.timestep, states[at], inputs
+            inputs = Inputs(desired, *motion, before.time, index + 1.0, inertia)
+            states[index], torque, signals = actuator.advance(
+                parameters[index], model.opt.timestep, states[index], inputs
             )
             torque = (
                 float(np.clip(torque / arm, *model.actuator_forcerange[output]))
                 if limited
                 else torque / arm
             )
-            oracle = [*states[at], *signals, torque]
-            after = SLOT_HEADER_SIZE + len(states[at])  # the candidate state, then the signals
-            found[at][0, step] = (
-                *slot_of[at][after : after + len(oracle) - 1],
+            oracle = [*states[index], *signals, torque]
+            # A slot holds the accepted state, then the candidate state, then the signals.
+            after = SLOT + len(states[index])
+            results[index][0, step] = (
+                *slot_of[index][after : after + len(oracle) - 1],
                 before.actuator_force[output],
             )
-            found[at][1, step] = oracle
-    return {at: (both[0], both[1]) for at, both in found.items()}
+            results[index][1, step] = oracle
+    return {index: (values[0], values[1]) for index, values in results.items()}
 
 
 BELOW_ONE = float(np.nextafter(1.0, 0.0))
@@ -147,11 +176,18 @@ BELOW_ONE = float(np.nextafter(1.0, 0.0))
         "stable: {motor}", "the family's own bound, a loop's eigenvalues", BELOW_ONE, "instability"
     ),
 )
-def stable(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
-    """What the family says of its parameters; of a loop, of which that is infinite from 1 on, the spectral radius."""
-    found = float(actuator.instability(np.array([actuator.numbers]), timestep)[0])
-    radius = spectral_radius(actuator, timestep) if isinstance(actuator, DCMotorActuator) else found
-    yield Case(max(found, radius) if radius < 1.0 else radius, f"at a step of {timestep:g} s")
+def stability(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
+    """Check the family's measure of instability, and a current loop's spectral radius.
+
+    For an unstable loop only the spectral radius is reported, because its instability is infinite.
+    """
+    instability = float(actuator.instability(np.array([actuator.numbers]), timestep)[0])
+    radius = (
+        spectral_radius(actuator, timestep)
+        if isinstance(actuator, DCMotorActuator)
+        else instability
+    )
+    yield Case(max(instability, radius) if radius < 1.0 else radius, f"at a step of {timestep:g} s")
 
 
 @check(
@@ -161,69 +197,89 @@ def stable(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
     ),
 )
 def motor_steps(actuator: ActuatorModel, ours: np.ndarray, oracle: np.ndarray) -> Iterator[Case]:
-    """A motor in the engine against its own in plain Python, driven by the speed that the model itself reached.
+    """Compare a motor in the engine with the same motor in plain Python, at the model's speed.
 
-    The Python motor starts at rest and is never corrected; states and signals are compared after
-    every step, and so is the torque that the engine applied.
+    The Python motor starts at rest and is never corrected; states, signals and the applied torque
+    are compared after every step.
     """
-    names = entries(actuator)
+    names = compared_names(actuator)
     yield Case(
         np.abs(ours - oracle) / np.maximum(1.0, np.abs(oracle)),
-        lambda at: f"{names[at % len(names)]} at step {at // len(names) + 1}",
+        lambda index: f"{names[index % len(names)]} at step {index // len(names) + 1}",
     )
 
 
 def motor_checks(model: mujoco.MjModel, quick: bool) -> Iterator[Check | Skipped]:
-    """The motors of a model whose callbacks are installed: stable, in step with Python, and each loop alone."""
-    named = {at: model.actuator(at).name or f"actuator {at}" for at in range(model.nactuator)}
+    """Run the motor checks of a model whose callbacks are installed.
+
+    They check that each motor is stable and equal to plain Python, and the response of each loop.
+    """
+    names = {
+        index: model.actuator(index).name or f"actuator {index}" for index in range(model.nactuator)
+    }
     ours = motors(model)
-    driven = {one for at in ours for one in actuators_sharing_motor(model, at)}
-    if foreign := [model.actuator(at).name or str(at) for at in named if at not in driven]:
+    # Several of the model's actuators may share one motor.
+    with_motor = {shared for index in ours for shared in actuators_sharing_motor(model, index)}
+    if without_motor := [
+        model.actuator(index).name or str(index) for index in names if index not in with_motor
+    ]:
         yield Skipped(
-            f"actuators {', '.join(foreign)}", "not motors of codrl_mj, which leaves them alone"
+            f"actuators {', '.join(without_motor)}",
+            "not motors of codrl_mj, which does not change them",
         )
     for text in describe_duplicate_dynamics(without_motors(model, ours), ours):
         yield Skipped(
-            "whether a motor is counted twice", f"this cannot be seen in a compiled model: {text}"
+            "whether a motor is counted twice", f"a compiled model does not show it: {text}"
         )
     running = {}
-    for at, actuator in ours.items():
-        group = int(model.actuator_group[at])
+    for index, actuator in ours.items():
+        group = int(model.actuator_group[index])
         if 0 <= group < mujoco.mjNGROUP and bool(model.opt.disableactuator >> group & 1):
-            yield Skipped(f"steps: {named[at]}", "its actuator group is disabled: it never runs")
+            yield Skipped(
+                f"steps: {names[index]}", "its actuator group is disabled: the motor never runs"
+            )
         elif isinstance(actuator, Ideal):
-            yield Skipped(f"steps: {named[at]}", "it is ideal: there is nothing to step")
+            yield Skipped(
+                f"steps: {names[index]}", "the actuator is ideal and has no state to compare"
+            )
         else:
-            running[at] = actuator
-    for at, actuator in ours.items():
-        yield from stable(actuator, model.opt.timestep, motor=named[at])
-    for at, found in beside(
+            running[index] = actuator
+    for index, actuator in ours.items():
+        yield from stability(actuator, model.opt.timestep, motor=names[index])
+    for index, values in compare_with_python(
         model, running, commands(model, 200 if quick else 2000, seed=7)
     ).items():
-        yield from motor_steps(running[at], *found, motor=named[at])
+        yield from motor_steps(running[index], *values, motor=names[index])
     loops = {}
-    for at, actuator in ours.items():
+    for index, actuator in ours.items():
         if not isinstance(actuator, DCMotorActuator):
             yield Skipped(
-                f"responses of {named[at]}", "it is no current loop: there is no oracle for it"
+                f"responses of {names[index]}",
+                "the actuator is not a current loop: there is no oracle for it",
             )
         elif spectral_radius(actuator, model.opt.timestep) < 1.0:
-            loops[named[at]] = Loop(actuator, model.opt.timestep)
+            loops[names[index]] = Loop(actuator, model.opt.timestep)
         else:
-            yield Skipped(f"responses of {named[at]}", "its loop is unstable: it has none")
+            yield Skipped(
+                f"responses of {names[index]}", "the loop is unstable: it has no steady response"
+            )
     if loops:
-        from codrl_mj.validation.motor_loops import sampled_checks  # needs scipy and python-control
+        # The import is local because python-control is optional.
+        from codrl_mj.validation.motor_loops import sampled_checks
 
         yield from sampled_checks(loops, quick)
 
 
 def checks(task_name: str, quick: bool = False) -> Iterator[Check | Skipped]:
-    """The checks of a task's own motors, in its model."""
+    """Run the motor checks of a task's model."""
     task = find_task(task_name)
     if not task.paper:
-        yield Skipped("the paper's actuators", f"it has none: the {STAND_IN} is in their place")
+        yield Skipped(
+            "the paper's actuators",
+            f"the task has none: the {FALLBACK_ACTUATOR} is checked instead",
+        )
     actuators = (
-        actuators_of(task) if task.actuator == "ideal" else resolve_actuators("default", task)
+        paper_actuators(task) if task.actuator == "ideal" else resolve_actuators("default", task)
     )
     model = task_model(SimulationConfig(task, actuators, task.motor_inner_steps))
     install_callbacks(model)
@@ -239,33 +295,40 @@ EXAMPLES: tuple[ActuatorModel, ...] = (
     TorqueSpeed(stall_torque=0.2, no_load_speed=1.0, max_torque=0.2),
     Drive(GearMotor(gear_ratio=3.0), SampledLoop(sample_rate=10e3, max_current=4.0), Supply(6.0)),
 )
-"""Actuators in which every parameter counts and limits are reached, of those families whose defaults do not show it."""
+"""Actuators in which every parameter matters and limits are reached, unlike their defaults."""
 
 
 def compiled_checks(quick: bool) -> Iterator[Check]:
-    """`advance` of every family, those that commands leave of it too, on swinging rotors under random torques."""
-    examples = {type(one): one for one in EXAMPLES}
-    named = [
+    """Compare `advance` of every family with plain Python, on swinging rotors under random torques.
+
+    The families behind other commands, such as voltage, are included.
+    """
+    examples = {type(actuator): actuator for actuator in EXAMPLES}
+    registered = [
         examples.get(family) or family() for family in FAMILIES.values() if family is not Ideal
     ]
-    driven = [command.actuator for one in named for command in one.commands().values()]
-    actuators = list({type(one): one for one in (*driven, *named)}.values())
+    commanded = [
+        command.actuator for actuator in registered for command in actuator.commands().values()
+    ]
+    actuators = list({type(actuator): actuator for actuator in (*commanded, *registered)}.values())
     for actuator in actuators:
         load_family(type(actuator))
-    model = motors_on(SWINGING, actuators, 0.01)
-    found = beside(
+    model = build_rotors(SWINGING, actuators, 0.01)
+    values = compare_with_python(
         model, dict(enumerate(actuators)), commands(model, 200 if quick else 2000, seed=7)
     )
-    for at, actuator in enumerate(actuators):
-        yield from compiled_advance(entries(actuator), *found[at], family=type(actuator).__name__)
+    for index, actuator in enumerate(actuators):
+        yield from compiled_advance(
+            compared_names(actuator), *values[index], family=type(actuator).__name__
+        )
 
 
 @check("motor", Check("compiled advance: {family}", "the same function in plain Python", 0.0, UNIT))
 def compiled_advance(
     names: tuple[str, ...], compiled: np.ndarray, python: np.ndarray
 ) -> Iterator[Case]:
-    """Floats that differ, of shape (steps, names), and the first of them."""
-    unequal = differing(compiled, python)
+    """Count the floats of shape (steps, names) that differ, and report the first of them."""
+    unequal = differs(compiled, python)
     step, entry = divmod(int(np.argmax(unequal)), len(names))
     first = f"the first of them at step {step + 1}: {names[entry]}"
     yield Case(float(unequal.sum()), lambda _: first, unequal.size)

@@ -1,4 +1,4 @@
-"""The bench: small MuJoCo models of motors, ours and MuJoCo's own, current loops to try, and a way to drive them."""
+"""Test bench: small MuJoCo models of codrl_mj's and MuJoCo's motors, and current loops to test."""
 
 import dataclasses
 import math
@@ -16,29 +16,30 @@ from codrl_mj.tasks import PAPER_TASKS
 
 @dataclasses.dataclass(frozen=True)
 class Rotor:
-    """What a motor turns in a test of it."""
+    """Load of a motor in a test."""
 
     name: str
-    """Its name in reports."""
+    """Name in reports."""
     inertia: float
-    """About the joint's axis, without the eccentric mass [kg*m^2]."""
+    """Inertia about the joint's axis, without the eccentric mass [kg*m^2]."""
     eccentric: bool = False
-    """Whether 0.5 kg hang 0.2 m off the axis, under gravity."""
+    """True if a mass of 0.5 kg hangs 0.2 m off the axis, under gravity."""
 
 
-HELD = Rotor("locked rotor", 1e15)
-"""Keeps its speed, whatever the torque: 1 N*m over 100 s changes it by 1e-13 rad/s."""
+LOCKED = Rotor("locked rotor", 1e15)
+"""Rotor of constant speed: a torque of 1 N*m over 100 s changes it by 1e-13 rad/s."""
 FREE = Rotor("free spinning", 0.2)
-"""A rotor and nothing else."""
+"""Rotor without a load."""
 SWINGING = Rotor("swinging load", 0.2, eccentric=True)
-"""A rotor with a bob, under gravity."""
+"""Rotor with an eccentric mass, under gravity."""
 
 
-_BODY_INERTIA = 0.01  # kg*m^2, part of the rotor's
+_BODY_INERTIA = 0.01
+"""Part of the rotor's inertia that the body has [kg*m^2]; the rest is the joint's armature."""
 
 
 class Record(NamedTuple):
-    """What was seen after each step, shape (steps, motors)."""
+    """Quantities after each step, each of shape (steps, motors)."""
 
     angle: np.ndarray
     """Joint angles [rad]."""
@@ -47,19 +48,19 @@ class Record(NamedTuple):
     current: np.ndarray
     """Motor currents [A]."""
     torque: np.ndarray
-    """Torques that the engine applied to the joints *during* the step [N*m], its `qfrc_actuator`."""
+    """Torques on the joints *during* the step [N*m], the engine's `qfrc_actuator`."""
 
 
-def motors_on(
+def build_rotors(
     rotor: Rotor,
     motors: Sequence[ActuatorModel | Motor],
     timestep: float,
     integrator: str = "Euler",
 ) -> mujoco.MjModel:
-    """Motors, each on a rotor of its own: ours, with the callbacks installed, or MuJoCo's `<dcmotor>` of a winding.
+    """Return a model of motors, each on a separate rotor, with the callbacks installed.
 
-    Where a `Motor` is given in the place of an actuator, it is MuJoCo's, and its control is the
-    terminal voltage [V].
+    An actuator becomes a codrl_mj motor. A `Motor` becomes MuJoCo's `<dcmotor>`, whose control is
+    the terminal voltage [V].
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = timestep
@@ -86,8 +87,10 @@ def motors_on(
     return model
 
 
-def driven_by_voltage(motor: Motor, substeps: int = 1) -> DCMotorActuator:
-    """A motor of ours whose control is its terminal voltage: a feed-forward of kT*i_ref, which is the control."""
+def voltage_actuator(motor: Motor, substeps: int = 1) -> DCMotorActuator:
+    """Return a codrl_mj motor whose control is its terminal voltage."""
+    # The reference current is the control over kT, so a feed-forward gain of kT gives the control
+    # itself as the voltage.
     return DCMotorActuator(
         motor,
         CurrentLoop(
@@ -100,18 +103,25 @@ def driven_by_voltage(motor: Motor, substeps: int = 1) -> DCMotorActuator:
     )
 
 
-def drive(model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None = None) -> Record:
-    """Run a model of this module from rest, of motors with a current.
+def simulate(
+    model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None = None
+) -> Record:
+    """Simulate a model of `build_rotors` from rest and record it.
 
-    Controls are of shape (steps,) for all alike or (steps, motors); joint speeds [rad/s], shape
-    (steps,), are set before each step, or left to the engine.
+    Args:
+        model: a model whose motors all have a current.
+        controls: controls, shape (steps,) for all motors or (steps, motors).
+        speeds: joint speeds [rad/s], shape (steps,) or (steps, motors), set before each step; None
+            leaves them to the engine.
     """
     data = mujoco.MjData(model)
+    # The current is the first signal in a slot of codrl_mj, and the only activation of a native
+    # <dcmotor>.
     entry = (
         signals_offset(DCMotorActuator)
         if model.na == model.nactuator * slot_size(DCMotorActuator)
         else 0
-    )  # current comes first
+    )
     currents = np.asarray(model.actuator_actadr) + entry
     rows = np.empty((len(controls), 4, model.nv))
     for row, control, speed in zip(
@@ -130,11 +140,11 @@ def drive(model: mujoco.MjModel, controls: np.ndarray, speeds: np.ndarray | None
     return Record(*rows.swapaxes(0, 1))
 
 
-# -- current loops --------------------------------------------------------------------------------------------
+# -- current loops ---------------------------------------------------------------------------------
 
 
 class Loop(NamedTuple):
-    """A motor under its current loop, and the step at which it is sampled."""
+    """A motor with its current loop, and the step at which it is simulated."""
 
     actuator: DCMotorActuator
     """Motor and gains."""
@@ -164,11 +174,11 @@ EVERY_FEATURE = Loop(
     ),
     0.01,
 )
-"""A loop in which every parameter counts; nothing hides its back-EMF."""
+"""Loop in which every parameter matters and no compensation hides the back-EMF."""
 
 
 def standard_loops() -> dict[str, Loop]:
-    """The paper's loop of each of our tasks at the task's inner step, and one with every feature."""
+    """Return the paper's loop of each built-in task at its inner step, and `EVERY_FEATURE`."""
     paper = {
         task.name: Loop(task.paper[0], task.step_duration / task.motor_inner_steps)
         for task in PAPER_TASKS
@@ -176,8 +186,8 @@ def standard_loops() -> dict[str, Loop]:
     return {**paper, "every feature": EVERY_FEATURE}
 
 
-def unlimited(loop: Loop, substeps: int) -> DCMotorActuator:
-    """The loop's actuator where it is linear: without limit and sensor errors, with so many electrical substeps."""
+def linear_actuator(loop: Loop, substeps: int) -> DCMotorActuator:
+    """Return the loop's actuator without limits and sensor errors, with a number of substeps."""
     linear = {
         "substeps": substeps,
         "max_voltage": math.inf,
@@ -188,8 +198,10 @@ def unlimited(loop: Loop, substeps: int) -> DCMotorActuator:
     return loop.actuator.replaced({**changes, "supply": None})
 
 
-def run(
+def simulate_torques(
     actuator: DCMotorActuator, timestep: float, torques: np.ndarray, speeds: np.ndarray
 ) -> Record:
-    """Drive one motor in MuJoCo with desired joint torques at joint speeds."""
-    return drive(motors_on(HELD, [actuator], timestep), torques * actuator.motor.arm_radius, speeds)
+    """Simulate one motor in MuJoCo under desired joint torques at joint speeds."""
+    return simulate(
+        build_rotors(LOCKED, [actuator], timestep), torques * actuator.motor.arm_radius, speeds
+    )

@@ -1,7 +1,8 @@
-"""The table of checks, and the one runner: the worst of what a check's cases found, where it was, and its picture.
+"""Table of all checks, and the decorator that evaluates them.
 
-A check is a function of cases: it yields what it compared, case by case, and says nothing of
-verdicts. `check` enters its rows in `TABLE` and makes it one that returns them with what was found.
+A check is a generator function that yields the compared cases and makes no verdict. The decorator
+`check` enters its rows in `TABLE` and turns it into a function that returns these rows with the
+worst case, its description and the plots.
 """
 
 import dataclasses
@@ -16,168 +17,194 @@ import numpy as np
 from codrl_mj.viz.pages.plots import Curve, Plot
 
 ORDER_TOLERANCE = 0.1
-"""Farthest that any end of a slope's 95 % interval may lie from the promised order. A method one
-order worse misses by 1; an error that does not vanish, such as a parameter off by 1 %, bends the
-line until its slope is near 0.
+"""Largest distance of either end of a slope's 95 % interval from the promised order.
+
+A method one order worse misses by 1; an error that does not vanish, such as a parameter off by 1 %,
+bends the line until its slope is near 0.
 """
 
 
 REPORT = "this is a fault of codrl_mj, or of this version of MuJoCo or Gymnasium; please report it"
+"""Likely cause of a failure that a user cannot fix."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """A row of the table, whose name and oracle may hold words in braces; once it was made, what was found."""
+    """A row of the table, and after the check its result.
+
+    In the table, name and oracle may have fields in braces, which the check's arguments fill in.
+    """
 
     name: str
-    """What was compared; stable, such as `one step, euler`, and unique within its group and task."""
+    """Compared quantity, such as `one step, euler`; unique within its group and task."""
     oracle: str
-    """What it was compared with."""
+    """Reference of the comparison."""
     tolerance: float
     """Largest difference allowed."""
     unit: str = "relative"
-    """Unit of `worst` and `tolerance`; `relative` measures each state entry against max(1, its size)."""
+    """Unit of `worst` and `tolerance`; `relative` divides each state entry by max(1, its size)."""
     samples: int = 0
-    """How many comparisons were made."""
+    """Number of comparisons."""
     worst: float = math.nan
-    """Largest difference found."""
+    """Largest difference."""
     where: str = ""
-    """Where the largest difference was found."""
+    """Description of the case with the largest difference."""
     group: str = ""
-    """Which part of the certificate: dynamics, trajectories, convergence, motor, energy or execution."""
+    """Part of the certificate: dynamics, trajectories, convergence, motor, energy or execution."""
     task: str = ""
-    """The task or model it was run on; empty where it needs none."""
+    """Task or model that was checked; empty if the check needs none."""
     plots: tuple[Plot, ...] = ()
-    """What to look at."""
+    """Plots of the comparison."""
     fault: str = ""
-    """Of a check that failed: whose fault that is, and what to do."""
+    """Likely cause of a failure, and its remedy."""
 
     @property
     def passed(self) -> bool:
-        """Whether the port is right as far as this check sees; a NaN is a failure."""
+        """True if the largest difference is within the tolerance; a NaN is a failure."""
         return bool(self.worst <= self.tolerance)
 
     @property
-    def beyond(self) -> float:
-        """How many times its tolerance the worst case is: above 1 it fails; a NaN is infinitely far."""
+    def tolerance_ratio(self) -> float:
+        """Ratio of the largest difference to the tolerance; a failure is > 1, a NaN infinite."""
         if self.tolerance == 0.0 or math.isnan(self.worst):
             return 0.0 if self.worst == 0.0 else math.inf
         return self.worst / self.tolerance
 
     @property
     def margin(self) -> str:
-        """Tolerance over worst case, as text."""
-        if self.beyond == 0.0:
+        """Ratio of the tolerance to the largest difference, as text."""
+        if self.tolerance_ratio == 0.0:
             return "exact"
-        ratio = 1.0 / self.beyond
+        # Near 1, two digits would round a failure to 1 and make it look like a pass.
+        ratio = 1.0 / self.tolerance_ratio
         return f"{ratio:.2g}" if ratio >= 1.005 or ratio < 1.0 else f"{ratio:.4g}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Skipped:
-    """A check that was not made."""
+    """A check that was not run."""
 
     name: str
-    """What was not compared."""
+    """Quantity that was not compared."""
     reason: str
-    """Why it does not apply, or what it needs."""
+    """Reason why the check does not apply, or a missing requirement."""
     group: str = ""
-    """Which part of the certificate; the certificate fills it in."""
+    """Part of the certificate, which the certificate fills in."""
     task: str = ""
-    """The task or model; the certificate fills it in."""
+    """Task or model, which the certificate fills in."""
 
 
-def order(name: str, oracle: str) -> Check:
-    """A row of slopes, which `of_order` finds: how far from the promised order errors vanish."""
+def order_check(name: str, oracle: str) -> Check:
+    """Return a table row for an order of convergence, which `order_case` evaluates."""
     return Check(name, oracle, ORDER_TOLERANCE, "slope")
 
 
 class Case(NamedTuple):
-    """What was compared at once."""
+    """Differences of one comparison."""
 
+    # A number or an array of any shape.
     gaps: Any
-    """Differences found, a number or an array, each >= 0 or NaN."""
+    """Differences, a number or an array, each >= 0 or NaN."""
     where: str | Callable[[int], str] = ""
-    """Where that was, or the words for the flat index of the largest of the gaps."""
+    """Description of the case, or a function of the flat index of the largest difference."""
     samples: int | None = None
-    """How many comparisons it was; None for the number of gaps."""
+    """Number of comparisons; None for the number of differences."""
     plots: tuple[Plot, ...] = ()
-    """What to look at."""
+    """Plots of the comparison."""
 
 
-EVERYWHERE = "everywhere: there is no difference"
+NO_DIFFERENCE = "everywhere: there is no difference"
 Cases = Iterable[Case | tuple[Case, ...]]
 TABLE: list[Check] = []
-"""The rows of every check of the modules that were imported."""
+"""Rows of all checks of the imported modules."""
 
 
 def check(group: str, *rows: Check) -> Callable[[Callable[..., Cases]], Callable[..., list[Check]]]:
-    """Enter a function of cases in the table, in a group of the certificate.
+    """Register a generator function of cases as a check in a group of the certificate.
 
-    The function yields a `Case` each time, or of several rows a tuple of them, one for each;
-    without a case there is no outcome. Words in the braces of rows are its arguments, or what it is
-    called with besides, by name.
+    The function yields a `Case` for a single row, or a tuple with a `Case` for each row. If it
+    yields nothing, there are no results. Fields in braces in the rows are filled in by its
+    arguments and by further keyword arguments of the call.
     """
     of_group = [dataclasses.replace(row, group=group) for row in rows]
     TABLE.extend(of_group)
 
-    def enter(cases: Callable[..., Cases]) -> Callable[..., list[Check]]:
+    def register(cases: Callable[..., Cases]) -> Callable[..., list[Check]]:
         signature = inspect.signature(cases)
 
+        # The arguments are those of any check, hence Any.
         @functools.wraps(cases)
-        def made(*arguments: Any, **named: Any) -> list[Check]:
-            words = {
-                name: named.pop(name) for name in list(named) if name not in signature.parameters
+        def run_check(*arguments: Any, **keywords: Any) -> list[Check]:
+            # Keyword arguments that the check itself does not take only fill in its rows.
+            extra = {
+                name: keywords.pop(name)
+                for name in list(keywords)
+                if name not in signature.parameters
             }
-            said = words | signature.bind(*arguments, **named).arguments
-            found = [
-                (case,) if isinstance(case, Case) else case for case in cases(*arguments, **named)
+            fields = extra | signature.bind(*arguments, **keywords).arguments
+            case_tuples = [
+                (case,) if isinstance(case, Case) else case
+                for case in cases(*arguments, **keywords)
             ]
-            of_rows = zip(*found, strict=True)
+            cases_by_row = zip(*case_tuples, strict=True)
             return [
-                outcome(row, said, several)
-                for row, several in zip(of_group, of_rows, strict=bool(found))
+                evaluate_cases(row, fields, row_cases)
+                for row, row_cases in zip(of_group, cases_by_row, strict=bool(case_tuples))
             ]
 
-        return made
+        return run_check
 
-    return enter
+    return register
 
 
-def outcome(row: Check, said: dict[str, Any], cases: Iterable[Case]) -> Check:
-    """The worst of a row's cases: the largest gap, the first of equals; a NaN is larger than anything."""
-    worst, where, samples = -math.inf, "", 0
+def evaluate_cases(row: Check, fields: dict[str, Any], cases: Iterable[Case]) -> Check:
+    """Return a row with the result of its cases.
+
+    The worst case is the largest difference, the first one of equals; a NaN is larger than
+    anything.
+    """
+    worst, description, samples = -math.inf, "", 0
     plots: list[Plot] = []
     for case in cases:
         gaps = np.ravel(case.gaps)
         samples += gaps.size if case.samples is None else case.samples
         plots += case.plots
-        at = int(np.argmax(gaps)) if gaps.size else -1  # a NaN, if there is one
-        if at >= 0 and not (gaps[at] <= worst or math.isnan(worst)):
-            worst, words = float(gaps[at]), case.where
-            where = words if isinstance(words, str) else words(at) if worst else EVERYWHERE
-    if worst < 0.0:  # nothing was compared
-        worst, where = 0.0, EVERYWHERE
-    name, oracle = (text.format_map(said) for text in (row.name, row.oracle))
-    found: dict[str, Any] = {
+        # argmax returns the index of a NaN if there is one.
+        index = int(np.argmax(gaps)) if gaps.size else -1
+        if index >= 0 and not (gaps[index] <= worst or math.isnan(worst)):
+            worst, case_description = float(gaps[index]), case.where
+            description = (
+                case_description
+                if isinstance(case_description, str)
+                else case_description(index)
+                if worst
+                else NO_DIFFERENCE
+            )
+    # No case had any differences.
+    if worst < 0.0:
+        worst, description = 0.0, NO_DIFFERENCE
+    name, oracle = (text.format_map(fields) for text in (row.name, row.oracle))
+    results: dict[str, Any] = {
         "samples": samples,
         "worst": worst,
-        "where": where,
+        "where": description,
         "plots": tuple(plots),
     }
-    return dataclasses.replace(row, name=name, oracle=oracle, **found)
+    return dataclasses.replace(row, name=name, oracle=oracle, **results)
 
 
-# -- orders of convergence ----------------------------------------------------------------------------------
+# -- orders of convergence -------------------------------------------------------------------------
 
 
 def fit_slope(steps: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
-    """The exponent of a cloud of points on logarithmic axes, and half the width of its 95 % interval.
+    """Return the slope of errors over steps on logarithmic axes, and half its 95 % interval.
 
-    Least squares on the logarithms, and Student's t at n - 2 degrees of freedom, of at least three
-    steps > 0; an error that is zero or NaN makes both a NaN.
+    The fit is least squares on the logarithms, the interval Student's t at n - 2 degrees of
+    freedom. At least three steps > 0 are needed; an error that is zero or NaN makes both results
+    NaN.
     """
-    from scipy import stats  # the certificate's reader does without
+    # The import is local because reading a certificate does not need scipy.
+    from scipy import stats
 
     with np.errstate(divide="ignore", invalid="ignore"):
         logarithms = np.log(errors)
@@ -187,32 +214,34 @@ def fit_slope(steps: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
     return float(fit.slope), float(stats.t.ppf(0.975, len(steps) - 2) * fit.stderr)
 
 
-class Family(NamedTuple):
+class ConvergenceSeries(NamedTuple):
     """Errors of one case at several steps."""
 
     label: str
-    """The case, as in a legend."""
+    """Name of the case in a legend."""
     steps: np.ndarray
-    """What is made smaller, or larger where the promised order is negative."""
+    """Step sizes, decreasing; for a negative order increasing quantities, such as bandwidths."""
     errors: np.ndarray
-    """What was found at each."""
+    """Error at each step."""
     rounding: float = 0.0
-    """Size up to which an error is rounding, and says nothing of an order."""
+    """Size up to which an error is rounding, and shows no order."""
 
-    def judged(self, promised: float) -> tuple[float, str]:
-        """How far it is from the promised order, and the finding in words; rounding is left out.
+    def distance_from(self, promised: float) -> tuple[float, str]:
+        """Return the distance from the promised order, and its description.
 
-        With fewer than three errors left there is no slope, and the largest may be what the
-        promised order leaves over rounding two steps before it, with as much again for rounding's
-        scatter: `ORDER_TOLERANCE` times its share in that.
+        Errors that are rounding are left out. If fewer than three errors remain, there is no slope.
+        Then the largest error may be twice the rounding, times the growth of an error of the
+        promised order over two steps; the distance is `ORDER_TOLERANCE` times the ratio to that.
         """
-        clear = ~(self.errors <= self.rounding) | (self.rounding == 0.0)  # NaN is clear
+        # A NaN compares false and therefore stays in, so that it fails the check.
+        clear = ~(self.errors <= self.rounding) | (self.rounding == 0.0)
         spread = f"errors {self.errors[0]:.2g} to {self.errors[-1]:.2g}"
         if clear.sum() >= 3 or not self.rounding:
-            slope, half = fit_slope(self.steps[clear], self.errors[clear])
-            distance = abs(slope - promised) + half  # of the farther end of the interval
-            said = f"{self.label}: slope {slope:.3f} +- {half:.3f}, {spread}"
-            return distance if math.isfinite(distance) else math.inf, said
+            slope, half_width = fit_slope(self.steps[clear], self.errors[clear])
+            # The distance of the farther end of the interval.
+            distance = abs(slope - promised) + half_width
+            description = f"{self.label}: slope {slope:.3f} +- {half_width:.3f}, {spread}"
+            return distance if math.isfinite(distance) else math.inf, description
         share = float(
             self.errors.max() / (2.0 * self.rounding * (self.steps[0] / self.steps[2]) ** promised)
         )
@@ -223,20 +252,22 @@ class Family(NamedTuple):
         )
 
 
-def of_order(
-    promised: float, families: list[Family], title: str, x_label: str, y_label: str
+def order_case(
+    promised: float, series: list[ConvergenceSeries], title: str, x_label: str, y_label: str
 ) -> Case:
-    """How far from the promised order every family's errors vanish, intervals included; drawn with that slope."""
-    found = [one.judged(promised) for one in families]
+    """Return the case with the largest distance from the promised order, and a plot of all errors.
+
+    The distances include the intervals; the plot has a line with the promised slope.
+    """
+    distances = [errors.distance_from(promised) for errors in series]
     curves = [
-        Curve(text.partition(", ")[0], f.steps, f.errors)
-        for f, (_, text) in zip(families, found, strict=True)
+        Curve(text.partition(", ")[0], errors.steps, errors.errors)
+        for errors, (_, text) in zip(series, distances, strict=True)
     ]
-    first = families[0]
-    guide = (
-        0.5 * first.errors[-1] * (first.steps / first.steps[-1]) ** promised
-    )  # beside the errors, not upon them
+    first = series[0]
+    # The factor 0.5 moves the line beside the errors, so that it does not cover them.
+    guide = 0.5 * first.errors[-1] * (first.steps / first.steps[-1]) ** promised
     curves.append(Curve(f"slope {promised:g}, as promised", first.steps, guide, reference=True))
     plot = Plot(title, x_label, y_label, tuple(curves), x_log=True, y_log=True)
-    distance, where = max(found, key=lambda one: one[0])
-    return Case(distance, where, sum(len(one.steps) for one in families), (plot,))
+    distance, description = max(distances, key=lambda pair: pair[0])
+    return Case(distance, description, sum(len(errors.steps) for errors in series), (plot,))

@@ -1,4 +1,4 @@
-"""The exported C as the controller of the simulation: over its wire, on this machine and on an emulated board."""
+"""Tests of the exported C as the controller, on this machine and on an emulated board."""
 
 import binascii
 import ctypes
@@ -56,7 +56,7 @@ of_furuta, of_cartpole = (
 
 @pytest.fixture(scope="module", params=AGENTS)
 def folder(request, tmp_path_factory):
-    """A policy with random weights, exported in float and in double."""
+    """Export a policy with random weights, in float or in double."""
     task = request.param
     out = tmp_path_factory.mktemp("exported") / task
     export(
@@ -72,30 +72,30 @@ def folder(request, tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def _compiled_once(tmp_path_factory):
-    """The same C for the same target is compiled once for the file."""
+    """Compile the same C for the same target only once in this file."""
     programs, build = {}, boards._build
 
-    def built(folder, target, _, flags):
-        key = (target, *flags, *(one.read_bytes() for one in sorted(folder.glob("*.[ch]"))))
+    def build_once(folder, target, _, flags):
+        key = (target, *flags, *(path.read_bytes() for path in sorted(folder.glob("*.[ch]"))))
         if key not in programs:
             programs[key] = build(folder, target, tmp_path_factory.mktemp("built"), flags)
         return programs[key]
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(boards, "_build", built)
+        patched.setattr(boards, "_build", build_once)
         yield
 
 
 @pytest.mark.parametrize("target", ON)
-def test_episodes_on_the_board_are_those_of_onnxruntime(folder, target):
-    done = board_test(folder, target, 3, seed=5)
-    assert done.frames == sum(len(one.time) for one in done.on_board)
-    assert (done.refused, done.unanswered, done.alike) == (0, 0, 3)
-    np.testing.assert_allclose(done.returns[:, 0], done.returns[:, 1], rtol=1e-3)
+def test_episodes_on_the_board_equal_those_of_onnxruntime(folder, target):
+    result = board_test(folder, target, 3, seed=5)
+    assert result.frames == sum(len(episode.time) for episode in result.on_board)
+    assert (result.refused, result.unanswered, result.num_equal_returns) == (0, 0, 3)
+    np.testing.assert_allclose(result.returns[:, 0], result.returns[:, 1], rtol=1e-3)
 
 
-def spoilt(folder, out, before, inserted, file="controller.c"):
-    """A copy of an exported folder with something written into its C."""
+def insert_text(folder, out, before, inserted, file="controller.c"):
+    """Copy an exported folder with a text inserted into its C."""
     shutil.copytree(folder, out, dirs_exist_ok=True)
     begin, line, rest = (folder / file).read_text().partition(before)
     assert line
@@ -104,22 +104,26 @@ def spoilt(folder, out, before, inserted, file="controller.c"):
 
 
 @of_furuta
-def test_a_weight_changed_in_the_c_changes_what_the_simulation_does(folder, tmp_path):
-    done = board_test(spoilt(folder, tmp_path, "bias_0[64] = {", "9.0f + "), episodes=1)
-    assert not np.array_equal(done.on_board[0].action, done.in_python[0].action)
+def test_changed_weight_in_the_c_changes_the_actions(folder, tmp_path):
+    result = board_test(insert_text(folder, tmp_path, "bias_0[64] = {", "9.0f + "), episodes=1)
+    assert not np.array_equal(result.on_board[0].action, result.in_python[0].action)
 
 
 @pytest.mark.parametrize("folder", matrix_params(["furuta"], AGENTS), indirect=True)
-def test_a_gain_changed_in_the_c_changes_what_the_motor_does(folder, tmp_path):
-    off = []
-    for where in (folder, spoilt(folder, tmp_path, "  const real asked = ", "0.001f * ")):
-        done = board_test(where, episodes=1)
-        assert done.samples > 0
-        ours, theirs = (side[0].signals["current"][:20] for side in (done.on_board, done.in_python))
-        off.append((np.abs(ours - theirs).max(), abs(done.returns[0, 0] - done.returns[0, 1])))
-    (same, alike), (changed, other) = off
-    assert same < 1e-4 < 1e-3 < changed
-    assert alike < other
+def test_changed_gain_in_the_c_changes_the_motor_current(folder, tmp_path):
+    errors = []
+    for tested in (folder, insert_text(folder, tmp_path, "  const real asked = ", "0.001f * ")):
+        result = board_test(tested, episodes=1)
+        assert result.samples > 0
+        ours, oracle = (
+            side[0].signals["current"][:20] for side in (result.on_board, result.in_python)
+        )
+        errors.append(
+            (np.abs(ours - oracle).max(), abs(result.returns[0, 0] - result.returns[0, 1]))
+        )
+    (original_current, original_return), (changed_current, changed_return) = errors
+    assert original_current < 1e-4 < 1e-3 < changed_current
+    assert original_return < changed_return
     assert board_test(tmp_path, episodes=1, loop=False).samples == 0
 
 
@@ -153,40 +157,40 @@ LOOPS = {
 
 
 @pytest.mark.parametrize("name", LOOPS)
-def test_a_motor_whose_loop_is_on_the_board_moves_as_it_does_in_the_simulation(name, tmp_path):
+def test_motor_with_its_loop_on_the_board_moves_as_in_the_simulation(name, tmp_path):
     env = EnvConfig(
         "furuta", actuator=LOOPS[name], action="position" if name == "servo" else "force"
     )
-    policy, made = trained("furuta", "ppo")[0], env.make()
-    policy.action_space = made.action_space
+    policy, simulation = trained("furuta", "ppo")[0], env.make()
+    policy.action_space = simulation.action_space
     export(policy, env, "ppo", tmp_path / "out", 1, double=True)
     random = np.random.default_rng(0)
-    actions = random.uniform(made.action_space.low, made.action_space.high, (60, 1)).astype(
-        np.float32
-    )
+    actions = random.uniform(
+        simulation.action_space.low, simulation.action_space.high, (60, 1)
+    ).astype(np.float32)
 
-    def signals():
-        made.reset(seed=0)
-        told = [made.step(action) for action in actions]
+    def run():
+        simulation.reset(seed=0)
+        steps = [simulation.step(action) for action in actions]
         keys = ("current", "voltage", "actual_force")
-        return np.array([one for one, *_ in told]), np.array(
-            [[info[key] for key in keys] for *_, info in told]
+        return np.array([observation for observation, *_ in steps]), np.array(
+            [[info[key] for key in keys] for *_, info in steps]
         )
 
     with Board(tmp_path / "out") as board:
-        observed, felt = signals()
+        observations, signals = run()
         assert board.samples >= 60 * (30 if name == "the paper's" else 400)
-    expected, wanted = signals()
-    np.testing.assert_allclose(felt, wanted, rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(observed, expected, rtol=1e-6, atol=1e-6)
+    expected_observations, expected_signals = run()
+    np.testing.assert_allclose(signals, expected_signals, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(observations, expected_observations, rtol=1e-6, atol=1e-6)
 
 
 @of_cartpole
-def test_converters_come_between(folder):
-    done = board_test(folder, episodes=1, link=Link(pwm_bits=6, current_bits=8))
-    steps = done.on_board[0].signals["voltage"] / (2.0 * 24.0 / 2**6)
+def test_voltages_are_rounded_to_the_bits_of_the_bridge(folder):
+    result = board_test(folder, episodes=1, link=Link(pwm_bits=6, current_bits=8))
+    steps = result.on_board[0].signals["voltage"] / (2.0 * 24.0 / 2**6)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
-    assert not np.allclose(done.in_python[0].signals["voltage"] % 0.75, 0.0)
+    assert not np.allclose(result.in_python[0].signals["voltage"] % 0.75, 0.0)
 
 
 LIMITED = {"name": "paper", "controller": {"max_voltage": 12.0}}
@@ -200,19 +204,21 @@ VOLTS = {
 
 
 @pytest.mark.parametrize("task", VOLTS)
-def test_a_bridge_comes_behind_a_policy_that_commands_voltages(tmp_path, task):
+def test_bridge_rounds_the_voltages_of_a_policy_that_commands_them(tmp_path, task):
     env, agent = VOLTS[task]
-    with env.make() as made:
-        policy = agent.make_policy(made.observation_space, made.action_space)
+    with env.make() as simulation:
+        policy = agent.make_policy(simulation.observation_space, simulation.action_space)
     export(policy, env, agent.name, tmp_path / "out", 1)
     step = 2.0 * 12.0 / 2**5
-    done = board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=5))
-    exact, coarse = (side[0].signals["voltage"] / step for side in (done.in_python, done.on_board))
+    result = board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=5))
+    exact, coarse = (
+        side[0].signals["voltage"] / step for side in (result.in_python, result.on_board)
+    )
     np.testing.assert_allclose(coarse, np.round(coarse), atol=1e-9)
     assert not np.allclose(exact, np.round(exact), atol=1e-3)
-    # What the policy commanded is logged as it is: `board check` finds it again.
+    # The log has the policy's unrounded commands, which `board check` computes again.
     contract = Contract.read(tmp_path / "out")
-    commanded = contract.commands(done.on_board[0].action).ravel() / step
+    commanded = contract.to_commands(result.on_board[0].action).ravel() / step
     np.testing.assert_allclose(coarse, np.round(commanded), atol=1e-6)
     with pytest.raises(
         ValueError, match="the policy commands voltages, and the C measures no current"
@@ -220,7 +226,7 @@ def test_a_bridge_comes_behind_a_policy_that_commands_voltages(tmp_path, task):
         board_test(tmp_path / "out", episodes=1, link=Link(pwm_bits=8, current_bits=8))
 
 
-def test_without_a_loop_and_a_voltage_there_is_no_bridge(tmp_path):
+def test_raises_for_pwm_bits_without_a_loop_or_a_voltage(tmp_path):
     export(
         trained("pendulum", "ddpg")[0], EnvConfig("pendulum", "lag"), "ddpg", tmp_path / "out", 1
     )
@@ -231,19 +237,19 @@ def test_without_a_loop_and_a_voltage_there_is_no_bridge(tmp_path):
 
 
 def forget():
-    """Let the example's module and its task be as in a new process."""
+    """Remove the example's module and its task, as in a new process."""
     sys.modules.pop("ball_and_beam", None)
     if "ball_and_beam" in TASKS:
         gym.registry.pop(TASKS.pop("ball_and_beam").env_id)
 
 
-def test_a_contract_that_names_a_module_takes_trust(tmp_path, monkeypatch, capsys, request):
+def test_contract_that_names_a_module_needs_trust(tmp_path, monkeypatch, capsys, request):
     example = Path(__file__).parents[2] / "examples/own_robot"
     shutil.copytree(example, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     request.addfinalizer(forget)
     forget()
-    monkeypatch.setattr(sys, "path", [one for one in sys.path if one])
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     with monkeypatch.context() as patched:
         patched.syspath_prepend(tmp_path)
         env = EnvConfig("ball_and_beam:TASK", max_episode_steps=20)
@@ -253,7 +259,7 @@ def test_a_contract_that_names_a_module_takes_trust(tmp_path, monkeypatch, capsy
         ["identify", "compare", "out", "a.csv"],
     ):
         forget()
-        monkeypatch.setattr(sys, "path", [one for one in sys.path if one != str(tmp_path)])
+        monkeypatch.setattr(sys, "path", [path for path in sys.path if path != str(tmp_path)])
         options = ["--episodes", "1"] if line[0] == "board" else []
         assert main([*line, *options]) == 2
         assert "'ball_and_beam:TASK': needs the module ball_and_beam" in capsys.readouterr().err
@@ -261,55 +267,54 @@ def test_a_contract_that_names_a_module_takes_trust(tmp_path, monkeypatch, capsy
         assert main([*line, *options, "--trust"]) == 0
     with pytest.raises(ValueError, match="trust=True"):
         board_test(tmp_path / "out", episodes=1)
-    assert board_test(tmp_path / "out", episodes=1, trust=True).alike == 1
+    assert board_test(tmp_path / "out", episodes=1, trust=True).num_equal_returns == 1
 
 
 @of_furuta
-def test_encoders_and_late_answers_come_between(folder):
+def test_encoders_round_angles_and_late_answers_delay_commands(folder):
     contract, step = Contract.read(folder), 2.0 * np.pi / 2048
     row = np.array(contract.golden["observations"][50])
-    seen = Link(counts=2048).encoded(contract, row)
-    for place in (0, 2):
-        angle = np.arctan2(seen[place + 1], seen[place])
+    measured = Link(counts=2048).quantize(contract, row)
+    for index in (0, 2):
+        angle = np.arctan2(measured[index + 1], measured[index])
         assert angle / step == pytest.approx(round(angle / step), abs=1e-9)
-        assert abs(angle - np.arctan2(row[place + 1], row[place])) <= 0.51 * step
+        assert abs(angle - np.arctan2(row[index + 1], row[index])) <= 0.51 * step
     np.testing.assert_allclose(
-        seen[4:] / (step * 50.0), np.round(row[4:] / (step * 50.0)), atol=1e-9
+        measured[4:] / (step * 50.0), np.round(row[4:] / (step * 50.0)), atol=1e-9
     )
     rows = np.array(contract.golden["observations"])
     with Board(folder, link=Link(late=1.0)) as late, Board(folder) as prompt:
-        held = [late.command(one) for one in rows]
-        given = [prompt.command(one) for one in rows]
-    np.testing.assert_array_equal(held[1:], given[:-1])
-    assert not held[0].any()
+        late_commands = [late.command(row) for row in rows]
+        commands = [prompt.command(row) for row in rows]
+    np.testing.assert_array_equal(late_commands[1:], commands[:-1])
+    assert not late_commands[0].any()
     python = OnnxPolicy(folder)
-    for one in board_test(
-        folder, episodes=2, link=Link(late=1.0)
-    ).on_board:  # the command before, of that episode
-        assert not one.action[0].any()
+    # Each episode begins with the safe command, not with one of the episode before.
+    for episode in board_test(folder, episodes=2, link=Link(late=1.0)).on_board:
+        assert not episode.action[0].any()
         np.testing.assert_allclose(
-            one.action[1:], python.predict(one.observation[:-2])[0], atol=1e-5
+            episode.action[1:], python.predict(episode.observation[:-2])[0], atol=1e-5
         )
 
 
 @of_furuta
-def test_the_simulation_may_have_another_motor_than_the_one_the_loop_is_for(folder):
+def test_simulation_may_have_a_different_motor_than_the_loop(folder):
     real = DRIVE.replaced(
         {"motor.torque_constant": 0.03, "motor.back_emf_constant": 0.03, "motor.resistance": 9.0}
     )
-    done = board_test(folder, episodes=1, actuator=real)
-    assert done.on_board[0].actuator.motor == real.motor
-    # the C asks for what its own motor would need; Python, which knows the real one, for more, up
-    # to the drive's 2 A
-    board, python = (side[0].signals["current"][0] for side in (done.on_board, done.in_python))
-    asked = abs(float(done.on_board[0].action[0, 0]))
-    assert abs(board) == pytest.approx(asked / 0.042, rel=0.02)
-    assert abs(python) == pytest.approx(min(asked / 0.03, 2.0), rel=0.02)
+    result = board_test(folder, episodes=1, actuator=real)
+    assert result.on_board[0].actuator.motor == real.motor
+    # The C converts the torque with the torque constant of the training. Python uses the real
+    # motor's and needs more current, up to the drive's 2 A.
+    board, python = (side[0].signals["current"][0] for side in (result.on_board, result.in_python))
+    torque = abs(float(result.on_board[0].action[0, 0]))
+    assert abs(board) == pytest.approx(torque / 0.042, rel=0.02)
+    assert abs(python) == pytest.approx(min(torque / 0.03, 2.0), rel=0.02)
     with pytest.raises(ValueError, match="actuator: a Lag, must be a Drive"):
         board_test(folder, episodes=1, actuator={"family": "lag"})
 
 
-def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
+def test_command_beyond_the_limits_is_the_safe_one(tmp_path):
     limits = {"arm_velocity": 4.0, "rod": 3.0}
     policy, _ = trained("furuta", "ppo")
     export(policy, FURUTA, "ppo", tmp_path / "out", 1, limits=limits)
@@ -320,22 +325,24 @@ def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
     }
     assert "arm_velocity, at least -4, at most 4" in (tmp_path / "out/controller.h").read_text()
     angles = np.random.default_rng(0).uniform(-np.pi, np.pi, 200)
-    rows = np.array([[1.0, 0.0, np.cos(one), np.sin(one), 3.0 * one, 0.0] for one in angles])
-    fine = (np.abs(angles) < 3.0) & (np.abs(3.0 * angles) < 4.0)
-    assert 20 < fine.sum() < 180
-    np.testing.assert_array_equal(contract.within(rows), fine)
+    rows = np.array(
+        [[1.0, 0.0, np.cos(angle), np.sin(angle), 3.0 * angle, 0.0] for angle in angles]
+    )
+    is_safe = (np.abs(angles) < 3.0) & (np.abs(3.0 * angles) < 4.0)
+    assert 20 < is_safe.sum() < 180
+    np.testing.assert_array_equal(contract.is_within_limits(rows), is_safe)
     with Board(tmp_path / "out") as board:
         commands = np.array([board.command(row) for row in rows])
-        assert board.stopped == (~fine).sum()
-    assert not commands[~fine].any()
-    assert commands[fine].all()
+        assert board.beyond_limits == (~is_safe).sum()
+    assert not commands[~is_safe].any()
+    assert commands[is_safe].all()
     np.testing.assert_allclose(python.predict(rows)[0], commands, atol=1e-6)
-    for name, limit, says in (
+    for name, limit, message in (
         ("arm_velocit", 4.0, "did you mean arm_velocity"),
         ("arm_velocity", -4.0, "arm_velocity = -4: must be > 0"),
         ("rod", 4.0, "must be > 0 and < pi"),
     ):
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=message):
             export(policy, FURUTA, "ppo", tmp_path / "other", 1, limits={name: limit})
 
 
@@ -345,20 +352,18 @@ def test_beyond_its_limits_a_policy_is_not_asked(tmp_path):
 def test_instructions_are_counted_on_the_emulated_board(folder):
     policy, sample = instructions(folder)
     products = 6 * 64 + 64 * 64 + 64
-    assert (
-        2 * products < policy < (20 if kind_of(folder) == "f" else 400) * products
-    )  # a Cortex-M4F has no double
+    # A Cortex-M4F has no hardware for double.
+    assert 2 * products < policy < (20 if kind_of(folder) == "f" else 400) * products
     assert 10 < sample < 2000
 
 
 @of_furuta
-def test_lost_and_damaged_frames_are_answered_for_safety(folder):
-    done = board_test(folder, episodes=2, link=Link(lost=0.1, damaged=0.1), loop=False)
-    assert done.refused > 0
-    assert done.unanswered > 0
-    with Board(
-        folder, link=Link(damaged=1.0)
-    ) as board:  # whichever bit it is: never a command of the policy
+def test_lost_and_damaged_frames_give_the_safe_command(folder):
+    result = board_test(folder, episodes=2, link=Link(lost=0.1, damaged=0.1), loop=False)
+    assert result.refused > 0
+    assert result.unanswered > 0
+    # A flipped bit, whichever it is, never leads to a command of the policy.
+    with Board(folder, link=Link(damaged=1.0)) as board:
         for row in Contract.read(folder).golden["observations"]:
             assert not board.command(np.array(row)).any()
         assert board.refused == board.frames
@@ -366,57 +371,64 @@ def test_lost_and_damaged_frames_are_answered_for_safety(folder):
 
 @of_cartpole
 @pytest.mark.parametrize("noise", [b"\xa5", b"\xa5\x5a" + bytes(21), b"\x00\xa5\xa5"])
-def test_an_answer_is_found_again_behind_noise(folder, noise):
+def test_answer_after_noise_is_found(folder, noise):
     contract = Contract.read(folder)
     numbers = np.full(
         len(contract.observations) + 4 * len(contract.actions),
         struct.unpack("<d", b"\xa5\x5a" * 4)[0],
     )
-    (to, sent), (back, said) = os.pipe(), os.pipe()
-    wire = Wire(contract, sent, back)
-    os.write(said, noise)
+    (request_read, request_write), (answer_read, answer_write) = os.pipe(), os.pipe()
+    wire = Wire(contract, request_write, answer_read)
+    os.write(answer_write, noise)
     for sequence in range(1, 21):
         content = struct.pack(f"<BBI{len(numbers)}d", sequence, OK, 0, *numbers)
-        os.write(said, b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF)))
-        answer = wire.asked(b"", sequence, 0.2)
+        os.write(
+            answer_write,
+            b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF)),
+        )
+        answer = wire.request(b"", sequence, 0.2)
         assert answer is not None
         assert (answer.sequence, answer.status) == (sequence, OK)
         np.testing.assert_array_equal(answer.observation, numbers[: len(contract.observations)])
-    for one in (to, sent, back, said):
-        os.close(one)
+    for descriptor in (request_read, request_write, answer_read, answer_write):
+        os.close(descriptor)
 
 
 def kind_of(folder):
-    """The numbers of a folder's C, as `struct` calls them."""
+    """Return the type of numbers of a folder's C, as a letter of `struct`."""
     return "d" if Contract.read(folder).task == "cartpole" else "f"
 
 
 def form_of(folder):
-    """An answer: of a controller with k observations and m commands k + 4 m numbers."""
+    """Return the format of an answer: k observations and m commands have k + 4 m numbers."""
     contract = Contract.read(folder)
     return struct.Struct(
         f"<HBBI{len(contract.observations) + 4 * len(contract.actions)}{kind_of(folder)}H"
     )
 
 
-def asked(folder, program, sent):
-    """Statuses and commands that the program answers to bytes, read as frames with a checksum of their own."""
+def answers_to(folder, program, sent):
+    """Return the program's answers to bytes: sequence, status, stamp and command of each."""
     form, contract = form_of(folder), Contract.read(folder)
-    got = subprocess.run([program], input=sent, capture_output=True, check=True, timeout=20).stdout
+    output = subprocess.run(
+        [program], input=sent, capture_output=True, check=True, timeout=20
+    ).stdout
     answers = []
-    for one in range(0, len(got), form.size):
-        start, sequence, status, stamp, *numbers, check = form.unpack(got[one : one + form.size])
+    for offset in range(0, len(output), form.size):
+        start, sequence, status, stamp, *numbers, check = form.unpack(
+            output[offset : offset + form.size]
+        )
         command = numbers[len(contract.observations) :][: len(contract.actions)]
         assert start == 0x5AA5
-        assert check == binascii.crc_hqx(got[one + 2 : one + form.size - 2], 0xFFFF)
+        assert check == binascii.crc_hqx(output[offset + 2 : offset + form.size - 2], 0xFFFF)
         answers.append((sequence, status, stamp, command))
     return answers
 
 
 @pytest.fixture(scope="module")
 def program(folder, tmp_path_factory):
-    """The controller for this machine, with gcc's sanitizers."""
-    built = str(tmp_path_factory.mktemp("sanitized") / "controller")
+    """Compile the controller for this machine with gcc's sanitizers."""
+    path = str(tmp_path_factory.mktemp("sanitized") / "controller")
     sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
     strict = [
         "-std=c99",
@@ -427,8 +439,8 @@ def program(folder, tmp_path_factory):
         "-Wpedantic",
         "-fsanitize=address,undefined",
     ]
-    subprocess.run(["cc", *strict, *sources, "-lm", "-o", built], check=True)
-    return built
+    subprocess.run(["cc", *strict, *sources, "-lm", "-o", path], check=True)
+    return path
 
 
 def frame(folder, sequence, stamp, row, kind=0, spoilt=False):
@@ -436,14 +448,11 @@ def frame(folder, sequence, stamp, row, kind=0, spoilt=False):
     return b"\xa5\x5a" + content + struct.pack("<H", binascii.crc_hqx(content, 0xFFFF) ^ spoilt)
 
 
-def test_every_frame_damaged_doubled_late_or_old_is_told_and_the_next_is_understood(
-    folder, program
-):
+def test_status_tells_damaged_repeated_late_and_old_frames(folder, program):
     rows = Contract.read(folder).golden["observations"]
-    good = [
-        frame(folder, n, 2**32 - 40_000 + 20_000 * n, rows[n]) for n in range(6)
-    ]  # the clock comes around
-    want = [command for *_, command in asked(folder, program, b"".join(good))]
+    # The 32-bit clock overflows within these frames.
+    good = [frame(folder, n, 2**32 - 40_000 + 20_000 * n, rows[n]) for n in range(6)]
+    expected = [command for *_, command in answers_to(folder, program, b"".join(good))]
     flipped = bytearray(good[1])
     flipped[11] ^= 4
     hours = frame(folder, 7, 3_600_000_000, rows[5])
@@ -459,35 +468,44 @@ def test_every_frame_damaged_doubled_late_or_old_is_told_and_the_next_is_underst
         infinite,
         hours,
     ]
-    got = asked(folder, program, b"".join(sent[1:]))
-    safe = [0.0] * len(want[0])
-    assert [status for _, status, *_ in got] == [OK, DAMAGED, OK, OLD, OLD, LATE, NOT_FINITE, OLD]
-    assert [command for *_, command in got] == [
-        want[0],
+    answers = answers_to(folder, program, b"".join(sent[1:]))
+    safe = [0.0] * len(expected[0])
+    assert [status for _, status, *_ in answers] == [
+        OK,
+        DAMAGED,
+        OK,
+        OLD,
+        OLD,
+        LATE,
+        NOT_FINITE,
+        OLD,
+    ]
+    assert [command for *_, command in answers] == [
+        expected[0],
         safe,
-        want[1],
-        want[1],
-        want[1],
-        want[4],
+        expected[1],
+        expected[1],
+        expected[1],
+        expected[4],
         safe,
         safe,
     ]
-    # noise that begins like a frame takes the next one with it; the one after is understood
-    after = asked(folder, program, sent[0] + b"".join(good))
-    assert [command for _, status, _, command in after if status == OK] == want
+    # Noise that begins like a frame does not hide the frames after it.
+    after_noise = answers_to(folder, program, sent[0] + b"".join(good))
+    assert [command for _, status, _, command in after_noise if status == OK] == expected
 
 
 @of_furuta
-@pytest.mark.parametrize("lacking", [1, 9])
-def test_a_frame_of_which_bytes_are_lost_is_refused_and_those_after_it_come_through(
-    folder, program, lacking
-):
+@pytest.mark.parametrize("num_lost", [1, 9])
+def test_frame_with_lost_bytes_is_refused_and_the_next_are_accepted(folder, program, num_lost):
     rows = Contract.read(folder).golden["observations"]
     good = [frame(folder, n, 20_000 * n + 1, rows[n]) for n in range(8)]
-    want = [command for *_, command in asked(folder, program, b"".join(good))]
-    got = asked(folder, program, good[0] + good[1][:-lacking] + b"".join(good[2:]))
-    fine = {sequence: command for sequence, status, _, command in got if status in (OK, LATE)}
-    assert fine == {n: want[n] for n in (0, 2, 3, 4, 5, 6, 7)}
+    expected = [command for *_, command in answers_to(folder, program, b"".join(good))]
+    answers = answers_to(folder, program, good[0] + good[1][:-num_lost] + b"".join(good[2:]))
+    accepted = {
+        sequence: command for sequence, status, _, command in answers if status in (OK, LATE)
+    }
+    assert accepted == {n: expected[n] for n in (0, 2, 3, 4, 5, 6, 7)}
 
 
 WATCHING, DRIVING = 1, 2
@@ -495,110 +513,121 @@ WATCHING, DRIVING = 1, 2
 
 @pytest.fixture
 def wired(folder, tmp_path):
-    """Functions of the exported wire: to send a frame of a kind at a stamp [us], to ask the watchdog; what is given."""
+    """Return functions of the exported wire that send a frame and call the watchdog; a contract.
+
+    The first sends a frame of a kind at a stamp [us], the second takes a time [us]; both return a
+    status and True if the drive has a command.
+    """
     library = with_sensors(folder, tmp_path, "-shared", "-fPIC", "-DBAD=0", "-DWORSE=0", "-DGONE=0")
     wire, contract = ctypes.CDLL(library), Contract.read(folder)
     real = {"f": ctypes.c_float, "d": ctypes.c_double}[kind_of(folder)]
-    given = (real * len(contract.actions)).in_dll(wire, "given")
+    applied = (real * len(contract.actions)).in_dll(wire, "given")
     state, answer = (ctypes.c_ubyte * 1024)(), (ctypes.c_ubyte * 256)()
     wire.wire_reset(state)
 
     def send(stamp, kind, spoilt=False):
         for byte in frame(folder, 1, stamp, contract.golden["observations"][0], kind, spoilt):
             wire.wire_byte(state, byte, answer)
-        return answer[3], any(given)
+        return answer[3], any(applied)
 
-    return send, lambda now: (bool(wire.wire_late(state, now % 2**32)), any(given)), contract
+    return send, lambda time: (bool(wire.wire_late(state, time % 2**32)), any(applied)), contract
 
 
 @of_furuta
-def test_the_watchdog_goes_by_the_board_s_own_clock_and_stops_the_drive(wired):
+def test_watchdog_uses_the_boards_clock_and_stops_the_drive(wired):
     send, late, contract = wired
     after = round(1e6 * contract.late["after"])
-    assert late(5_000_000) == (True, False)  # nothing came yet
+    # No frame has come yet.
+    assert late(5_000_000) == (True, False)
     assert send(1_000, DRIVING) == (OK, True)
+    # The frame's arrival counts, on the board's clock, which started before the host's.
     assert late(5_000_100) == (
         False,
         True,
-    )  # when it came, by this clock, which began before the host's
+    )
     assert late(5_000_100 + after) == (False, True)
     assert late(5_000_101 + after) == (True, False)
+    # The host has started again, with stamps from zero, or hours have passed.
     assert send(1, DRIVING) == (
         OK,
         True,
-    )  # another run of the host, whose stamps begin anew, or hours later
+    )
     assert late(2**32 - 10) == (False, True)
-    assert late(after - 10) == (False, True)  # the clock comes around
+    # The clock has overflowed.
+    assert late(after - 10) == (False, True)
     assert late(after - 9) == (True, False)
 
 
 @of_cartpole
-def test_an_old_frame_moves_nothing_that_did_not_move(wired):
+def test_old_frame_does_not_start_the_drive(wired):
     send, _, _ = wired
     assert send(9_000, WATCHING) == (OK, False)
-    assert send(9_000, DRIVING) == (OLD, False)  # what was only watched is no command
+    # The command of a watching frame was not given to the drive.
+    assert send(9_000, DRIVING) == (OLD, False)
     assert send(10_000, DRIVING) == (OK, True)
-    assert send(10_000, DRIVING) == (OLD, True)  # a doubled frame keeps what the drive has
+    # A repeated frame leaves the drive's command.
+    assert send(10_000, DRIVING) == (OLD, True)
     assert send(11_000, DRIVING, spoilt=True) == (DAMAGED, False)
     assert send(10_000, DRIVING) == (OLD, False)
 
 
-def test_a_log_of_the_board_keeps_its_contract_and_one_that_is_changed_does_not(
-    folder, tmp_path, capsys
-):
+def test_log_of_the_board_passes_the_check_and_a_changed_one_fails(folder, tmp_path, capsys):
     log = tmp_path / "log.csv"
     assert main(["board", "test", str(folder), "--episodes", "1", "--log", str(log)]) == 0
     assert "1 of 1" in capsys.readouterr().out
     assert main(["board", "check", str(folder), str(log)]) == 0
     contract = Contract.read(folder)
-    found = check_log(folder, log)
-    assert (found.late, found.differing) == (0, 0)
-    assert found.rate == pytest.approx(contract.rate)
+    result = check_log(folder, log)
+    assert (result.late, result.differing) == (0, 0)
+    assert result.rate == pytest.approx(contract.rate)
     header, *rows = [line.split(",") for line in log.read_text().splitlines()]
-    sent = 1 + len(contract.observations)
-    assert header[sent + 1 :] == ["motor_voltage:V", "motor_current:A", "motor_position:rad"]
+    command_column = 1 + len(contract.observations)
+    assert header[command_column + 1 :] == [
+        "motor_voltage:V",
+        "motor_current:A",
+        "motor_position:rad",
+    ]
     refused = {
         "order": ([header[0], header[2], header[1], *header[3:]], rows),
         "rate": (header, [[str(2.0 * float(row[0])), *row[1:]] for row in rows]),
-        "convert it": ([*header[:sent], "motor:kg", *header[sent + 1 :]], rows),
+        "convert it": ([*header[:command_column], "motor:kg", *header[command_column + 1 :]], rows),
         "increase": (header, [rows[1], rows[0], *rows[2:]]),
         "cells": (header, [rows[0][:-1], *rows[1:]]),
         "a number": (header, [["soon", *rows[0][1:]], *rows[1:]]),
-        "no column 'motor'": (header[:sent], [row[:sent] for row in rows]),
+        "no column 'motor'": (header[:command_column], [row[:command_column] for row in rows]),
     }
 
     def text(header, rows, end="\n"):
         return end.join(",".join(row) for row in (header, *rows))
 
-    for says, table in refused.items():
+    for message, table in refused.items():
         log.write_text(text(*table))
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=message):
             check_log(folder, log)
-    log.write_text(
-        "\ufeff" + text(header, rows, "\r\n") + "\r\n\r\n", encoding="utf-8"
-    )  # as a spreadsheet saves it
-    assert check_log(folder, log) == found
+    # A spreadsheet program saves the file in this way.
+    log.write_text("\ufeff" + text(header, rows, "\r\n") + "\r\n\r\n", encoding="utf-8")
+    assert check_log(folder, log) == result
     for row in rows:
-        row[sent] = str(float(row[sent]) + 0.01)
+        row[command_column] = str(float(row[command_column]) + 0.01)
     log.write_text(text(header, rows))
     assert check_log(folder, log).differing == len(rows)
     assert main(["board", "check", str(folder), str(log)]) == 1
 
 
 @of_furuta
-def test_a_program_that_ends_is_an_error(folder, tmp_path, capsys):
-    for line, says in {
+def test_ended_program_is_an_error(folder, tmp_path, capsys):
+    for line, message in {
         "wire_reset(&wire);\n": "the board's program ended at frame 1",
         "current_state state;\n": "the board's current loop did not answer at sample",
     }.items():
-        spoilt(folder, tmp_path, line, "  if (sizeof(real) > 0) return 3;\n", "board.c")
+        insert_text(folder, tmp_path, line, "  if (sizeof(real) > 0) return 3;\n", "board.c")
         assert main(["board", "test", str(tmp_path), "--episodes", "1"]) == 2
-        assert says in capsys.readouterr().err
+        assert message in capsys.readouterr().err
 
 
 @of_cartpole
-def test_what_cannot_be_run_is_said(folder, tmp_path, monkeypatch, capsys):
-    for line, says in {
+def test_bad_input_and_missing_tools_are_errors(folder, tmp_path, monkeypatch, capsys):
+    for line, message in {
         (
             "test",
             str(folder),
@@ -616,7 +645,7 @@ def test_what_cannot_be_run_is_said(folder, tmp_path, monkeypatch, capsys):
         ("test", str(tmp_path)): "contract.json",
     }.items():
         assert main(["board", *line]) == 2
-        assert says in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     (folder / "board.c").rename(folder / "elsewhere.c")
     assert main(["board", "test", str(folder)]) == 2
     assert "board.c: missing: write the folder with codrl-mj export" in capsys.readouterr().err
@@ -631,11 +660,11 @@ def test_what_cannot_be_run_is_said(folder, tmp_path, monkeypatch, capsys):
 
 @of_furuta
 @pytest.mark.parametrize("weight", ["0.0f / 0.0f + ", "1.5f + "])
-def test_a_wrong_weight_fails_the_golden_check_and_fast_math_does_not_compile(
+def test_wrong_weight_fails_the_golden_check_and_fast_math_does_not_compile(
     folder, tmp_path, weight
 ):
     program = tmp_path / "golden"
-    controller = spoilt(folder, tmp_path, "bias_0[64] = {", weight) / "controller.c"
+    controller = insert_text(folder, tmp_path, "bias_0[64] = {", weight) / "controller.c"
     sources = [str(controller), str(folder / "main.c")]
     subprocess.run(
         ["cc", "-std=c99", f"-I{folder}", *sources, "-lm", "-o", str(program)], check=True

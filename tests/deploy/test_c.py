@@ -1,4 +1,4 @@
-"""The C of a policy and of its current loop, compiled and held against Python's."""
+"""Tests that the compiled C of a policy and of its current loop equals Python."""
 
 import ctypes
 import dataclasses
@@ -14,9 +14,9 @@ from codrl_mj.actuators import DCMotorActuator, Drive, Servo, ServoLoop, Supply,
 from codrl_mj.actuators.drive import State
 from codrl_mj.actuators.model import Inputs
 from codrl_mj.actuators.parameters import parameters_type
-from codrl_mj.deploy import Contract, network_of
+from codrl_mj.deploy import Contract, extract_network
 from codrl_mj.deploy.c_code import c_files, check_board
-from codrl_mj.deploy.loops import current_loop
+from codrl_mj.deploy.loops import loop_parameters
 from codrl_mj.envs.config import EnvConfig
 from tests.deploy.test_export import EACH, observed, trained
 from tests.matrix import matrix_params
@@ -28,23 +28,26 @@ KINDS = {False: ctypes.c_float, True: ctypes.c_double}
 
 
 def each(names, in_float):
-    """All names in double and one in float; all others in float are parts of the full matrix."""
+    """Return all names in double and one in float; the full matrix has all names in both."""
     return matrix_params(
         [(in_float, False), *((name, True) for name in names)], itertools.product(names, KINDS)
     )
 
 
-def written(folder, task, agent="ppo", settings=(), double=False, **changes):
-    """The C files of a policy with random weights, the policy, and its contract."""
+def write_c(folder, task, agent="ppo", settings=(), double=False, **changes):
+    """Write the C files of a policy with random weights; return the policy and its contract."""
     policy, _ = trained(task, agent, **dict(settings))
-    contract = Contract.of(policy, EnvConfig(task, **changes), agent, 1, double=double)
-    for name, content in c_files(network_of(policy), contract).items():
+    contract = Contract.from_policy(policy, EnvConfig(task, **changes), agent, 1, double=double)
+    for name, content in c_files(extract_network(policy), contract).items():
         (folder / name).write_text(content)
     return policy, contract
 
 
 def compiled(folder, double, *functions):
-    """The controller of a folder as a library, of which some functions return a number; and the kind of its numbers."""
+    """Compile a folder's controller as a library.
+
+    Return the library, whose named functions return numbers, and the type of the numbers.
+    """
     out = [
         "-shared",
         "-fPIC",
@@ -62,39 +65,43 @@ def compiled(folder, double, *functions):
 
 @pytest.mark.parametrize("double", [False, True])
 @pytest.mark.parametrize(("task", "agent", "settings"), EACH)
-def test_the_policy_in_c_is_the_policy(tmp_path, task, agent, settings, double):
-    policy, contract = written(tmp_path, task, agent, settings, double)
+def test_policy_in_c_equals_the_policy(tmp_path, task, agent, settings, double):
+    policy, contract = write_c(tmp_path, task, agent, settings, double)
     library, kind = compiled(tmp_path, double)
-    seen = observed(policy.observation_space, 2000)
-    network = network_of(policy)
-    expected = network(seen, np.float64) if double else policy.predict(seen, deterministic=True)[0]
+    observations = observed(policy.observation_space, 2000)
+    network = extract_network(policy)
+    expected = (
+        network(observations, np.float64)
+        if double
+        else policy.predict(observations, deterministic=True)[0]
+    )
     command = (kind * len(contract.actions))()
-    got = np.empty((len(seen), len(contract.actions)))
-    for row, one in enumerate(seen):
-        library.policy_step((kind * len(one))(*one.tolist()), command)
-        got[row] = command[:]
+    commands = np.empty((len(observations), len(contract.actions)))
+    for row, observation in enumerate(observations):
+        library.policy_step((kind * len(observation))(*observation.tolist()), command)
+        commands[row] = command[:]
     if network.low is None:
-        levels = np.array([one["levels"] for one in contract.actions]).T
-        assert (got != levels[expected]).any(axis=1).sum() <= 1
+        levels = np.array([action["levels"] for action in contract.actions]).T
+        assert (commands != levels[expected]).any(axis=1).sum() <= 1
     else:
-        np.testing.assert_allclose(got, expected, atol=1e-12 if double else 1e-6, rtol=0)
+        np.testing.assert_allclose(commands, expected, atol=1e-12 if double else 1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize(
     ("task", "agent"), [("furuta", "sac"), ("acrobot", "dqn"), ("acrobot", "sarsa")]
 )
-def test_golden_commands_are_computed_again_without_a_warning(tmp_path, compiler, task, agent):
-    written(tmp_path, task, agent)
+def test_golden_commands_are_recomputed_without_a_warning(tmp_path, compiler, task, agent):
+    write_c(tmp_path, task, agent)
     program = str(tmp_path / "main")
     files = [str(tmp_path / name) for name in ("controller.c", "main.c")]
     subprocess.run(
         [compiler, *STRICT, "-fsanitize=undefined", *files, "-lm", "-o", program], check=True
     )
-    done = subprocess.run([program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0
-    assert float(done.stdout.split(": ")[1]) < 1e-6
-    assert not done.stderr
+    process = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert process.returncode == 0
+    assert float(process.stdout.split(": ")[1]) < 1e-6
+    assert not process.stderr
 
 
 LOOPS = {
@@ -107,14 +114,13 @@ LOOPS = {
 
 
 @pytest.mark.parametrize(("name", "double"), each(LOOPS, "late"))
-def test_the_current_loop_in_c_is_the_drive_s_sample_by_sample(tmp_path, name, double):
+def test_current_loop_in_c_equals_the_drives_sample_by_sample(tmp_path, name, double):
     (usual,) = EnvConfig("furuta").driven.values()
     changed = {f"controller.{field}": value for field, value in LOOPS[name].items()}
-    drive = usual.replaced(
-        changed | {"motor.load_inertia": np.inf}
-    )  # a held speed, as the engine gives it
+    # The infinite inertia keeps the speed during a step, as the engine does.
+    drive = usual.replaced(changed | {"motor.load_inertia": np.inf})
     motor = drive.motor
-    written(tmp_path, "furuta", double=double, actuator=drive)
+    write_c(tmp_path, "furuta", double=double, actuator=drive)
     library, kind = compiled(tmp_path, double, "current_step", "current_reference")
     state = (kind * 2)()
     library.current_reset(state)
@@ -128,16 +134,17 @@ def test_the_current_loop_in_c_is_the_drive_s_sample_by_sample(tmp_path, name, d
         inputs = Inputs(torque, 0.0, speed, sample * period, 0.0)
         after, _, signals = Drive.advance(parameters, period, ours, inputs)
         reference = library.current_reference(kind(torque))
-        if not double:  # from equal states: rounding adds up in an integral
+        # In float, rounding errors add up in the integral, so each sample starts at equal states.
+        if not double:
             state[:] = ours.integral, ours.pending
         volts = library.current_step(state, kind(reference), kind(ours.current), kind(speed))
-        tolerance = 1e-11 if double else 1e-6  # of the supply
+        # The voltage's tolerance is a share of the supply voltage.
+        tolerance = 1e-11 if double else 1e-6
         assert reference == pytest.approx(signals.reference_current, abs=tolerance * 10)
         assert volts == pytest.approx(signals.voltage, abs=tolerance * drive.voltage_limit)
-        reached = (signals.voltage - motor.back_emf_constant * speed) / motor.resistance
-        assert after.current == pytest.approx(
-            reached + (ours.current - reached) * decay, abs=1e-9
-        )  # the winding's
+        steady = (signals.voltage - motor.back_emf_constant * speed) / motor.resistance
+        # The winding's current decays exponentially to its steady state.
+        assert after.current == pytest.approx(steady + (ours.current - steady) * decay, abs=1e-9)
         saturated += signals.voltage_saturated
         ours = after
     assert 20 < saturated < 1900
@@ -158,12 +165,12 @@ PID = {
 
 
 @pytest.mark.parametrize(("name", "double"), each(PID, "filtered"))
-def test_the_paper_s_loop_in_c_is_the_actuator_s_sample_by_sample(tmp_path, name, double):
+def test_papers_loop_in_c_equals_the_actuators_sample_by_sample(tmp_path, name, double):
     (usual,) = EnvConfig("cartpole").driven.values()
     controller = dataclasses.replace(usual.controller, **PID[name])
     supply = Supply(12.0, 0.5) if name == "sagging" else usual.supply
     actuator = dataclasses.replace(usual, controller=controller, supply=supply)
-    written(tmp_path, "cartpole", "dqn", double=double, actuator=actuator)
+    write_c(tmp_path, "cartpole", "dqn", double=double, actuator=actuator)
     library, kind = compiled(tmp_path, double, "current_step", "current_reference")
     parameters = parameters_type(DCMotorActuator)(*actuator.numbers)
     header = (tmp_path / "controller.h").read_text()
@@ -179,7 +186,8 @@ def test_the_paper_s_loop_in_c_is_the_actuator_s_sample_by_sample(tmp_path, name
     for sample in range(1000):
         if sample % 10 == 0:
             force, speed = random.uniform(-60.0, 60.0), random.uniform(-4.0, 4.0)
-        if not double:  # from equal states: rounding adds up in an integral
+        # In float, rounding errors add up in the integral, so each sample starts at equal states.
+        if not double:
             state[:] = integral, error
         available = min(controller.max_voltage, math.inf if supply is None else supply.voltage)
         if name == "sagging":
@@ -189,12 +197,12 @@ def test_the_paper_s_loop_in_c_is_the_actuator_s_sample_by_sample(tmp_path, name
         reference = kind(library.current_reference(kind(force)))
         volts = library.current_step(state, reference, kind(current), kind(speed))
         torque = force * actuator.arm_radius
-        given = parameters, period, current, integral, error, torque, speed, 0.0, available
-        current, integral, error, wanted = electrical_step(*given)
+        arguments = parameters, period, current, integral, error, torque, speed, 0.0, available
+        current, integral, error, expected = electrical_step(*arguments)
         assert volts == pytest.approx(
-            wanted, rel=1e-12 if double else 1e-5, abs=1e-11 if double else 2e-5
+            expected, rel=1e-12 if double else 1e-5, abs=1e-11 if double else 2e-5
         )
-        saturated += abs(wanted) == available
+        saturated += abs(expected) == available
     assert (saturated > 20) == (name != "fed forward")
     assert list(state) == pytest.approx(
         [integral, error], rel=1e-9 if double else 1e-4, abs=1e-9 if double else 1e-4
@@ -224,13 +232,13 @@ SERVOS = {
 
 
 @pytest.mark.parametrize(("name", "double"), each(SERVOS, "position"))
-def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name, double):
+def test_servo_loops_in_c_equal_the_servos_sample_by_sample(tmp_path, name, double):
     (drive,) = EnvConfig("furuta").driven.values()
     loop = ServoLoop(servo_rate=500.0, **SERVOS[name])
     servo = Servo(
         dataclasses.replace(drive.motor, gear_ratio=3.0), drive.controller, drive.supply, loop
     )
-    written(tmp_path, "furuta", double=double, actuator=servo, action=loop.controls)
+    write_c(tmp_path, "furuta", double=double, actuator=servo, action=loop.controls)
     library, kind = compiled(tmp_path, double, "servo_step", "servo_target")
     assert library.servo_target(kind(0.5)) == pytest.approx(0.5 * 3.0)
     state, random, limited, free = (kind * 1)(), np.random.default_rng(0), 0, 0
@@ -271,9 +279,9 @@ def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name,
         ("furuta", {"action": "voltage"}),
     ],
 )
-def test_without_a_drive_s_loop_there_is_the_policy_alone(tmp_path, task, changes):
-    assert current_loop(EnvConfig(task, **changes)) is None
-    written(tmp_path, task, **changes)
+def test_c_has_only_the_policy_without_a_current_loop(tmp_path, task, changes):
+    assert loop_parameters(EnvConfig(task, **changes)) is None
+    write_c(tmp_path, task, **changes)
     assert "current_step" not in (tmp_path / "controller.h").read_text()
 
 
@@ -281,7 +289,7 @@ MLP, SARSA = ("pendulum", "ppo"), ("acrobot", "sarsa")
 
 
 @pytest.mark.parametrize(
-    ("board", "policy", "hidden", "double", "says"),
+    ("board", "policy", "hidden", "double", "message"),
     [
         (
             "arduino-uno",
@@ -308,8 +316,10 @@ MLP, SARSA = ("pendulum", "ppo"), ("acrobot", "sarsa")
         ("arduino-un", MLP, 48, False, "did you mean arduino-uno"),
     ],
 )
-def test_a_policy_that_does_not_fit_is_refused_with_both_sizes(board, policy, hidden, double, says):
-    network = network_of(trained(*policy, **({"hidden": (hidden, hidden)} if hidden else {}))[0])
+def test_raises_with_both_sizes_if_a_policy_does_not_fit(board, policy, hidden, double, message):
+    network = extract_network(
+        trained(*policy, **({"hidden": (hidden, hidden)} if hidden else {}))[0]
+    )
     check_board("nucleo-f446re", network, double=False)
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         check_board(board, network, double)

@@ -1,4 +1,4 @@
-"""A policy outside of the simulator: what other runtimes compute of it, and what its contract refuses."""
+"""Tests of the exported policy in other runtimes, and of its contract."""
 
 import csv
 import json
@@ -13,7 +13,7 @@ from onnx.reference import ReferenceEvaluator
 from codrl_mj.actuators import DCMotorActuator
 from codrl_mj.agents import AGENTS
 from codrl_mj.cli import main
-from codrl_mj.deploy import Contract, board_test, export, network_of, onnx_model
+from codrl_mj.deploy import Contract, board_test, export, extract_network, onnx_model
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import RandomPolicy
 from codrl_mj.runs.policies import load_policy, save_policy
@@ -29,14 +29,14 @@ SMALL = {"hidden": (16, 16)}
 
 
 def trained(task, agent, **settings):
-    """A policy with random weights that tell observations apart, and its settings."""
+    """Return a policy with random weights whose actions depend on the observation; its settings."""
     torch.manual_seed(0)
     torch.set_num_threads(1)
     env = EnvConfig(task)
-    with_env = env.make()
+    instance = env.make()
     config = AGENTS[agent](**settings)
-    policy = config.make_policy(with_env.observation_space, with_env.action_space)
-    with_env.close()
+    policy = config.make_policy(instance.observation_space, instance.action_space)
+    instance.close()
     with torch.no_grad():
         for parameter in policy.parameters():
             parameter.mul_(1.5).add_(0.02 * torch.randn_like(parameter))
@@ -45,7 +45,7 @@ def trained(task, agent, **settings):
 
 
 def observed(space, count=10_000):
-    """Observations (count, k), of which half are within the bounds and of the others many far out."""
+    """Return observations (count, k), half within the bounds and half partly far beyond."""
     random = np.random.default_rng(1)
     far = random.normal(0.0, 2.0, (count, *space.shape))
     near = random.uniform(np.maximum(space.low, -2.0), np.minimum(space.high, 2.0), far.shape)
@@ -53,11 +53,11 @@ def observed(space, count=10_000):
 
 
 def runtimes(model):
-    """Two that others wrote."""
+    """Return functions that compute the model with onnxruntime and with onnx's reference."""
     session = onnxruntime.InferenceSession(model.SerializeToString())
     return (
-        lambda seen: session.run(None, {"observation": seen})[0],
-        lambda seen: ReferenceEvaluator(model).run(None, {"observation": seen})[0],
+        lambda observations: session.run(None, {"observation": observations})[0],
+        lambda observations: ReferenceEvaluator(model).run(None, {"observation": observations})[0],
     )
 
 
@@ -74,21 +74,22 @@ EACH = [
 
 
 @pytest.mark.parametrize(("task", "agent", "settings"), EACH)
-def test_other_runtimes_act_as_the_policy_does(task, agent, settings):
+def test_other_runtimes_compute_the_policys_actions(task, agent, settings):
     policy, _ = trained(task, agent, **settings)
-    seen = observed(policy.observation_space)
-    acted = policy.predict(seen, deterministic=True)[0]
-    for run in runtimes(onnx_model(network_of(policy), {})):
-        other = run(seen)
-        assert other.dtype == acted.dtype
-        if acted.dtype == np.int64:
-            assert (other != acted).sum() <= 1  # two that are equally good but for rounding
+    observations = observed(policy.observation_space)
+    expected = policy.predict(observations, deterministic=True)[0]
+    for run in runtimes(onnx_model(extract_network(policy), {})):
+        actions = run(observations)
+        assert actions.dtype == expected.dtype
+        if expected.dtype == np.int64:
+            # Two actions may be equally good except for rounding.
+            assert (actions != expected).sum() <= 1
         else:
-            np.testing.assert_allclose(other, acted, atol=1e-6, rtol=0)
-    assert len(np.unique(acted.round(6))) > 1
+            np.testing.assert_allclose(actions, expected, atol=1e-6, rtol=0)
+    assert len(np.unique(expected.round(6))) > 1
 
 
-def test_the_table_is_the_policy(tmp_path):
+def test_csv_table_gives_the_policys_actions(tmp_path):
     policy, _ = trained("mountain_car", "sarsa")
     export(policy, EnvConfig("mountain_car"), "sarsa", tmp_path / "out", 1)
     header, *rows = csv.reader((tmp_path / "out/table.csv").open())
@@ -96,26 +97,27 @@ def test_the_table_is_the_policy(tmp_path):
     weights = {tuple(map(int, row[:3])): np.array(row[3:], float) for row in rows}
     assert len(weights) == 8 * 9 * 9
     low, high = np.array([-1.2, -0.07]), np.array([0.6, 0.07])
-    seen = np.random.default_rng(0).uniform(low, high, (300, 2)).astype(np.float32)
-    for one, action in zip(seen, policy.predict(seen, deterministic=True)[0], strict=True):
-        eighths = np.floor(
-            (one.astype(float) - low) / (high - low) * 64
-        )  # Sutton's displacements: 1 and 3 a tiling
+    observations = np.random.default_rng(0).uniform(low, high, (300, 2)).astype(np.float32)
+    for observation, action in zip(
+        observations, policy.predict(observations, deterministic=True)[0], strict=True
+    ):
+        eighths = np.floor((observation.astype(float) - low) / (high - low) * 64)
+        # Sutton's displacements are 1 and 3 eighths of a tile for each tiling.
         tiles = [
             (tiling, *((eighths + tiling * np.array([1, 3]) % 8) // 8).astype(int))
             for tiling in range(8)
         ]
         assert sum(weights[tile] for tile in tiles).argmax() == action
-    done = board_test(tmp_path / "out", episodes=2)
-    np.testing.assert_array_equal(done.on_board[1].action, done.in_python[1].action)
+    result = board_test(tmp_path / "out", episodes=2)
+    np.testing.assert_array_equal(result.on_board[1].action, result.in_python[1].action)
 
 
-# -- the folder ---------------------------------------------------------------------------------------------
+# -- the folder ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """A folder of a policy for Furuta behind its motor."""
+    """Export a policy for the Furuta pendulum with its motor."""
     folder = tmp_path_factory.mktemp("out") / "furuta"
     export(
         trained("furuta", "ppo")[0],
@@ -127,28 +129,37 @@ def exported(tmp_path_factory):
     return folder
 
 
-def test_the_golden_actions_are_those_of_the_file(exported):
+def test_onnx_file_gives_the_golden_actions(exported):
     golden = Contract.read(exported).golden
-    seen = np.array(golden["observations"], np.float32)
+    observations = np.array(golden["observations"], np.float32)
     model = onnx.load(exported / "policy.onnx")
     onnx.checker.check_model(model, full_check=True)
-    assert seen.shape == (200, 6)
+    assert observations.shape == (200, 6)
     for run in runtimes(model):
-        np.testing.assert_allclose(run(seen), golden["actions"], atol=golden["tolerance"])
+        np.testing.assert_allclose(run(observations), golden["actions"], atol=golden["tolerance"])
 
 
-def test_the_contract_says_what_passes_to_and_fro(exported):
+def test_contract_has_rate_units_bounds_actuators_and_metadata(exported):
     contract = Contract.read(exported)
     assert contract.rate == pytest.approx(50.0)
-    assert [one["unit"] for one in contract.observations] == ["1", "1", "1", "1", "rad/s", "rad/s"]
-    assert [one["name"] for one in contract.actions] == ["motor"]
+    assert [entry["unit"] for entry in contract.observations] == [
+        "1",
+        "1",
+        "1",
+        "1",
+        "rad/s",
+        "rad/s",
+    ]
+    assert [entry["name"] for entry in contract.actions] == ["motor"]
     assert contract.actions[0]["unit"] == "N*m"
     assert contract.actions[0]["most"] == pytest.approx(0.084)
     assert contract.actuators["motor"]["fields"]["motor"]["resistance"] == 8.4
-    least, most = np.array([one["seen"] for one in contract.observations]).T
-    assert (least <= most).all()
+    low, high = np.array([entry["seen"] for entry in contract.observations]).T
+    assert (low <= high).all()
     assert contract.late == {"after": pytest.approx(0.03), "unit": "s", "command": [0.0]}
-    metadata = {one.key: one.value for one in onnx.load(exported / "policy.onnx").metadata_props}
+    metadata = {
+        entry.key: entry.value for entry in onnx.load(exported / "policy.onnx").metadata_props
+    }
     assert json.loads(metadata["observations"])[4]["name"] == "arm_velocity"
 
 
@@ -156,25 +167,26 @@ CURRENTS = {"action": "current", "observe_actuator": True}
 
 
 @pytest.mark.parametrize(
-    ("task", "changes", "units", "actions"),
+    ("task", "changes", "units", "expected"),
     [
         ("cartpole", {}, ["m", "m/s", "rad", "rad/s"], ("motor", "N", [-10.0, 10.0], None)),
         ("pendulum", CURRENTS, ["1", "1", "rad/s", "A", "A"], ("motor", "A", None, 2.0)),
         ("acrobot", {}, ["1"] * 4 + ["rad/s"] * 2, ("motor", "N*m", [-1.0, 0.0, 1.0], None)),
         ("mountain_car", {}, ["m", "m/s"], ("motor", "N", [-1.0, 0.0, 1.0], None)),
+        # A third-party environment has bounds but no units.
         (
             "InvertedPendulum-v5",
             {},
             [None] * 4,
             ("slide", None, None, 3.0),
-        ),  # of others: bounds and no units
+        ),
     ],
 )
-def test_units_are_those_of_state_signals_and_commands(task, changes, units, actions):
+def test_units_are_those_of_state_signals_and_commands(task, changes, units, expected):
     config = EnvConfig(task, **changes)
-    seen, (acts,) = config.world.interface(config)
-    assert [one["unit"] for one in seen] == units
-    assert (acts["name"], acts["unit"], acts.get("levels"), acts.get("most")) == actions
+    observations, (action,) = config.world.interface(config)
+    assert [entry["unit"] for entry in observations] == units
+    assert (action["name"], action["unit"], action.get("levels"), action.get("most")) == expected
 
 
 @pytest.mark.parametrize(
@@ -191,28 +203,28 @@ def test_units_are_those_of_state_signals_and_commands(task, changes, units, act
         (lambda seen: seen, 100.0, "at 100 Hz, must be 50 Hz"),
     ],
 )
-def test_observations_of_another_kind_or_rate_are_refused(exported, change, rate, message):
+def test_raises_for_wrong_observations_or_a_wrong_rate(exported, change, rate, message):
     contract = Contract.read(exported)
-    rows = [(one["name"], one["unit"]) for one in contract.observations]
-    contract.admit(rows, 50.0)
+    rows = [(entry["name"], entry["unit"]) for entry in contract.observations]
+    contract.check_observations(rows, 50.0)
     with pytest.raises(ValueError, match=message):
-        contract.admit(change(rows), rate)
+        contract.check_observations(change(rows), rate)
 
 
-def test_another_actuator_is_refused_by_the_number_that_differs(exported):
+def test_raises_for_another_actuator_with_the_field_that_differs(exported):
     contract = Contract.read(exported)
     (drive,) = EnvConfig("furuta").driven.values()
-    contract.admit_actuators({"motor": drive})
+    contract.check_actuators({"motor": drive})
     weaker = drive.replaced({"supply.voltage": 6.0})
-    for other, message in {
+    for actuator, message in {
         weaker: r"supply\.voltage = 6\.0, must be 18\.0",
         DCMotorActuator(): "must be drive",
     }.items():
         with pytest.raises(ValueError, match=message):
-            contract.admit_actuators({"motor": other})
+            contract.check_actuators({"motor": actuator})
 
 
-def test_an_edited_contract_is_refused(exported, tmp_path):
+def test_raises_for_an_edited_contract(exported, tmp_path):
     text = (exported / "contract.json").read_text()
     (tmp_path / "contract.json").write_text(text.replace('"rate": 50.0', '"rate": 51.0'))
     with pytest.raises(ValueError, match="sha256"):
@@ -220,7 +232,7 @@ def test_an_edited_contract_is_refused(exported, tmp_path):
 
 
 @pytest.mark.parametrize("agent", ["sac", "td3"])
-def test_large_commands_may_be_off_by_more(agent, tmp_path):
+def test_tolerance_scales_with_the_largest_command(agent, tmp_path):
     env = EnvConfig(
         "pendulum", {"name": "paper", "controller": {"max_voltage": 200.0}}, action="voltage"
     )
@@ -233,7 +245,7 @@ def test_large_commands_may_be_off_by_more(agent, tmp_path):
     assert golden["tolerance"] == pytest.approx(1e-5 * largest)
 
 
-def test_what_cannot_be_exported_is_said_and_leaves_nothing(tmp_path):
+def test_raises_and_writes_nothing_for_a_policy_that_cannot_be_exported(tmp_path):
     layered = trained("pendulum", "ppo")[0]
     layered.mlp_extractor.policy_net[1] = torch.nn.ELU()
     for policy, message in {
@@ -247,7 +259,7 @@ def test_what_cannot_be_exported_is_said_and_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_from_the_command_line(tmp_path, capsys):
+def test_export_on_the_command_line(tmp_path, capsys):
     policy, config = trained("pendulum", "ppo", **SMALL)
     save_policy(policy, config, tmp_path / "policy")
     out = tmp_path / "out"
@@ -262,16 +274,16 @@ def test_from_the_command_line(tmp_path, capsys):
         "1",
     ]
     assert main([*line, "--out", str(out)]) == 0
-    told = capsys.readouterr().out
-    assert "angular_velocity" in told
-    assert "20 Hz" in told
-    kept = {path: path.read_bytes() for path in out.iterdir()}
+    printed = capsys.readouterr().out
+    assert "angular_velocity" in printed
+    assert "20 Hz" in printed
+    files = {path: path.read_bytes() for path in out.iterdir()}
     contract = Contract.read(out)
     assert (contract.task, contract.agent) == ("pendulum", "ppo")
-    again = load_policy(tmp_path / "policy")
-    seen = np.array(contract.golden["observations"], np.float32)
+    loaded = load_policy(tmp_path / "policy")
+    observations = np.array(contract.golden["observations"], np.float32)
     np.testing.assert_array_equal(
-        again.predict(seen, deterministic=True)[0], contract.golden["actions"]
+        loaded.predict(observations, deterministic=True)[0], contract.golden["actions"]
     )
     assert "typedef float real" in (out / "controller.h").read_text()
     assert (
@@ -279,5 +291,5 @@ def test_from_the_command_line(tmp_path, capsys):
     )
     assert "typedef double real" in (tmp_path / "small" / "controller.h").read_text()
     assert main([*line, "--out", str(out)]) == 2
-    assert "is no empty folder" in capsys.readouterr().err
-    assert {path: path.read_bytes() for path in out.iterdir()} == kept
+    assert "is not an empty folder" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in out.iterdir()} == files

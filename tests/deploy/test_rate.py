@@ -1,4 +1,4 @@
-"""The exported rate is that at which the environment takes actions, whatever its model's integration step is."""
+"""Tests that the exported rate is the rate of actions, whatever the model's integration step is."""
 
 import functools
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::Deprecat
 
 
 class Repeating(gym.Wrapper):
-    """Each action for several steps, as many as the list says in turn."""
+    """A wrapper that repeats each action for a number of steps, from a list in turn."""
 
     def __init__(self, env, repeats):
         """Wrap an environment."""
@@ -28,16 +28,16 @@ class Repeating(gym.Wrapper):
 
     def step(self, action):
         for _ in range(self.repeats[self.count % len(self.repeats)]):
-            outcome = self.env.step(action)
+            result = self.env.step(action)
         self.count += 1
-        return outcome
+        return result
 
 
 class OfDmControl(gym.Env):
-    """An environment of dm_control's behind Gymnasium's interface."""
+    """A dm_control environment with Gymnasium's interface."""
 
     def __init__(self, domain, task):
-        """Load it."""
+        """Load the environment."""
         self.inner = suite.load(domain, task, task_kwargs={"random": 0})
         self.model, self.data = self.inner.physics.model.ptr, self.inner.physics.data.ptr
         spec = self.inner.action_spec()
@@ -60,64 +60,64 @@ def repeated(*repeats):
 
 @pytest.fixture
 def registered(request):
-    """The id of an environment that a function makes."""
+    """Register an environment that a function creates, and return its id."""
     gym.register("RateOfMine-v0", request.param, max_episode_steps=50)
     yield "RateOfMine-v0"
     gym.registry.pop("RateOfMine-v0")
 
 
 @pytest.mark.parametrize("env_id", V5)
-def test_of_gymnasiums_environments(env_id):
+def test_rate_of_gymnasiums_environments(env_id):
     with gym.make(env_id) as env:
-        assert Interface.between(EnvConfig(env_id)).rate == pytest.approx(
+        assert Interface.from_env(EnvConfig(env_id)).rate == pytest.approx(
             1.0 / env.unwrapped.dt, rel=1e-9
         )
 
 
-def test_of_another_frame_skip():
+def test_rate_with_another_frame_skip():
     with gym.make("Hopper-v5", frame_skip=8) as env:
         assert env.unwrapped.dt == pytest.approx(0.016)
-        rate = Interface.between(EnvConfig("Hopper-v5", options={"frame_skip": 8})).rate
+        rate = Interface.from_env(EnvConfig("Hopper-v5", options={"frame_skip": 8})).rate
     assert rate == pytest.approx(62.5, rel=1e-9)
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_of_tasks(task):
-    assert Interface.between(EnvConfig(task)).rate == pytest.approx(
+def test_rate_of_tasks(task):
+    assert Interface.from_env(EnvConfig(task)).rate == pytest.approx(
         1.0 / TASKS[task].step_duration, rel=1e-12
     )
 
 
-def test_of_a_world_and_of_a_task_of_ones_own():
-    assert Interface.between(EnvConfig("tests.envs.rig:RIG")).rate == pytest.approx(
-        50.0
-    )  # 10 steps of 2 ms
-    assert Interface.between(EnvConfig("tests.own_project.arm:TASK")).rate == pytest.approx(20.0)
+def test_rate_of_a_custom_env_source_and_a_custom_task():
+    # The rig takes 10 steps of 2 ms.
+    assert Interface.from_env(EnvConfig("tests.envs.rig:RIG")).rate == pytest.approx(50.0)
+    assert Interface.from_env(EnvConfig("tests.own_project.arm:TASK")).rate == pytest.approx(20.0)
 
 
 @pytest.mark.parametrize(
     ("registered", "rate"),
+    # The first environment has no `dt`, the second has a wrapper inside.
     [
         (BareEnv, 100.0),
         (functools.partial(repeated, 4), 25.0),
-    ],  # without a dt; with a wrapper inside
+    ],
     indirect=["registered"],
 )
-def test_of_functions_that_make_environments(registered, rate):
-    assert Interface.between(EnvConfig(registered)).rate == pytest.approx(rate, rel=1e-9)
+def test_rate_of_functions_that_create_environments(registered, rate):
+    assert Interface.from_env(EnvConfig(registered)).rate == pytest.approx(rate, rel=1e-9)
 
 
 @pytest.mark.parametrize("registered", [functools.partial(repeated, 2, 3)], indirect=True)
-def test_steps_of_no_one_duration_are_refused(registered):
+def test_raises_if_steps_have_different_durations(registered):
     with pytest.raises(ValueError, match=r"first steps take \[0\.02, 0\.03.*must be equal"):
-        Interface.between(EnvConfig(registered))
+        Interface.from_env(EnvConfig(registered))
 
 
 @pytest.mark.parametrize(
     "name", ["cartpole/swingup", "pendulum/swingup", "reacher/easy", "finger/spin", "walker/walk"]
 )
-def test_of_dm_controls_environments(name):
-    """Their physics takes one integration step in halves."""
+def test_rate_of_dm_control_environments(name):
+    """Check dm_control, whose physics splits an integration step into halves."""
     domain, task = name.split("/")
     inner = suite.load(domain, task)
     env = codrl_mj.make(
@@ -132,19 +132,22 @@ def test_of_dm_controls_environments(name):
     assert ours.control_timestep() == inner.control_timestep()
 
 
-def test_a_recorder_knows_the_duration_before_the_first_step():
-    """A live view has the ends of its settings, and its pace, from there."""
+def test_recorder_knows_the_step_duration_before_the_first_step():
+    """Check the duration that a live view needs for the ranges of its settings and its pace."""
     env = codrl_mj.make("HalfCheetah-v5", {".*": "ideal"})
     assert env.recorder.step_duration == pytest.approx(0.05)
     env.close()
 
 
-def test_of_contract_and_c(tmp_path):
+def test_rate_in_the_contract_and_the_c(tmp_path):
     env = EnvConfig("InvertedPendulum-v5", max_episode_steps=100)
-    with env.make() as made:
-        policy = SACConfig(hidden=(8,)).make_policy(made.observation_space, made.action_space)
+    with env.make() as instance:
+        policy = SACConfig(hidden=(8,)).make_policy(
+            instance.observation_space, instance.action_space
+        )
     contract = export(policy, env, "sac", tmp_path / "out", 1)
-    assert contract.rate == pytest.approx(25.0)  # 2 steps of 0.02 s
+    # The environment takes 2 steps of 0.02 s.
+    assert contract.rate == pytest.approx(25.0)
     assert contract.late["after"] == pytest.approx(0.06)
     header = (tmp_path / "out/controller.h").read_text()
     assert "#define CONTROLLER_POLICY_RATE 25.0f" in header

@@ -1,4 +1,4 @@
-"""A board at a serial port: here a program of the exported C, with sensors of its own, behind a pseudo-terminal."""
+"""Tests of a board at a serial port: a program of the exported C behind a pseudo-terminal."""
 
 import os
 import subprocess
@@ -39,7 +39,7 @@ void wire_apply(const real command[CONTROLLER_COMMANDS]) { given[0] = command[0]
 
 
 def with_sensors(folder, out, *flags):
-    """The board's program of an exported folder, compiled with these sensors; its path."""
+    """Compile the board's program of an exported folder with simulated sensors; return its path."""
     (out / "sensors.c").write_text(SENSORS)
     sources = [str(folder / name) for name in ("controller.c", "wire.c", "board.c")]
     line = [
@@ -55,14 +55,14 @@ def with_sensors(folder, out, *flags):
     return str(out / "board")
 
 
-def exported(out, fastest):
+def exported(out, max_velocity):
     export(
         trained("furuta", "ppo")[0],
         EnvConfig("furuta"),
         "ppo",
         out,
         1,
-        limits={"arm_velocity": fastest},
+        limits={"arm_velocity": max_velocity},
     )
     return out
 
@@ -74,26 +74,29 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def port(folder, tmp_path):
-    """Starts a board, and says where it is; BAD is the question to which an arm's velocity of WORSE is the answer."""
+    """Return a function that starts a board and returns its port.
+
+    The board's measurement number `bad` has the arm velocity `worse`, and number `gone` fails.
+    """
     tty, running, opened = pytest.importorskip("tty"), [], []
 
     def start(bad=0, worse="0", gone=0):
         program = with_sensors(
             folder, tmp_path, f"-DBAD={bad}", f"-DWORSE={worse}", f"-DGONE={gone}"
         )
-        ours, theirs = os.openpty()
-        tty.setraw(theirs)
-        tty.setraw(ours)
-        opened.extend((ours, theirs))
-        running.append(subprocess.Popen([program], stdin=ours, stdout=ours))
-        return os.ttyname(theirs)
+        board_end, host_end = os.openpty()
+        tty.setraw(host_end)
+        tty.setraw(board_end)
+        opened.extend((board_end, host_end))
+        running.append(subprocess.Popen([program], stdin=board_end, stdout=board_end))
+        return os.ttyname(host_end)
 
     yield start
-    for one in running:
-        one.kill()
-        one.wait()
-    for one in opened:
-        os.close(one)
+    for process in running:
+        process.kill()
+        process.wait()
+    for descriptor in opened:
+        os.close(descriptor)
 
 
 def table_of(log):
@@ -102,67 +105,68 @@ def table_of(log):
 
 
 @pytest.mark.parametrize("drive", [False, True])
-def test_a_board_is_watched_or_driven_and_what_it_says_is_a_log(
+def test_answers_of_a_board_are_logged_while_watching_or_driving(
     folder, port, tmp_path, drive, capsys
 ):
     log = tmp_path / "swing.csv"
     line = ["board", "run", str(folder), "--port", port(), "--out", str(log), "--seconds", "0.7"]
     assert main([*line, "--drive"] if drive else line) == 0
-    assert "told to" in capsys.readouterr().out
+    assert "requested" in capsys.readouterr().out
     header, rows = table_of(log)
-    assert 15 <= len(rows) <= 37  # 50 a second, fewer on a machine that is busy
+    # There are 50 rows per second, and fewer on a busy machine.
+    assert 15 <= len(rows) <= 37
     assert header[-4:] == ["motor:N*m", "motor_voltage:V", "motor_current:A", "motor_position:rad"]
-    question = np.rint(
-        rows[:, 2] / 0.01
-    )  # of which one may stay without an answer, on such a machine
-    np.testing.assert_allclose(rows[:, 2], 0.01 * question, rtol=1e-6)
-    follows = np.diff(question, prepend=0.0) == 1.0
-    assert (np.diff(question) >= 1.0).all()
+    # On a busy machine a measurement may have no answer.
+    measurement = np.rint(rows[:, 2] / 0.01)
+    np.testing.assert_allclose(rows[:, 2], 0.01 * measurement, rtol=1e-6)
+    follows = np.diff(measurement, prepend=0.0) == 1.0
+    assert (np.diff(measurement) >= 1.0).all()
     assert follows.sum() >= 10
     expected, _ = OnnxPolicy(folder).predict(rows[:, 1:7])
     np.testing.assert_allclose(rows[:, 7], expected[:, 0], atol=1e-6)
-    given = (
-        np.append(0.0, rows[:-1, 7]) if drive else np.zeros(len(rows))
-    )  # what the drive got before
-    np.testing.assert_allclose(rows[follows, 8], given[follows], atol=1e-6)
-    found = check_log(folder, log)
-    assert (found.rows, found.differing) == (len(rows), 0)
+    # The simulated sensors measure the command that the drive got before.
+    applied = np.append(0.0, rows[:-1, 7]) if drive else np.zeros(len(rows))
+    np.testing.assert_allclose(rows[follows, 8], applied[follows], atol=1e-6)
+    result = check_log(folder, log)
+    assert (result.rows, result.differing) == (len(rows), 0)
     columns = "time='time:s':s,voltage='motor_voltage:V':V,current='motor_current:A':A,"
-    read = read_log(log, f"{columns}position='motor_position:rad':rad")
-    np.testing.assert_allclose(read.signals["position"], 0.1 * question, rtol=1e-6)
+    signal_log = read_log(log, f"{columns}position='motor_position:rad':rad")
+    np.testing.assert_allclose(signal_log.signals["position"], 0.1 * measurement, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("worse", "why"),
+    ("worse", "reason"),
     [
         ("25", "beyond the limits"),
         ("-25", "beyond the limits"),
-        ("(real)(1e30 * 1e30)", "no finite"),
+        ("(real)(1e30 * 1e30)", "is not finite"),
     ],
 )
-def test_a_board_that_drives_is_stopped_when_something_is_wrong(folder, port, tmp_path, worse, why):
-    done = run_board(folder, port(10, worse), tmp_path / "log.csv", drive=True, seconds=5.0)
-    assert why in done.why
-    assert done.rows == 10 - done.missed  # on a machine that is busy an answer may come too late
+def test_driving_board_is_stopped_if_something_is_wrong(folder, port, tmp_path, worse, reason):
+    result = run_board(folder, port(10, worse), tmp_path / "log.csv", drive=True, seconds=5.0)
+    assert reason in result.reason
+    # On a busy machine an answer may come too late.
+    assert result.rows == 10 - result.missed
     _, rows = table_of(tmp_path / "log.csv")
     assert rows[:-1, 7].all()
-    assert rows[-1, 7] == 0.0  # in C
+    # The C itself gives the safe command.
+    assert rows[-1, 7] == 0.0
     watched = run_board(folder, port(10, worse), tmp_path / "log.csv", seconds=0.5)
-    assert watched.why == "told to"
+    assert watched.reason == "requested"
 
 
-def test_a_second_run_does_not_drive_with_the_command_of_the_first(folder, port, tmp_path):
+def test_second_run_does_not_drive_with_the_command_of_the_first(folder, port, tmp_path):
     board = port()
-    assert run_board(folder, board, tmp_path / "first.csv", seconds=0.5).why == "told to"
-    again = run_board(
-        folder, board, tmp_path / "again.csv", drive=True, seconds=5.0
-    )  # no watchdog: stamps are old
-    assert "took a frame for old" in again.why
+    assert run_board(folder, board, tmp_path / "first.csv", seconds=0.5).reason == "requested"
+    # Without a watchdog, the board takes the second run's stamps for old.
+    second = run_board(folder, board, tmp_path / "again.csv", drive=True, seconds=5.0)
+    assert "took a frame for old" in second.reason
     _, rows = table_of(tmp_path / "again.csv")
-    assert not rows[:, 8].any()  # what the drive got
+    # This column has the commands that the drive got.
+    assert not rows[:, 8].any()
 
 
-def test_what_was_logged_is_kept_when_it_is_interrupted(folder, port, tmp_path):
+def test_interrupted_run_keeps_its_log(folder, port, tmp_path):
     answers = []
 
     def pull(answer):
@@ -170,25 +174,27 @@ def test_what_was_logged_is_kept_when_it_is_interrupted(folder, port, tmp_path):
         if len(answers) == 8:
             raise OSError("the cable is out")
 
-    done = run_board(folder, port(), tmp_path / "log.csv", drive=True, seconds=5.0, on_answer=pull)
-    assert "the cable is out" in done.why
-    assert len(table_of(tmp_path / "log.csv")[1]) == done.rows == 8
+    result = run_board(
+        folder, port(), tmp_path / "log.csv", drive=True, seconds=5.0, on_answer=pull
+    )
+    assert "the cable is out" in result.reason
+    assert len(table_of(tmp_path / "log.csv")[1]) == result.rows == 8
 
 
-def test_a_number_that_is_none_is_named_with_its_line(folder, port, tmp_path):
+def test_raises_for_a_value_that_is_not_finite_with_its_line(folder, port, tmp_path):
     log = tmp_path / "log.csv"
     run_board(folder, port(10, "(real)(1e30 * 1e30)"), log, seconds=0.5)
-    place = next(
+    line_number = next(
         number for number, line in enumerate(log.read_text().splitlines(), 1) if "inf" in line
     )
-    assert 10 <= place <= 11
+    assert 10 <= line_number <= 11
     with pytest.raises(
-        ValueError, match=rf"line {place}, arm_velocity:rad/s: inf: must be a finite number"
+        ValueError, match=rf"line {line_number}, arm_velocity:rad/s: inf: must be a finite number"
     ):
         check_log(folder, log)
 
 
-def test_any_key_ends_it(folder, port, tmp_path):
+def test_any_key_ends_the_run(folder, port, tmp_path):
     keys, terminal = os.openpty()
     line = [sys.executable, "-m", "codrl_mj", "board", "run", str(folder), "--port", port()]
     line += ["--out", str(tmp_path / "log.csv")]
@@ -196,24 +202,23 @@ def test_any_key_ends_it(folder, port, tmp_path):
         assert b"any key ends it" in running.stdout.readline()
         time.sleep(1.0)
         os.write(keys, b" ")
-        assert b"told to" in running.communicate(timeout=10)[0]
+        assert b"requested" in running.communicate(timeout=10)[0]
     assert running.returncode == 0
-    for one in (keys, terminal):
-        os.close(one)
+    for descriptor in (keys, terminal):
+        os.close(descriptor)
 
 
-def test_in_python_too_limits_are_kept(folder, port, tmp_path):
+def test_limits_are_also_checked_in_python(folder, port, tmp_path):
     tighter = exported(tmp_path / "tighter", 0.05)
-    done = run_board(
-        tighter, port(), tmp_path / "log.csv", drive=True, seconds=5.0
-    )  # whose C allows 20 rad/s
-    assert "beyond the limits" in done.why
+    # The board's C allows 20 rad/s.
+    result = run_board(tighter, port(), tmp_path / "log.csv", drive=True, seconds=5.0)
+    assert "beyond the limits" in result.reason
     _, rows = table_of(tmp_path / "log.csv")
-    assert len(rows) == 6 - done.missed
+    assert len(rows) == 6 - result.missed
     assert rows[-1, 7] != 0.0
 
 
-def test_a_board_without_sensors_an_answer_or_a_port_is_said(folder, port, tmp_path, capsys):
+def test_missing_sensors_answers_and_ports_are_reported(folder, port, tmp_path, capsys):
     log = tmp_path / "log.csv"
     with pytest.raises(RuntimeError, match="the board has no sensors: give it wire_sense"):
         run_board(folder, port(gone=3), log, seconds=2.0)
@@ -223,9 +228,10 @@ def test_a_board_without_sensors_an_answer_or_a_port_is_said(folder, port, tmp_p
         == 2
     )
     assert "is the board plugged in" in capsys.readouterr().err
-    ours, theirs = os.openpty()  # nobody listens
-    done = run_board(folder, os.ttyname(theirs), log, drive=True, seconds=5.0)
-    assert done.why == "3 frames in a row had no answer"
-    assert (done.rows, done.missed) == (0, 3)
-    for one in (ours, theirs):
-        os.close(one)
+    # No program reads from this terminal.
+    board_end, host_end = os.openpty()
+    result = run_board(folder, os.ttyname(host_end), log, drive=True, seconds=5.0)
+    assert result.reason == "3 frames in a row had no answer"
+    assert (result.rows, result.missed) == (0, 3)
+    for descriptor in (board_end, host_end):
+        os.close(descriptor)

@@ -1,7 +1,7 @@
-"""Zips of Stable-Baselines3 in and out: with the statistics of `VecNormalize`, and in the units of their training.
+"""Tests of the export of Stable-Baselines3 zips, with `VecNormalize` and other units.
 
-What is expected is what Stable-Baselines3 itself computes: `VecNormalize.normalize_obs`, then the
-model's `predict`.
+The expected values are those of Stable-Baselines3: `VecNormalize.normalize_obs`, then the model's
+`predict`.
 """
 
 import json
@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 import codrl_mj
 from codrl_mj.cli import main
-from codrl_mj.deploy import Board, Contract, export, network_of
+from codrl_mj.deploy import Board, Contract, export, extract_network
 from codrl_mj.deploy.board import missing_tools
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import evaluate
@@ -51,7 +51,7 @@ ZIP = ["--task", "pendulum", "--agent", "ppo", "--trust"]
 
 
 def model_of(agent, envs):
-    """A small model that learned nothing."""
+    """Return a small untrained model."""
     settings = LEARNS[agent] | {"policy_kwargs": {"net_arch": [16]}}
     return getattr(stable_baselines3, agent.upper())(
         "MlpPolicy", envs, **settings, seed=0, device="cpu"
@@ -59,16 +59,16 @@ def model_of(agent, envs):
 
 
 def saved(folder, agent, task, normalized=True, steps=32, **options):
-    """A model that learned a little, and its `VecNormalize`, in two folders."""
+    """Train a model briefly and save it and its `VecNormalize` into two folders; return both."""
     envs = codrl_mj.make_sb3_vec_env(TASK_IDS[task], 2, **options)
     envs = VecNormalize(envs, clip_obs=2.0) if normalized else envs
     model = model_of(agent, envs)
     model.learn(steps)
     (folder / "apart").mkdir()
     model.save(folder / "policy.zip")
-    if (
-        normalized
-    ):  # as after a long training of observations far from zero, beside which they hardly change
+    # The statistics are like those of a long training with observations far from zero that hardly
+    # change.
+    if normalized:
         envs.obs_rms.mean[:] = np.linspace(-300.0, 200.0, len(envs.obs_rms.mean))
         envs.obs_rms.var[:] = np.geomspace(1e-6, 9.0, len(envs.obs_rms.mean))
         envs.save(folder / "apart/statistics.pkl")
@@ -76,7 +76,7 @@ def saved(folder, agent, task, normalized=True, steps=32, **options):
 
 
 def observed(statistics, count=500):
-    """Raw observations of which some are beyond the clip."""
+    """Return raw observations, some of which exceed the clip."""
     rms = statistics.obs_rms
     random = np.random.default_rng(1)
     return (rms.mean + 1.5 * np.sqrt(rms.var) * random.normal(size=(count, len(rms.mean)))).astype(
@@ -90,7 +90,7 @@ def observed(statistics, count=500):
     ids="-".join,
 )
 def normalized(request, tmp_path_factory):
-    """Task and agent, a folder with the zip, the model, and its statistics."""
+    """Return task and agent, a folder with the zip, the model, and its statistics."""
     task, agent = request.param
     folder = tmp_path_factory.mktemp(agent)
     return task, agent, folder, *saved(folder, agent, task)
@@ -98,7 +98,7 @@ def normalized(request, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def half(tmp_path_factory):
-    """A folder with the zip of PPO behind `VecNormalize`."""
+    """Save a zip of PPO that was trained with `VecNormalize`, and return its folder."""
     folder = tmp_path_factory.mktemp("half")
     saved(folder, "ppo", "pendulum")
     return folder
@@ -109,45 +109,47 @@ def _elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-# -- statistics ---------------------------------------------------------------------------------------------
+# -- statistics ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("double", [False, True], ids=["float", "double"])
-def test_onnx_and_c_and_contract_have_the_statistics(normalized, tmp_path, double):
+def test_onnx_c_and_contract_have_the_statistics(normalized, tmp_path, double):
     task, agent, folder, model, statistics = normalized
     policy = load_sb3_zip(folder / "policy.zip", agent, True, folder / "apart/statistics.pkl")
     export(policy, EnvConfig(task), agent, tmp_path / "out", 1, double=double)
-    seen = observed(statistics)
-    within = np.abs(statistics.normalize_obs(seen))
-    assert 0.05 < (within == 2.0).mean() < 0.5
-    expected = model.predict(statistics.normalize_obs(seen), deterministic=True)[0]
+    observations = observed(statistics)
+    clipped = np.abs(statistics.normalize_obs(observations))
+    assert 0.05 < (clipped == 2.0).mean() < 0.5
+    expected = model.predict(statistics.normalize_obs(observations), deterministic=True)[0]
     assert len(np.unique(expected)) > 1
-    acted = onnxruntime.InferenceSession(tmp_path / "out/policy.onnx").run(
-        None, {"observation": seen}
+    actions = onnxruntime.InferenceSession(tmp_path / "out/policy.onnx").run(
+        None, {"observation": observations}
     )[0]
-    np.testing.assert_allclose(acted, expected, atol=1e-5)
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
     contract, rms = Contract.read(tmp_path / "out"), statistics.obs_rms
     mean, variance, scale, offset = np.array(
         [
-            [one[name] for name in ("mean", "variance", "scale", "offset")]
-            for one in contract.observations
+            [entry[name] for name in ("mean", "variance", "scale", "offset")]
+            for entry in contract.observations
         ]
     ).T
     np.testing.assert_array_equal(mean, rms.mean)
     np.testing.assert_allclose(variance, rms.var + statistics.epsilon, rtol=1e-12)
     np.testing.assert_allclose(
-        scale * seen[0] + offset, (seen[0] - rms.mean) / np.sqrt(rms.var + 1e-8), atol=1e-6
+        scale * observations[0] + offset,
+        (observations[0] - rms.mean) / np.sqrt(rms.var + 1e-8),
+        atol=1e-6,
     )
-    assert {one["clip"] for one in contract.observations} == {2.0}
+    assert {entry["clip"] for entry in contract.observations} == {2.0}
     if missing_tools("host"):
         pytest.skip("NOT RUN: no C compiler: apt-get install gcc")
     with Board(tmp_path / "out") as board:
-        commands = np.array([board.command(row) for row in seen[:100]])
-    np.testing.assert_allclose(commands, contract.commands(expected[:100]), atol=1e-5)
+        commands = np.array([board.command(row) for row in observations[:100]])
+    np.testing.assert_allclose(commands, contract.to_commands(expected[:100]), atol=1e-5)
 
 
 @pytest.mark.parametrize(
-    "changes", [{"norm_obs": False}, {"clip_obs": np.inf}], ids=lambda one: next(iter(one))
+    "changes", [{"norm_obs": False}, {"clip_obs": np.inf}], ids=lambda changes: next(iter(changes))
 )
 def test_other_settings_of_vecnormalize(half, tmp_path, changes):
     envs = codrl_mj.make_sb3_vec_env(TASK_IDS["pendulum"], 1)
@@ -156,21 +158,21 @@ def test_other_settings_of_vecnormalize(half, tmp_path, changes):
     statistics.save(tmp_path / "other.pkl")
     policy = load_sb3_zip(half / "policy.zip", "ppo", True, tmp_path / "other.pkl")
     export(policy, EnvConfig("pendulum"), "ppo", tmp_path / "out", 1)
-    seen = observed(statistics)
+    observations = observed(statistics)
     model = stable_baselines3.PPO.load(half / "policy.zip", device="cpu")
-    expected = model.predict(statistics.normalize_obs(seen), deterministic=True)[0]
-    acted = onnxruntime.InferenceSession(tmp_path / "out/policy.onnx").run(
-        None, {"observation": seen}
+    expected = model.predict(statistics.normalize_obs(observations), deterministic=True)[0]
+    actions = onnxruntime.InferenceSession(tmp_path / "out/policy.onnx").run(
+        None, {"observation": observations}
     )[0]
-    np.testing.assert_allclose(acted, expected, atol=1e-5)
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
     if not missing_tools("host"):
         with Board(tmp_path / "out") as board:
             np.testing.assert_allclose(
-                [board.command(row) for row in seen[:50]], expected[:50], atol=1e-5
+                [board.command(row) for row in observations[:50]], expected[:50], atol=1e-5
             )
 
 
-def test_an_evaluation_has_the_returns_of_stable_baselines3(normalized, capsys):
+def test_evaluation_has_the_returns_of_stable_baselines3(normalized, capsys):
     task, agent, folder, model, statistics = normalized
     expected = []
     for seed in range(2):
@@ -192,15 +194,15 @@ def test_an_evaluation_has_the_returns_of_stable_baselines3(normalized, capsys):
     )
 
 
-def test_half_a_policy_is_refused(half, tmp_path, capsys):
+def test_raises_for_a_policy_without_its_statistics(half, tmp_path, capsys):
     for verb in ("evaluate", "export"):
         assert main([verb, str(half / "policy.zip"), *ZIP]) == 2
-        said = capsys.readouterr().err
+        error = capsys.readouterr().err
         assert (
             "half of a policy that was trained behind VecNormalize: its last observations were"
-            " normalized" in said
+            " normalized" in error
         )
-        assert "--normalize FILE.pkl, or say --normalize none" in said
+        assert "--normalize FILE.pkl, or say --normalize none" in error
     assert not list(tmp_path.iterdir())
     raw = load_sb3_zip(half / "policy.zip", "ppo", True, "none")
     expected = stable_baselines3.PPO.load(half / "policy.zip").predict(
@@ -209,41 +211,38 @@ def test_half_a_policy_is_refused(half, tmp_path, capsys):
     np.testing.assert_array_equal(raw.predict(np.ones((1, 3)), deterministic=True)[0], expected)
 
 
-@pytest.mark.parametrize(
-    "place", ["statistics.pkl", "CartPole-v0/vecnormalize.pkl"]
-)  # the second: rl-zoo3's
-def test_statistics_beside_a_zip_are_asked_for(tmp_path, place):
+# The second path is rl-zoo3's.
+@pytest.mark.parametrize("path", ["statistics.pkl", "CartPole-v0/vecnormalize.pkl"])
+def test_raises_for_unused_statistics_beside_a_zip(tmp_path, path):
     model, _ = saved(tmp_path, "ppo", "cartpole", normalized=False)
-    assert (
-        load_sb3_zip(tmp_path / "policy.zip", "ppo", True) is not None
-    )  # nothing hints at statistics
-    (tmp_path / place).parent.mkdir(exist_ok=True)
-    (tmp_path / place).write_bytes(b"")
+    # Without a file there is no sign of statistics.
+    assert load_sb3_zip(tmp_path / "policy.zip", "ppo", True) is not None
+    (tmp_path / path).parent.mkdir(exist_ok=True)
+    (tmp_path / path).write_bytes(b"")
     with pytest.raises(
-        ValueError, match=rf"half of a policy.*{place} may have its statistics.*--normalize none"
+        ValueError, match=rf"half of a policy.*{path} may have its statistics.*--normalize none"
     ):
         load_sb3_zip(tmp_path / "policy.zip", "ppo", True)
     assert load_sb3_zip(tmp_path / "policy.zip", "ppo", True, "none") is not None
     assert model.num_timesteps > 0
 
 
-def test_a_zip_that_says_nothing_is_warned_of(tmp_path):
+def test_warns_if_a_zip_does_not_tell_about_normalization(tmp_path):
     saved(tmp_path, "dqn", "cartpole", normalized=False)
     with pytest.warns(UserWarning, match="does not say whether it was trained behind VecNormalize"):
         load_sb3_zip(tmp_path / "policy.zip", "dqn", True)
 
 
-def test_normalized_observations_in_a_zip_give_it_away(tmp_path):
+def test_raises_if_last_observations_in_a_zip_are_normalized(tmp_path):
     model, _ = saved(tmp_path, "dqn", "cartpole", normalized=False)
-    model._last_obs = model._last_obs + np.float32(
-        [0.0, 0.0, 1.0, 0.0]
-    )  # a pole at more than its 24 degrees
+    # The pole is at more than its 24 degrees.
+    model._last_obs = model._last_obs + np.float32([0.0, 0.0, 1.0, 0.0])
     model.save(tmp_path / "policy.zip")
     with pytest.raises(ValueError, match="lie outside of its observation space"):
         load_sb3_zip(tmp_path / "policy.zip", "dqn", True)
 
 
-def test_files_that_are_no_statistics_of_the_policy_are_refused(half, tmp_path):
+def test_raises_for_files_without_the_policys_statistics(half, tmp_path):
     class Bomb:
         def __reduce__(self):
             return open, (str(tmp_path / "executed"), "w")
@@ -252,7 +251,7 @@ def test_files_that_are_no_statistics_of_the_policy_are_refused(half, tmp_path):
     (tmp_path / "list.pkl").write_bytes(pickle.dumps([0.0]))
     (tmp_path / "bomb.pkl").write_bytes(pickle.dumps(Bomb()))
     VecNormalize(codrl_mj.make_sb3_vec_env(TASK_IDS["cartpole"], 1)).save(tmp_path / "cartpole.pkl")
-    for name, says in {
+    for name, message in {
         "none.pkl": "no such file; name what VecNormalize.save wrote",
         "text.pkl": "must be a file that VecNormalize.save wrote",
         "list.pkl": "holds a list: must be a file that VecNormalize.save wrote",
@@ -260,19 +259,19 @@ def test_files_that_are_no_statistics_of_the_policy_are_refused(half, tmp_path):
             r"the policy observes Box.*\(3,\).*: name the file that was saved with the policy"
         ),
     }.items():
-        with pytest.raises((ValueError, FileNotFoundError), match=says):
+        with pytest.raises((ValueError, FileNotFoundError), match=message):
             load_sb3_zip(half / "policy.zip", "ppo", True, tmp_path / name)
     with pytest.raises(ValueError, match="Pass --trust"):
         load_sb3_zip(half / "policy.zip", "ppo", False, tmp_path / "bomb.pkl")
     assert not (tmp_path / "executed").exists()
 
 
-def test_statistics_are_for_zips_alone(capsys):
+def test_raises_for_statistics_without_a_zip(capsys):
     assert main(["evaluate", "runs/mine", "--normalize", "statistics.pkl"]) == 2
     assert "runs/mine is no zip of Stable-Baselines3: leave it out" in capsys.readouterr().err
 
 
-# -- units --------------------------------------------------------------------------------------------------
+# -- units -----------------------------------------------------------------------------------------
 
 
 VOLTS = {"actuator": {"name": "paper", "controller": {"max_voltage": 12.0}}, "action": "voltage"}
@@ -280,7 +279,7 @@ VOLTS = {"actuator": {"name": "paper", "controller": {"max_voltage": 12.0}}, "ac
 
 @pytest.fixture(scope="module")
 def volts(tmp_path_factory):
-    """A zip of PPO that commands the voltage of a motor of 12 V, and a file of that motor."""
+    """Save a zip of PPO that commands the voltage of a 12 V motor, and a file of that motor."""
     folder = tmp_path_factory.mktemp("volts")
     saved(folder, "ppo", "pendulum", normalized=False, **VOLTS)
     (folder / "apart/motor.yaml").write_text("name: paper\ncontroller: {max_voltage: 12.0}\n")
@@ -291,16 +290,15 @@ def test_volts_are_not_exported_as_torques(volts, tmp_path, capsys):
     path, motor = str(volts / "policy.zip"), str(volts / "apart/motor.yaml")
     for verb in (["evaluate", path, *ZIP, "--episodes", "1"], ["export", path, *ZIP]):
         assert main(verb) == 2
-        said = capsys.readouterr().err
-        assert "action_space: the policy was trained with Box(-12.0, 12.0, (1,), float32)" in said
+        error = capsys.readouterr().err
+        assert "action_space: the policy was trained with Box(-12.0, 12.0, (1,), float32)" in error
         assert (
             "pendulum as it is set has Box(-2.0, 2.0, (1,), float32): set what it was trained with"
-            in said
+            in error
         )
-        assert "--env.action" in said
-    assert (
-        main(["export", path, *ZIP, "--env.action", "voltage"]) == 2
-    )  # of the task's own motor, which has others
+        assert "--env.action" in error
+    # The task's default motor has other voltages.
+    assert main(["export", path, *ZIP, "--env.action", "voltage"]) == 2
     assert "Box(-12.0, 12.0, (1,), float32)" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
     assert (
@@ -308,8 +306,8 @@ def test_volts_are_not_exported_as_torques(volts, tmp_path, capsys):
         == 0
     )
     assert "no current loop: this policy commands a voltage" in capsys.readouterr().out
-    (acts,) = Contract.read(tmp_path / "out").actions
-    assert (acts["unit"], acts["least"], acts["most"]) == ("V", -12.0, 12.0)
+    (action,) = Contract.read(tmp_path / "out").actions
+    assert (action["unit"], action["least"], action["most"]) == ("V", -12.0, 12.0)
     with pytest.raises(ValueError, match=r"Box\(-12\.0, 12\.0.*has Box\(-2\.0, 2\.0"):
         export(
             load_sb3_zip(volts / "policy.zip", "ppo", True),
@@ -320,7 +318,7 @@ def test_volts_are_not_exported_as_torques(volts, tmp_path, capsys):
 
 
 @pytest.mark.filterwarnings("default::UserWarning")
-def test_another_motor_in_an_evaluation_is_warned_of(volts, capsys):
+def test_warns_of_another_motor_in_an_evaluation(volts, capsys):
     line = [
         "evaluate",
         str(volts / "policy.zip"),
@@ -339,7 +337,7 @@ def test_another_motor_in_an_evaluation_is_warned_of(volts, capsys):
     assert "warning" not in capsys.readouterr().err
 
 
-def test_other_observations_are_refused(tmp_path, capsys):
+def test_raises_for_other_observations(tmp_path, capsys):
     envs = VecFrameStack(codrl_mj.make_sb3_vec_env(TASK_IDS["pendulum"], 1), 4)
     model_of("ppo", envs).save(tmp_path / "stacked.zip")
     envs = codrl_mj.make_sb3_vec_env(
@@ -364,13 +362,13 @@ def test_other_observations_are_refused(tmp_path, capsys):
         "--env.observe-actuator",
     ]
     assert main(line) == 0
-    assert [one["unit"] for one in Contract.read(tmp_path / "exported").observations][3:] == [
+    assert [entry["unit"] for entry in Contract.read(tmp_path / "exported").observations][3:] == [
         "A",
         "A",
     ]
 
 
-def test_a_run_is_exported_as_it_was_trained(tmp_path, capsys):
+def test_run_is_exported_with_the_environment_of_its_training(tmp_path, capsys):
     tiny = (
         "--num-envs 1 --agent.rollout-steps 64 --agent.batch-size 64 --agent.epochs 1"
         " --agent.hidden 8"
@@ -386,12 +384,12 @@ def test_a_run_is_exported_as_it_was_trained(tmp_path, capsys):
     assert Contract.read(tmp_path / "exported").assumed == load_config(Path("run")).env.as_mapping()
 
 
-def test_statistics_count_as_numbers_of_the_network(half):
-    plain, whole = (
-        network_of(load_sb3_zip(half / "policy.zip", "ppo", True, one))
-        for one in ("none", half / "apart/statistics.pkl")
+def test_statistics_count_in_the_size_of_the_network(half):
+    plain, normalized = (
+        extract_network(load_sb3_zip(half / "policy.zip", "ppo", True, statistics))
+        for statistics in ("none", half / "apart/statistics.pkl")
     )
-    assert whole.size == plain.size + 2 * 3
+    assert normalized.size == plain.size + 2 * 3
 
 
 @pytest.mark.parametrize("agent", ["ppo", "dqn"])

@@ -20,7 +20,7 @@ from codrl_mj.actuators import (
     from_array,
 )
 from codrl_mj.envs import ActuatedEnv
-from codrl_mj.validation.motor_catalogue import Bench, Mechanics
+from codrl_mj.validation.motor_catalogue import DriveOracle, JointOracle
 from tests.envs.faces import run
 from tests.envs.vectors import assert_equal_episodes, assert_same, batched, looped
 from tests.matrix import matrix_params
@@ -56,7 +56,7 @@ SIMPLE = {
     "resistance_coefficient": 0.0,
     "max_temperature": math.inf,
 }
-"""What `Bench` does not know, left out."""
+"""What `DriveOracle` does not know, left out."""
 ONE = Drive(MOTOR, supply=Supply(6.0))  # which is short at times
 ADDED = {
     name: getattr(MOTOR, name) for name in ("rotor_inertia", "coulomb_friction", "viscous_friction")
@@ -175,8 +175,8 @@ def test_everything_drawn_moves_as_the_equations_say(task, seed):
     one, definition, state = env.actuator, env.task, env.state
     timestep, at = definition.step_duration, definition.speed_indices[0]
     bench, mechanics = (
-        Bench(one, timestep),
-        Mechanics(definition, one, timestep, definition.integrators[0]),
+        DriveOracle(one, timestep),
+        JointOracle(definition, one, timestep, definition.integrators[0]),
     )
     arm = one.motor.arm_radius / one.motor.gear_ratio
     for action in actions(task, seed, 30):

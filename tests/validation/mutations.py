@@ -1,4 +1,4 @@
-"""Ways to make the simulation of a task wrong, for the tests of the checks that must notice."""
+"""Faults in the simulation of a task, for tests of the checks that must detect them."""
 
 import mujoco
 
@@ -8,7 +8,7 @@ from codrl_mj.physics import MujocoPhysics
 
 
 def wrong_model(monkeypatch, change):
-    """Every task's MuJoCo model has the change made to it once it was accepted: `change(model)`."""
+    """Apply `change(model)` to every task's MuJoCo model after its construction."""
     make = MujocoPhysics.__init__
 
     def make_wrong(self, *arguments, **options):
@@ -19,12 +19,12 @@ def wrong_model(monkeypatch, change):
 
 
 def entry(parameter):
-    """Where a current loop's parameter is in the user data of its actuator."""
+    """Return the index of a current loop's parameter in the user data of its actuator."""
     return USER_HEADER_SIZE + parameters_type(DCMotorActuator)._fields.index(parameter)
 
 
 def scaled_motor(parameter, factor):
-    """A change that scales one parameter of the motor, where there is one."""
+    """Return a change that scales one parameter of the motor, if the model has a motor."""
 
     def change(model):
         if model.nuser_actuator:
@@ -33,27 +33,27 @@ def scaled_motor(parameter, factor):
     return change
 
 
-def scaled(field, factor, at=slice(None)):
-    """A change that scales an array of the model, or a part of it."""
+def scaled(field, factor, index=slice(None)):
+    """Return a change that scales an array of the model, or a part of it."""
 
     def change(model):
-        getattr(model, field)[at] *= factor
+        getattr(model, field)[index] *= factor
 
     return change
 
 
 def euler(model):
-    """Another integrator than the task's."""
+    """Replace the task's integrator by Euler."""
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
 
 
 def rusty(model):
-    """Friction that nobody asked for."""
+    """Add damping to all joints."""
     model.dof_damping[:] = 0.05
 
 
 def late_force(monkeypatch):
-    """MuJoCo gets every command one environment step late."""
+    """Give every command to MuJoCo one environment step late."""
     step, reset = MujocoPhysics.step, MujocoPhysics.reset
 
     def late(self, desired_force):
@@ -69,21 +69,25 @@ def late_force(monkeypatch):
 
 
 def failed(checks):
-    """Names of the checks that failed."""
+    """Return the names of the checks that failed."""
     return {check.name for check in checks if not check.passed}
 
 
-KNOWN = {}
-"""What was computed once."""
+CACHE = {}
+"""Results of the functions of `once`."""
 
 
 def once(function, faulty):
-    """The function, which computes what it is asked for again once only, unless its first argument is the faulty."""
+    """Return the function with a cache, which is not used if its first argument is `faulty`."""
 
-    def made(first, *others):
-        key = function.__name__, repr((first, *(one for one in others if not callable(one))))
-        if first is faulty or key not in KNOWN:
-            KNOWN[key] = function(first, *others)
-        return KNOWN[key]
+    def cached(first, *others):
+        # Functions have no stable representation, so they are left out of the key.
+        key = (
+            function.__name__,
+            repr((first, *(argument for argument in others if not callable(argument)))),
+        )
+        if first is faulty or key not in CACHE:
+            CACHE[key] = function(first, *others)
+        return CACHE[key]
 
-    return made
+    return cached

@@ -1,4 +1,4 @@
-"""Every check of convergence fails when the physics are made wrong."""
+"""Tests that every convergence check fails if the physics are wrong."""
 
 import dataclasses
 
@@ -37,44 +37,46 @@ def with_motor(task):
 
 
 def failures(monkeypatch, task):
-    """The checks that fail of a fault in MuJoCo: solutions and analytic runs, which it does not move, are made once."""
-    for name in ("solve", "_states"):
+    """Return the names of the checks that fail because of a fault in MuJoCo."""
+    # Solutions and analytic runs do not depend on the fault, so they are computed only once.
+    for name in ("solve", "_simulated_states"):
         monkeypatch.setattr(convergence, name, once(getattr(convergence, name), MujocoPhysics))
     return failed(convergence.checks(task, quick=True))
 
 
 MOTOR = {"inductance": 1.05, "resistance": 1.05, "torque_constant": 1.05, "back_emf_constant": -1.0}
 FAULTS = [
-    # task, its model's fault, and of the checks ideal, with the motor and rate: which fail, and
-    # which others may
+    # Each row has the task, the model's fault, the groups of checks that must fail (ideal, motor,
+    # rate), and the groups that may fail.
     *((task, scaled("body_mass", 1.01), "ideal motor rate", "") for task in TASKS),
     *(
         (task, scaled("actuator_gear", 1.01), "motor rate", "ideal")
         for task in ("pendulum", "acrobot")
     ),
-    *(("pendulum", scaled_motor(*one), "motor", "rate") for one in MOTOR.items()),
+    *(("pendulum", scaled_motor(*change), "motor", "rate") for change in MOTOR.items()),
     ("acrobot", euler, "ideal", "motor rate"),
-    ("pendulum", scaled("actuator_gear", 1e9), "ideal motor rate", ""),  # it diverges
+    # This simulation diverges.
+    ("pendulum", scaled("actuator_gear", 1e9), "ideal motor rate", ""),
 ]
 
 
-@pytest.mark.parametrize(("task", "fault", "seen_by", "others"), FAULTS)
-def test_a_wrong_model_fails_the_checks_that_see_it(monkeypatch, task, fault, seen_by, others):
+@pytest.mark.parametrize(("task", "fault", "must_fail", "may_fail"), FAULTS)
+def test_wrong_model_fails_the_affected_checks(monkeypatch, task, fault, must_fail, may_fail):
     wrong_model(monkeypatch, fault)
     names = {"ideal": ideal(task), "motor": with_motor(task), "rate": {RATE}}
-    least, more = (
-        set().union(*(names[one] for one in words.split())) for words in (seen_by, others)
+    required, allowed = (
+        set().union(*(names[group] for group in groups.split())) for groups in (must_fail, may_fail)
     )
-    assert least <= failures(monkeypatch, task) <= least | more
+    assert required <= failures(monkeypatch, task) <= required | allowed
 
 
 @pytest.mark.parametrize("task", ["pendulum", "mountain_car"])
-def test_a_force_that_is_a_step_late_fails_every_check(monkeypatch, task):
+def test_force_one_step_late_fails_every_check(monkeypatch, task):
     late_force(monkeypatch)
     assert failures(monkeypatch, task) == ideal(task) | with_motor(task) | {RATE}
 
 
-def test_a_wrong_force_on_the_analytic_physics_fails_every_check(monkeypatch):
+def test_wrong_force_in_the_analytic_physics_fails_every_check(monkeypatch):
     step = AnalyticPhysics.step
     monkeypatch.setattr(AnalyticPhysics, "step", lambda self, force: step(self, 1.01 * force))
     assert ideal("cartpole") | with_motor("cartpole") <= failed(
@@ -82,11 +84,11 @@ def test_a_wrong_force_on_the_analytic_physics_fails_every_check(monkeypatch):
     )
 
 
-# -- the oracle ---------------------------------------------------------------------------------------------
+# -- the oracle ------------------------------------------------------------------------------------
 
 
-def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
-    """A change of Gymnasium's own equations moves the oracle and the analytic physics: MuJoCo is what then differs."""
+def test_oracle_is_the_installed_gymnasium(monkeypatch):
+    """Check that a change of Gymnasium's equations makes MuJoCo differ from the oracle."""
     make = gymnasium.envs.classic_control.CartPoleEnv.__init__
 
     def lighter(self, *arguments, **options):
@@ -103,7 +105,7 @@ def test_the_oracle_is_the_installed_gymnasium(monkeypatch):
         assert check.where.startswith("MuJoCo")
 
 
-def test_the_equations_are_the_textbooks():
+def test_equations_equal_the_textbook():
     generator = np.random.default_rng(0)
     pendulum, cartpole = (gymnasium_equations(TASKS[name]) for name in ("pendulum", "cartpole"))
     car = gymnasium_equations(TASKS["mountain_car_continuous"])
@@ -123,7 +125,7 @@ def test_the_equations_are_the_textbooks():
         np.testing.assert_allclose(car(np.array([x, v]), force / 2), expected, rtol=0, atol=1e-14)
 
 
-def test_acrobots_equations_are_the_limit_of_its_steps():
+def test_acrobot_equations_are_the_limit_of_its_steps():
     task = TASKS["acrobot"]
     equations, state = gymnasium_equations(task), np.array([0.3, -0.7, 0.9, -1.1])
     physics = AnalyticPhysics(
@@ -138,11 +140,11 @@ def test_acrobots_equations_are_the_limit_of_its_steps():
 
 @pytest.mark.parametrize("motor", [False, True], ids=["ideal", "motor"])
 @pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].constrain is not None])
-def test_the_runs_stay_away_from_every_bound(task, motor):
-    """Solution and coarsest run, at every integration step of it."""
+def test_runs_stay_away_from_every_bound(task, motor):
+    """Check the states of the solution, and of a fine run at every integration step."""
     definition = TASKS[task]
     start, forces, _ = free_run(definition)
-    actuators = convergence.analogues(definition) if motor else [IDEAL]
+    actuators = convergence.continuous_actuators(definition) if motor else [IDEAL]
     states = [*solve(definition, gymnasium_equations(definition), start, forces, actuators)]
     unbounded = dataclasses.replace(
         definition, step_duration=definition.step_duration / 128, constrain=None

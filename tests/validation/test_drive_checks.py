@@ -1,4 +1,4 @@
-"""The oracles of bench motors, against equations written by hand, and what the fitted drives bring into the tasks."""
+"""Tests of the oracles of off-the-shelf motors against hand-written equations."""
 
 import dataclasses
 import math
@@ -8,21 +8,30 @@ import pytest
 
 from codrl_mj.actuators import Drive, GearMotor
 from codrl_mj.tasks import PAPER_TASKS, TASKS
-from codrl_mj.validation.motor_catalogue import FITTED, Bench, Mechanics, drive_checks, fitted
+from codrl_mj.validation.motor_catalogue import (
+    TASK_MOTORS,
+    DriveOracle,
+    JointOracle,
+    drive_checks,
+    task_drive,
+)
 
 ROTOR = GearMotor(
     rotor_inertia=0.02, viscous_friction=0.3, coulomb_friction=0.4, gear_ratio=2.0, arm_radius=0.8
 )
-ARMATURE, DAMPING, FRICTION = 0.02 * 6.25, 0.3 * 6.25, 0.4 * 2.5  # (n/r)^2 and n/r
+# Inertia and damping scale with (n/r)^2, friction with n/r.
+ARMATURE, DAMPING, FRICTION = 0.02 * 6.25, 0.3 * 6.25, 0.4 * 2.5
 
 
 def accelerations(task, state, force, inertia):
-    """Mass matrix and forces by hand, `inertia` added to the driven joint; an array, by speeds."""
-    if task == "pendulum":  # a rod of 1 kg and 1 m under 10 m/s^2
+    """Return the accelerations of all speeds, with `inertia` added to the driven joint."""
+    # The pendulum is a rod of 1 kg and 1 m under 10 m/s^2.
+    if task == "pendulum":
         return np.array([(5.0 * math.sin(state[0]) + force) / (1.0 / 3.0 + inertia)])
     if task == "mountain_car":
         return np.array([(force - 2.5 * math.cos(3.0 * state[0])) / (1000.0 + inertia)])
-    sine, cosine = math.sin(state[2]), math.cos(state[2])  # a cart of 1 kg, a rod of 0.1 kg and 1 m
+    # The cart has 1 kg, its rod 0.1 kg and 1 m.
+    sine, cosine = math.sin(state[2]), math.cos(state[2])
     matrix = [[1.1 + inertia, 0.05 * cosine], [0.05 * cosine, 0.1 / 3.0]]
     return np.linalg.solve(matrix, [force + 0.05 * state[3] ** 2 * sine, 0.05 * 9.8 * sine])
 
@@ -36,10 +45,10 @@ def accelerations(task, state, force, inertia):
         ("cartpole", (0.1, -1.2, 0.5, -0.8), "semi-implicit"),
     ],
 )
-def test_the_oracle_moves_as_mass_matrices_with_a_rotor_say(task, state, integrator):
-    """While it slides; the damping of a semi-implicit step is that of the new speed."""
+def test_oracle_equals_mass_matrices_with_a_rotor(task, state, integrator):
+    """Check sliding joints; a semi-implicit step has the damping of the new speed."""
     definition, step = TASKS[task], 1e-3
-    after = Mechanics(definition, Drive(ROTOR), step, integrator).step(np.array(state), 0.6)
+    after = JointOracle(definition, Drive(ROTOR), step, integrator).step(np.array(state), 0.6)
     speeds = list(definition.qvel)
     sliding = 0.6 - DAMPING * state[1] - math.copysign(FRICTION, state[1])
     implicit = step * DAMPING if integrator == "semi-implicit" else 0.0
@@ -49,9 +58,9 @@ def test_the_oracle_moves_as_mass_matrices_with_a_rotor_say(task, state, integra
     )
 
 
-def test_the_oracle_holds_what_is_less_than_the_friction():
+def test_oracle_holds_a_force_below_the_friction():
     pendulum, state = TASKS["pendulum"], np.array([math.pi, 0.0])
-    mechanics = Mechanics(pendulum, Drive(ROTOR), 0.05, "semi-implicit")
+    mechanics = JointOracle(pendulum, Drive(ROTOR), 0.05, "semi-implicit")
     for _ in range(40):
         state = mechanics.step(state, 0.9)
     assert abs(state[0] - math.pi) < 0.05
@@ -60,28 +69,31 @@ def test_the_oracle_holds_what_is_less_than_the_friction():
     assert abs(state[0] - math.pi) > 0.15
 
 
-def test_the_bench_settles_at_what_is_asked_or_at_ohm_s_law():
-    one = Drive()
-    bench = Bench(one, 0.01)
-    torques = [bench.torque(0.05, 100.0) for _ in range(3)]
+def test_drive_oracle_settles_at_the_command_or_at_the_voltage_limit():
+    actuator = Drive()
+    oracle = DriveOracle(actuator, 0.01)
+    torques = [oracle.torque(0.05, 100.0) for _ in range(3)]
     assert torques[-1] == pytest.approx(0.05, rel=1e-9)
-    stalled = [bench.torque(10.0, 100.0) for _ in range(3)]
-    assert stalled[-1] == pytest.approx(0.042 * (24.0 - 0.042 * 100.0) / 8.4, rel=1e-9)
-    lossy = Bench(
-        dataclasses.replace(one, motor=dataclasses.replace(one.motor, gear_efficiency=0.8)), 0.01
+    saturated = [oracle.torque(10.0, 100.0) for _ in range(3)]
+    assert saturated[-1] == pytest.approx(0.042 * (24.0 - 0.042 * 100.0) / 8.4, rel=1e-9)
+    lossy = DriveOracle(
+        dataclasses.replace(
+            actuator, motor=dataclasses.replace(actuator.motor, gear_efficiency=0.8)
+        ),
+        0.01,
     )
     assert [lossy.torque(0.05, 100.0) for _ in range(3)][-1] == pytest.approx(0.04, rel=1e-9)
 
 
-def test_every_task_has_a_drive_and_together_they_have_every_addition():
-    assert FITTED.keys() == {task.name for task in PAPER_TASKS}
-    drives = [fitted(name) for name in FITTED]
-    assert len({name for name, *_ in FITTED.values()}) == len(FITTED)
-    assert all(any(one.additions[entry] > 0.0 for one in drives) for entry in range(3))
+def test_every_task_has_a_drive_and_they_cover_inertia_damping_and_friction():
+    assert TASK_MOTORS.keys() == {task.name for task in PAPER_TASKS}
+    drives = [task_drive(name) for name in TASK_MOTORS]
+    assert len({name for name, *_ in TASK_MOTORS.values()}) == len(TASK_MOTORS)
+    assert all(any(drive.additions[entry] > 0.0 for drive in drives) for entry in range(3))
 
 
-def test_a_wrong_motor_fails(monkeypatch):
-    """The comparison with the oracle sees a torque that is off by a thousandth; that of two of ours does not."""
-    torque = Bench.torque
-    monkeypatch.setattr(Bench, "torque", lambda self, *inputs: 1.001 * torque(self, *inputs))
+def test_wrong_oracle_fails_only_the_comparison_with_it(monkeypatch):
+    """Check that a torque error of 0.1 % fails; the comparison of two engine loops passes."""
+    torque = DriveOracle.torque
+    monkeypatch.setattr(DriveOracle, "torque", lambda self, *inputs: 1.001 * torque(self, *inputs))
     assert [check.passed for check in drive_checks(quick=True)] == [False, True]

@@ -1,4 +1,4 @@
-"""Every check of the motor fails when the motor is made wrong."""
+"""Tests that every check of the motor fails if the motor is wrong."""
 
 import ast
 import dataclasses
@@ -13,7 +13,7 @@ import pytest
 from scipy import integrate, signal
 
 from codrl_mj.actuators import FAMILIES, CurrentLoop, DCMotorActuator, Motor, Supply
-from codrl_mj.validation import motor, motor_catalogue, own_model, rotors
+from codrl_mj.validation import motor, motor_catalogue, motor_loops, own_model, rotors
 from codrl_mj.validation.motor_loops import closed_form, closed_loop, sampled_system
 from codrl_mj.validation.rotors import EVERY_FEATURE, Loop, standard_loops
 from codrl_mj.validation.table import Skipped
@@ -51,15 +51,16 @@ EVERY = LOOP | {VOLTAGE, LINE, NO_LOAD, RK4, GEM} | NATIVE | COMPILED | DRIVES
 
 MINE = {"every feature": EVERY_FEATURE}
 MOTORS = {"every feature": EVERY_FEATURE.actuator.motor}
-MADE = (  # names -> their checks, with a few loops and motors only
-    ({ORDER, LIMIT}, lambda: motor.analogue(MINE, quick=True)),
+# Names of checks, and a function that runs them with a few loops and motors only.
+RUNS = (
+    ({ORDER, LIMIT}, lambda: motor.order_to_closed_form(MINE, quick=True)),
     ({SAMPLED, STEP, MAGNITUDE, PHASE}, lambda: motor.sampled_checks(MINE, quick=True)),
     ({VOLTAGE}, lambda: motor.voltage_limit(MINE)),
     ({LINE}, lambda: motor.torque_speed_line(MOTORS)),
     ({NO_LOAD}, lambda: motor.no_load(MOTORS)),
-    ({MAP}, lambda: motor.same_map(SMALL, quick=True)),
-    ({SUB}, lambda: motor.substeps(SMALL, quick=True)),
-    ({FAST}, lambda: motor.implicitfast(SMALL, quick=True)),
+    ({MAP}, lambda: motor.equal_to_native(SMALL, quick=True)),
+    ({SUB}, lambda: motor.order_in_substeps(SMALL, quick=True)),
+    ({FAST}, lambda: motor.order_under_implicitfast(SMALL, quick=True)),
     (COMPILED, lambda: own_model.compiled_checks(quick=True)),
     ({RK4}, lambda: motor.rk4_check(quick=True)),
     ({GEM}, lambda: motor.gem_check(Motor(), quick=True)),
@@ -67,14 +68,14 @@ MADE = (  # names -> their checks, with a few loops and motors only
 )
 
 
-def failed(wanted):
-    """The checks that fail, of those wanted and what comes with them."""
-    made = [check for names, make in MADE if names & wanted for check in make()]
-    return {check.name for check in made if not check.passed}
+def failed(names):
+    """Run the named checks, and those of the same functions, and return the names that fail."""
+    checks = [check for available, run in RUNS if available & names for check in run()]
+    return {check.name for check in checks if not check.passed}
 
 
 def mutate(monkeypatch, change):
-    """Every model with our motors is made wrong: `change(user data, gear)`, rows by motor, in place."""
+    """Apply `change(user data, gear)`, with rows by motor, to every model with codrl_mj motors."""
     install = rotors.install_callbacks
 
     def wrong(model):
@@ -120,68 +121,69 @@ MUTATIONS = {
     "gear + 1 %": (longer_gear, LOOP - {PHASE} | {VOLTAGE, LINE, NO_LOAD, GEM} | NATIVE),
     "substeps ignored": (one_substep, {ORDER, LIMIT, SAMPLED, SUB}),
 }
-"""Name -> (what is wrong, checks that must see it; others may)."""
+"""Name -> (fault, checks that must fail; others may fail)."""
 
 
 @pytest.mark.parametrize("mutation", MUTATIONS)
-def test_a_wrong_motor_fails(monkeypatch, mutation):
-    change, seen_by = MUTATIONS[mutation]
+def test_wrong_motor_fails(monkeypatch, mutation):
+    change, must_fail = MUTATIONS[mutation]
     mutate(monkeypatch, change)
-    assert seen_by <= failed(seen_by)
+    assert must_fail <= failed(must_fail)
 
 
-def test_every_family_is_compared_with_its_python():
+def test_every_family_is_compared_with_plain_python():
     names = {f"compiled advance: {kind.__name__}" for kind in FAMILIES.values()}
     assert names - COMPILED == {"compiled advance: Ideal"}, (
-        "the ideal actuator alone has no callback"
+        "only the ideal actuator has no callback"
     )
 
 
 def test_every_check_is_failed_by_some_mutation():
-    assert set().union(*(seen_by for _, seen_by in MUTATIONS.values())) == EVERY
+    assert set().union(*(must_fail for _, must_fail in MUTATIONS.values())) == EVERY
 
 
-def test_a_command_that_is_a_step_late_fails(monkeypatch):
+def test_command_one_step_late_fails(monkeypatch):
     step, waiting = mujoco.mj_step, {}
 
     def late(model, data):
         _, command = waiting.get(id(data), (data, np.zeros_like(data.ctrl)))
+        # A reference to the data is kept, so that their id is not used for other data.
         waiting[id(data)] = (
             data,
             data.ctrl.copy(),
-        )  # which keeps the data: their id is not used again
+        )
         data.ctrl[:] = command
         step(model, data)
 
     monkeypatch.setattr(rotors.mujoco, "mj_step", late)
-    # the native motor's command is late as well: what is compared with it does not notice
+    # The native motor's command is also late, so comparisons with it do not fail.
     assert failed({SAMPLED, LIMIT}) >= {SAMPLED, STEP, PHASE, LIMIT}
 
 
-def test_a_task_has_its_own_loop_checked(monkeypatch):
-    monkeypatch.setattr(motor, "checks_of", lambda loops, _: iter([list(loops)]))
+def test_loop_of_a_task_is_checked(monkeypatch):
+    monkeypatch.setattr(motor, "loop_checks", lambda loops, _: iter([list(loops)]))
     assert next(motor.checks("cartpole", quick=True)) == ["cartpole"]
 
 
-def test_a_motor_that_never_saturates_and_one_without_back_emf_have_their_own_checks():
+def test_checks_without_a_voltage_limit_and_a_back_emf():
     quiet = DCMotorActuator(Motor(back_emf_constant=0.0), CurrentLoop(max_voltage=math.inf))
     names = {
-        check.name: check for check in motor.checks_of({"mine": Loop(quiet, 0.01)}, quick=True)
+        check.name: check for check in motor.loop_checks({"mine": Loop(quiet, 0.01)}, quick=True)
     }
     assert names.keys() == LOOP | {LINE}
     assert all(check.passed for check in names.values())
 
 
 @pytest.mark.parametrize("supply", [Supply(12.0), Supply(24.0, 0.5), Supply(np.inf, 0.5), None])
-def test_a_motor_behind_a_supply_is_held_to_the_torque_that_this_leaves(supply):
+def test_stall_torque_is_limited_by_the_supply(supply):
     actuator = DCMotorActuator(controller=CurrentLoop(kp=2.0, ki=5.0), supply=supply)
     checks = {
-        check.name: check for check in motor.checks_of({"mine": Loop(actuator, 0.01)}, quick=True)
+        check.name: check for check in motor.loop_checks({"mine": Loop(actuator, 0.01)}, quick=True)
     }
     assert checks["stall torque at the voltage limit"].passed
 
 
-def test_a_stiff_motor_passes_at_its_own_substeps():
+def test_stiff_motor_passes_with_its_substeps():
     stiff = DCMotorActuator(
         Motor(
             resistance=0.5,
@@ -192,16 +194,16 @@ def test_a_stiff_motor_passes_at_its_own_substeps():
         ),
         CurrentLoop(kp=0.5, ki=800.0, substeps=40),
     )
-    for check in motor.checks_of({"mine": Loop(stiff, 0.01)}, quick=True):
+    for check in motor.loop_checks({"mine": Loop(stiff, 0.01)}, quick=True):
         assert check.passed, check
 
 
-# -- the oracles --------------------------------------------------------------------------------------------
+# -- the oracles -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [*standard_loops()])
-def test_the_sampled_oracles_are_the_papers_equations(name):
-    """State space, blocks and the equations in plain Python are one system."""
+def test_sampled_oracles_equal_the_papers_equations(name):
+    """Check that state space, blocks and plain Python are the same system."""
     actuator, timestep = standard_loops()[name]
     m, c = actuator.motor, dataclasses.replace(actuator.controller, substeps=1)
     actuator = DCMotorActuator(m, c)
@@ -216,8 +218,8 @@ def test_the_sampled_oracles_are_the_papers_equations(name):
     np.testing.assert_allclose(np.ravel(blocks.outputs)[1:], currents, rtol=0, atol=1e-10)
 
 
-def test_the_closed_form_solves_the_circuits_equations():
-    """Against scipy's integrator, on the loop without a derivative."""
+def test_closed_form_solves_the_circuits_equations():
+    """Compare with scipy's integrator, on a loop without a derivative gain."""
     actuator = DCMotorActuator(
         Motor(inductance=0.05, back_emf_constant=0.7),
         CurrentLoop(kp=2, ki=5, bemf_compensation=False),
@@ -232,24 +234,25 @@ def test_the_closed_form_solves_the_circuits_equations():
     solved = integrate.solve_ivp(
         derivative, (0, times[-1]), [0, 0], "DOP853", times, rtol=1e-12, atol=1e-12
     )
+    # scipy interpolates between its steps with an error of 1e-8.
     np.testing.assert_allclose(
         closed_form(actuator, 0.02, np.ones(40), 0.4),
         solved.y[0],
         rtol=0,
-        atol=1e-8,  # of its interpolation
+        atol=1e-8,
     )
 
 
-def test_the_oracles_use_none_of_our_mathematics():
-    """Only the parameters' names are taken from the motor: not one of its functions."""
+def test_oracles_import_no_functions_of_the_actuators():
+    """Check that the oracles import only the classes with the parameters."""
     classes = {"Motor", "CurrentLoop", "DCMotorActuator"}
-    for path in Path(motor.__file__).parent.glob("motor*.py"):
+    for path in map(Path, (motor.__file__, motor_loops.__file__)):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and node.module.startswith("codrl_mj.actuators"):
                 assert {alias.name for alias in node.names} <= classes, path
 
 
-def test_the_native_motor_is_wrong_under_rk4_and_ours_is_not():
+def test_native_motor_is_wrong_under_rk4_and_ours_is_not():
     (check,) = motor.rk4_check(quick=True)
     ours, native = check.plots[0].curves
     assert ours.y.max() < 1e-12
@@ -257,11 +260,11 @@ def test_the_native_motor_is_wrong_under_rk4_and_ours_is_not():
     assert native.y[-1] > 0.3
 
 
-def test_without_gym_electric_motor_its_check_is_left_out(monkeypatch):
-    for name in ("checks_of", "compiled_checks", "drive_checks"):
+def test_check_is_skipped_without_gym_electric_motor(monkeypatch):
+    for name in ("loop_checks", "compiled_checks", "drive_checks"):
         monkeypatch.setattr(motor, name, lambda *_: iter(()))
     monkeypatch.setattr(motor, "MOTORS", SMALL)
     monkeypatch.setitem(sys.modules, "gym_electric_motor", None)
-    *made, skipped = motor.checks(quick=True)
-    assert {check.name for check in made} == NATIVE | {RK4}
+    *completed, skipped = motor.checks(quick=True)
+    assert {check.name for check in completed} == NATIVE | {RK4}
     assert skipped == Skipped(skipped.name, "gym-electric-motor is not installed")

@@ -1,4 +1,4 @@
-"""Of a task of one's own: checks whose conditions do not hold are left out, and a failed one says whose fault it is."""
+"""Tests of the certificate of custom tasks: skipped checks, and the cause of failed ones."""
 
 import dataclasses
 import itertools
@@ -30,7 +30,7 @@ XML = """
   <actuator><motor name="motor" joint="shaft"/></actuator>
 </mujoco>
 """
-"""A small Furuta pendulum, as somebody measured it; 0.8 N m turn it through a radian in 30 ms."""
+"""A small Furuta pendulum with measured parameters; 0.8 N m turn it through a radian in 30 ms."""
 COUNT = itertools.count()
 GENTLE = Trials(
     bounds=(3.0,) * 4,
@@ -43,14 +43,14 @@ GENTLE = Trials(
 
 
 def furuta(folder, changes=(), **fields):
-    """A task of that model, in whose text parts are replaced."""
+    """Register a task of the model, with parts of the model's text replaced."""
     text = XML
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
     number = next(COUNT)
     (path := folder / f"furuta{number}.xml").write_text(text)
-    given = {
+    defaults = {
         "name": f"own_furuta{number}",
         "env_id": f"own/Furuta{number}-v0",
         "asset": str(path),
@@ -68,7 +68,7 @@ def furuta(folder, changes=(), **fields):
         "reward": reward,
         "terminated": terminated,
     }
-    return codrl_mj.register(codrl_mj.Task(**given | fields))
+    return codrl_mj.register(codrl_mj.Task(**defaults | fields))
 
 
 def bounds(options):
@@ -91,7 +91,7 @@ def terminated(state):
     return np.abs(state[0]) > 9.0
 
 
-def judged(task):
+def certify(task):
     return validate(task.name, quick=True, groups=("convergence", "energy"))
 
 
@@ -99,7 +99,7 @@ RUBBING = ('damping="1e-6"', 'damping="1e-6" frictionloss="1e-4"')
 ALL = {"convergence: all checks", "energy: the balances of a whole run"}
 TWO = {f"energy: order, {name} balance, rk4" for name in ("mechanical", "whole")}
 CASES = {
-    # what is asked of the model -> which checks do not apply, and why
+    # Feature of the model -> changes of its text and of the task, skipped checks, and the reason.
     "tiny damping": ((), {}, set(), ""),
     "none": ((('damping="1e-5"', ""), ('damping="1e-6"', "")), {}, set(), ""),
     "Euler": (((' integrator="RK4"', ""),), {"integrators": ("euler",)}, set(), ""),
@@ -108,13 +108,13 @@ CASES = {
         (('<body name="rod"', '<body name="rod" gravcomp="1"'),),
         {"trials": GENTLE},
         TWO,
-        "the model has gravity compensation, whose energy no balance knows: leave that out",
+        "the model has gravity compensation, whose energy is in no balance: remove it",
     ),
     "another actuator": (
         (("</actuator>", '<position joint="hinge" kp="0.1"/></actuator>'),),
         {"trials": GENTLE},
         TWO,
-        "the model has actuators besides the task's motors, whose energy no balance knows",
+        "the model has actuators besides the task's motors, whose energy is in no balance",
     ),
     "quadratic drag": (
         (('timestep="0.001"', 'timestep="0.001" density="1000" viscosity="0.001"'),),
@@ -128,57 +128,57 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(("changes", "fields", "left_out", "reason"), CASES.values(), ids=CASES)
-def test_a_model_of_ones_own_fails_no_check_whose_conditions_it_does_not_meet(
-    tmp_path, changes, fields, left_out, reason
+@pytest.mark.parametrize(("changes", "fields", "skipped", "reason"), CASES.values(), ids=CASES)
+def test_checks_that_do_not_apply_to_a_custom_model_are_skipped(
+    tmp_path, changes, fields, skipped, reason
 ):
-    found = judged(furuta(tmp_path, changes, **fields))
-    assert found.passed, [check.where for check in found.checks if not check.passed]
-    skips = {
-        f"{one.group}: {one.name}": one.reason
-        for one in found.skipped
-        if "equations of motion" not in one.name
+    certificate = certify(furuta(tmp_path, changes, **fields))
+    assert certificate.passed, [check.where for check in certificate.checks if not check.passed]
+    reasons = {
+        f"{skip.group}: {skip.name}": skip.reason
+        for skip in certificate.skipped
+        if "equations of motion" not in skip.name
     }
-    assert skips.keys() == left_out
-    for text in skips.values():
+    assert reasons.keys() == skipped
+    for text in reasons.values():
         with pytest.raises(ValueError, match=reason):
             raise ValueError(text)
 
 
-def test_a_fault_of_ours_is_still_found_in_somebodys_task_and_said_to_be_ours(tmp_path):
+def test_fault_of_the_package_in_a_custom_task_is_reported_as_such(tmp_path):
     task = furuta(tmp_path, trials=GENTLE)
     assert judged(task).passed
     with wrong_model(("timestep", None, 1.001)):
-        found = judged(task)
-    failed = {check.name: check.fault for check in found.checks if not check.passed}
+        certificate = certify(task)
+    failed = {check.name: check.fault for check in certificate.checks if not check.passed}
     assert (
-        "textbook steps of such sizes have this order: " + REPORT
+        "textbook steps of the same size have this order: " + REPORT
         in failed["order, rk4, ideal actuator"]
     )
     assert "gentler run in Task.reference_states" in failed["order, mechanical balance, rk4"]
 
 
-def test_an_unstable_motor_is_its_owners():
+def test_unstable_motor_is_reported_as_the_users_fault():
     unstable = DCMotorActuator(controller=CurrentLoop(kp=200.0))
     model = codrl_mj.add_motors(
         arm("implicitfast"), {".*": unstable}, allow_unstable=True
     ).compile()
-    found = validate_model(model, quick=True).checks
-    failed = [one.fault for one in found if one.name.startswith("stable: ")]
+    checks = validate_model(model, quick=True).checks
+    failed = [check.fault for check in checks if check.name.startswith("stable: ")]
     assert (
         failed
         == [
-            "your model or motor is not stable at this step: shorten it, or slow down the motor's"
-            " loop"
+            "your model or motor is not stable at this step: shorten the step, or slow down the"
+            " motor's loop"
         ]
         * 2
     )
 
 
-def test_of_our_tasks_nobody_else_is_to_blame():
+def test_failures_of_built_in_tasks_are_the_packages_fault():
     with wrong_model(("body_mass", -1, 1.001)):
-        found = validate("pendulum", quick=True, groups=("dynamics",))
-    assert {check.fault for check in found.checks if not check.passed} == {REPORT}
-    assert {check.fault for check in found.checks if check.passed} <= {""}
-    assert REPORT in str(found.as_mapping()["checks"])
-    assert "fault" in {field.name for field in dataclasses.fields(found.checks[0])}
+        certificate = validate("pendulum", quick=True, groups=("dynamics",))
+    assert {check.fault for check in certificate.checks if not check.passed} == {REPORT}
+    assert {check.fault for check in certificate.checks if check.passed} <= {""}
+    assert REPORT in str(certificate.as_mapping()["checks"])
+    assert "fault" in {field.name for field in dataclasses.fields(certificate.checks[0])}

@@ -9,14 +9,14 @@ from markupsafe import Markup
 
 from codrl_mj.runs.files import check_writable, writing
 from codrl_mj.validation.certificate import GROUPS, Certificate, verdict, versions
-from codrl_mj.validation.mutations import Caught, as_mapping, unfailed
+from codrl_mj.validation.mutations import MutationResult, as_mapping, undetected_checks
 from codrl_mj.viz.pages import page
 
 JSON_NAME, HTML_NAME = "certificate.json", "certificate.html"
 _CHECKS = ("check", "oracle", "samples", "worst", "allowed", "margin", "unit", "where", "verdict")
 
 
-def html(certificate: Certificate, caught: Sequence[Caught] = ()) -> str:
+def html(certificate: Certificate, caught: Sequence[MutationResult] = ()) -> str:
     """The page of what was found, and of what mutations did, if they were tried."""
     top = [page.judged(certificate.passed, certificate.verdict, "p", "verdict")]
     if certificate.quick:
@@ -83,21 +83,21 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
     return page.Section(name, name.capitalize(), page.joined(body), mark)
 
 
-def _mutations(certificate: Certificate, caught: Sequence[Caught]) -> page.Section:
+def _mutations(certificate: Certificate, caught: Sequence[MutationResult]) -> page.Section:
     rows = []
     for one in caught:
         clearest, cells = (
-            one.clearest,
-            [one.mutation, one.task or "the motor", f"{len(one.failed)} of {one.made}"],
+            one.clearest_failure,
+            [one.mutation, one.task or "the motor", f"{len(one.failed)} of {one.num_checks}"],
         )
         found = ["none", "", "", ""]
         if clearest is not None:
-            values = (clearest.worst, clearest.tolerance, clearest.beyond)
+            values = (clearest.worst, clearest.tolerance, clearest.tolerance_ratio)
             found = [f"{clearest.group}: {clearest.name}", *(f"{value:.2g}" for value in values)]
         said = page.judged(clearest is not None, "MISSED" if clearest is None else "caught")
         rows.append((*cells, *found, said))
     columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond", "verdict"
-    blind = unfailed(certificate.checks, caught)
+    blind = undetected_checks(certificate.checks, caught)
     told = "; ".join(f"{check.group}, {check.task}: {check.name}" for check in blind)
     body = (
         page.paragraph(
@@ -147,7 +147,7 @@ def summary(content: Mapping[str, Any]) -> Markup:
 
 
 def write(
-    certificate: Certificate, folder: Path, caught: Sequence[Caught] = ()
+    certificate: Certificate, folder: Path, caught: Sequence[MutationResult] = ()
 ) -> tuple[Path, Path]:
     """Write `certificate.json` and `certificate.html` into a folder, whole or not at all; older ones are replaced."""
     text = (
