@@ -228,7 +228,11 @@ class Test:
             title = f"{env.task} by its C on {self.target}: return {panel.episode.total:.0f}"
             film([dataclasses.replace(panel, title=title)], self.film, 640, 480)
             print(f"wrote {self.film}")
-        return int(done.num_equal_returns < 0.95 * self.episodes and link == Link() and self.actuator is None)
+        return int(
+            done.num_equal_returns < 0.95 * self.episodes
+            and link == Link()
+            and self.actuator is None
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -359,7 +363,13 @@ class CompareLog:
         )
         found = compare(env, self.log, self.window, self.actuator)
         columns = list(
-            zip(found.names, found.units, found.errors.tolist(), found.baseline_errors.tolist(), strict=True)
+            zip(
+                found.names,
+                found.units,
+                found.errors.tolist(),
+                found.baseline_errors.tolist(),
+                strict=True,
+            )
         )
         title = (
             f"{self.log.name} through {self.actuator or env.through}: {len(found.starts)} windows"

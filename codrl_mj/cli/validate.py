@@ -12,7 +12,7 @@ from rich.text import Text
 from codrl_mj.cli.parsing import AsJson
 from codrl_mj.cli.terminal import console, print_table, progress_bar, say
 from codrl_mj.tasks import TASKS
-from codrl_mj.validation import GROUPS, MutationResult, Certificate, Check
+from codrl_mj.validation import GROUPS, Certificate, Check, MutationResult
 
 
 @dataclasses.dataclass(frozen=True)

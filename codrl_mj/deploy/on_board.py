@@ -74,7 +74,8 @@ def sample_on_board(
         # A pipe may deliver the 24 bytes of an answer in several parts.
         while received < 24 and _poll(entry_address(table, 1), 1, TIMEOUT_MS) > 0:
             count = _read(
-                u64(_table_at())[1] & 0xFFFFFFFF, entry_address(table, 16) + received, 24 - received)
+                u64(_table_at())[1] & 0xFFFFFFFF, entry_address(table, 16) + received, 24 - received
+            )
             if count <= 0:
                 break
             received += count

@@ -182,7 +182,7 @@ _VIOLENT_RUN = (
     f" {REPORT}"
 )
 _DIFFERENT_MODELS = (
-    "your model and your reference environment (Task.twin) differ: compare masses, gravity and the"
+    "your model and your reference environment (Task.reference_env) differ: compare masses, gravity and the"
     " integrator"
 )
 _LIKELY_CAUSES = {
@@ -228,7 +228,7 @@ def validate(
     """Run the checks on tasks and return their certificate.
 
     A custom task runs through all checks that apply to it. Checks that need a reference environment
-    (`Task.twin`), or the states and the run of `Task.reference_states`, are skipped if the task has none.
+    (`Task.reference_env`), or the states and the run of `Task.reference_states`, are skipped if the task has none.
 
     Args:
         tasks: name of a task, several names, or None for all registered tasks.

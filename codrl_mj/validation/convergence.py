@@ -83,7 +83,7 @@ def free_run(task: Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def nonsmooth_reason(task: Task) -> str:
     """Return the reason why the run of a custom task is not smooth, or "" if it is smooth."""
     # The runs of built-in tasks are covered by the tests.
-    if task in OURS:
+    if task in PAPER_TASKS:
         return ""
     start, forces, _ = free_run(task)
     free = dataclasses.replace(task, step_duration=task.step_duration / 16, constrain=None)
@@ -179,7 +179,9 @@ def solve(
             motor, loop = actuator.motor, actuator.controller
             current, integral = state[size + 2 * motor_index : size + 2 * motor_index + 2]
             reference = desired[motor_index] * motor.arm_radius / motor.torque_constant
-            back_emf = motor.back_emf_constant * state[task.speed_indices[motor_index]] / motor.arm_radius
+            back_emf = (
+                motor.back_emf_constant * state[task.speed_indices[motor_index]] / motor.arm_radius
+            )
             error = reference - current
             voltage = (
                 loop.kp * error
@@ -226,9 +228,8 @@ def continuous_actuators(task: Task) -> tuple[DCMotorActuator, ...]:
 
 def halving_range(task: Task, max_halvings: int = 4) -> range:
     """Return the numbers of extra halvings of the steps that are tried until the order shows."""
-    # Without `Task.trials` the run is arbitrary and may be violent: it begins with finer steps.
-    first = (
-        2 if task.reference_states is None else 0
+    # Without `Task.reference_states` the run is arbitrary and may be violent: it begins with finer steps.
+    first = 2 if task.reference_states is None else 0
     return range(first, first + (1 if is_ours(task) else max_halvings + 1), 2)
 
 
@@ -257,7 +258,8 @@ def attribute_failure(
         " not smooth"
     )
     return Skipped(
-        outcome.name, f"{reason}. Name a gentler run in Task.reference_states, or a smaller max_force"
+        outcome.name,
+        f"{reason}. Name a gentler run in Task.reference_states, or a smaller max_force",
     )
 
 
@@ -269,7 +271,7 @@ def _step_counts(
         return 2 ** (np.arange(2, 6 if quick else 7) + extra_halvings)
     if not motors:
         return 2 ** ((np.arange(3, 7) if quick else np.arange(4, 9)) + extra_halvings)
-    # Steps of a quarter of the winding's time constant, and shorter. Without `Task.trials` they are
+    # Steps of a quarter of the winding's time constant, and shorter. Without `Task.reference_states` they are
     # also short for the motion (`halving_range`).
     steps_per_quarter = task.step_duration / (
         min(motor.electrical_time_constant for motor in motors) / 4

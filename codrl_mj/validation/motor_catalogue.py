@@ -184,7 +184,11 @@ _TWIN = "Gymnasium {task.gymnasium_id} with a rotor on its joint, the winding by
 def task_motor_run(task: Task, integrator: str, quick: bool) -> Iterator[Case]:
     """Compare a task's run with its drive of `TASK_MOTORS`, under random bang-bang commands."""
     actuator, generator = task_drive(task.name), np.random.default_rng(0)
-    inner_steps, arm, speed_index = task.motor_inner_steps, actuator.arm_radius, task.speed_indices[0]
+    inner_steps, arm, speed_index = (
+        task.motor_inner_steps,
+        actuator.arm_radius,
+        task.speed_indices[0],
+    )
     # The oracle computes every sample in Python, so their number is limited.
     max_steps = round(
         (5e4 if quick else 5e5) / (task.step_duration * actuator.controller.sample_rate)

@@ -158,7 +158,7 @@ def compare_with_python(
             )
             oracle = [*states[index], *signals, torque]
             # A slot holds the accepted state, then the candidate state, then the signals.
-            after = SLOT + len(states[index])
+            after = SLOT_HEADER_SIZE + len(states[index])
             results[index][0, step] = (
                 *slot_of[index][after : after + len(oracle) - 1],
                 before.actuator_force[output],

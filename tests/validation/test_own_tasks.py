@@ -5,10 +5,10 @@ import itertools
 
 import numpy as np
 import pytest
-from codrl_mj.tasks.twin import Trials
 
 import codrl_mj
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator
+from codrl_mj.tasks.reference_env import ReferenceStates
 from codrl_mj.validation import validate, validate_model
 from codrl_mj.validation.mutations import wrong_model
 from codrl_mj.validation.table import REPORT
@@ -32,14 +32,14 @@ XML = """
 """
 """A small Furuta pendulum with measured parameters; 0.8 N m turn it through a radian in 30 ms."""
 COUNT = itertools.count()
-GENTLE = Trials(
+GENTLE = ReferenceStates(
     bounds=(3.0,) * 4,
     edges=((3.0,),) * 4,
     start=(0.02, 3.1, 0.01, -0.02),
     steps=3,
     balanced_steps=1,
 )
-"""A short run, whose errors show an order at coarse steps: where it does not matter what a task without one costs."""
+"""A short run, whose errors show an order at coarse steps: it is used where the cost of the default run does not matter."""
 
 
 def furuta(folder, changes=(), **fields):
@@ -106,13 +106,13 @@ CASES = {
     "friction": ((RUBBING,), {}, ALL, "friction or another constraint acts in the run"),
     "gravity compensation": (
         (('<body name="rod"', '<body name="rod" gravcomp="1"'),),
-        {"trials": GENTLE},
+        {"reference_states": GENTLE},
         TWO,
         "the model has gravity compensation, whose energy is in no balance: remove it",
     ),
     "another actuator": (
         (("</actuator>", '<position joint="hinge" kp="0.1"/></actuator>'),),
-        {"trials": GENTLE},
+        {"reference_states": GENTLE},
         TWO,
         "the model has actuators besides the task's motors, whose energy is in no balance",
     ),
@@ -146,8 +146,8 @@ def test_checks_that_do_not_apply_to_a_custom_model_are_skipped(
 
 
 def test_fault_of_the_package_in_a_custom_task_is_reported_as_such(tmp_path):
-    task = furuta(tmp_path, trials=GENTLE)
-    assert judged(task).passed
+    task = furuta(tmp_path, reference_states=GENTLE)
+    assert certify(task).passed
     with wrong_model(("timestep", None, 1.001)):
         certificate = certify(task)
     failed = {check.name: check.fault for check in certificate.checks if not check.passed}
