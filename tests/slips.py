@@ -339,7 +339,7 @@ def run(face: str, made: Any, actuator: Any = "ideal", **options: Any) -> None:
         from codrl_mj.envs.compiled import compiled_env
 
         if (parts := compiled_env(env.unwrapped)) is not None:
-            parts.reset(env.unwrapped.np_random, parts.low, parts.high, parts.where)
+            parts.reset(env.unwrapped.np_random, parts.low, parts.high, parts.pointers)
     elif face == "vector":
         envs = gymnasium.make_vec(
             made.env_id, 3, vectorization_mode="vector_entry_point", actuator=actuator, **options

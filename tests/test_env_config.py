@@ -143,7 +143,7 @@ def test_a_configuration_survives_json_and_keyword_arguments(config, random):
     )
     arguments = config.as_arguments()
     arguments.pop("max_episode_steps", None)
-    again = EnvConfig.of(config.task, arguments.pop("actuator"), arguments)
+    again = EnvConfig.from_arguments(config.task, arguments.pop("actuator"), arguments)
     assert again == dataclasses.replace(config, max_episode_steps=None)
 
 

@@ -362,7 +362,7 @@ class CompareLog:
             zip(found.names, found.units, found.errors.tolist(), found.moved.tolist(), strict=True)
         )
         title = (
-            f"{self.log.name} through {self.actuator or env.through}: {len(found.starts)} windows"
+            f"{self.log.name} through {self.actuator or env.actuator_label}: {len(found.starts)} windows"
         )
         rows = [
             (name, unit or "?", f"{error:.3g}", f"{moved:.3g}")

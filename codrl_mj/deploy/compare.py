@@ -86,7 +86,7 @@ def compare(
     tried = (
         env
         if actuator is None
-        else dataclasses.replace(env, actuator=dict.fromkeys(env.driven, actuator))
+        else dataclasses.replace(env, actuator=dict.fromkeys(env.actuators_by_name, actuator))
     )
     if env.action == "force" and interface.levels is None:
         # force at the joint for an ampere; 0 of what has no motor, whose commands stay as they are

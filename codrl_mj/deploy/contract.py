@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import mapping_of, trusting
+from codrl_mj.actuators import mapping_of, allow_imports
 from codrl_mj.deploy.loops import current_loop
 from codrl_mj.deploy.network import network_of
 from codrl_mj.envs.config import EnvConfig
@@ -85,7 +85,7 @@ class Interface:
         """That of an environment."""
         with contextlib.closing(env.make()) as made:
             rate = 1.0 / _step_duration(made)
-        return cls(env.task, rate, *env.world.interface(env))
+        return cls(env.task, rate, *env.source.interface(env))
 
     @property
     def levels(self) -> np.ndarray | None:
@@ -217,7 +217,7 @@ class Contract(Interface):
         return cls(
             **vars(between),
             agent=agent,
-            actuators={name: _told(mapping_of(one)) for name, one in env.driven.items()},
+            actuators={name: _told(mapping_of(one)) for name, one in env.actuators_by_name.items()},
             assumed=json.loads(json.dumps(env.as_mapping())),
             controller={"real": "double" if double else "float", "loop": current_loop(env)},
             limits=_limits([one["name"] for one in between.observations], limits or {}),
@@ -258,7 +258,7 @@ class Contract(Interface):
 
     def environment(self, trust: bool = False) -> EnvConfig:
         """Return the environment of the training; modules that it names are imported with `trust`, or refused."""
-        with trusting(trust):
+        with allow_imports(trust):
             return EnvConfig.from_mapping(self.assumed)
 
     def write(self, folder: Path) -> None:

@@ -18,10 +18,10 @@ from numba.extending import register_jitable
 
 from codrl_mj.actuators import Family, Inputs, family_number, parameters_type, reference
 from codrl_mj.actuators.model import advance_form, check_family
-from codrl_mj.compile_cache import Note, cfunc
+from codrl_mj.compile_cache import VerifiedMarker, cfunc
 from codrl_mj.engine.doors import load_inertia
 from codrl_mj.engine.memory import call, f64, i32, internal, read, symbol, tuple_of, u8, u64, write
-from codrl_mj.user_code import Form, check_form, not_compiled
+from codrl_mj.user_code import Form, check_form, compile_error_message
 
 SIGNATURE = (250700.0, 268401.0)
 """First two numbers of the `user` data of every actuator and joint that is ours: the paper's arXiv
@@ -177,16 +177,16 @@ def compiled_function(function: Callable[..., Any], form: Form, declared: str, *
 
     It is compiled to find that out, unless a process before has, of the very same function.
     """
-    compiled, noted = internal(function), Note("fits", function, form, kinds)
+    compiled, noted = internal(function), VerifiedMarker("fits", function, form, kinds)
     try:
         _make_known(function)
-        if noted.is_there():
+        if noted.exists():
             return compiled
         compiled.compile(kinds)
     except Exception as error:
-        raise ValueError(not_compiled(function, error)) from error
+        raise ValueError(compile_error_message(function, error)) from error
     check_form(function, _example(compiled.overloads[kinds].signature.return_type), form, declared)
-    noted.leave()
+    noted.write()
     return compiled
 
 

@@ -25,7 +25,7 @@ from numba import types
 from numba.core.registry import cpu_target
 from numba.core.typing.ctypes_utils import from_ctypes
 
-from codrl_mj.compile_cache import external
+from codrl_mj.compile_cache import external_function
 from codrl_mj.engine.memory import emitted, pointed
 from codrl_mj.plugin import LayoutError, library
 
@@ -239,6 +239,6 @@ def address_of(owner: Any, name: str) -> int:
 @functools.cache
 def engine_function(name: str) -> Any:
     """A function of MuJoCo's of (model, data), such as `mj_step`, by their addresses, for compiled code."""
-    return external(
+    return external_function(
         f"codrl_mj_{name}", getattr(library(), name), types.void(types.uintp, types.uintp)
     )

@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from codrl_mj.compile_cache import linked
+from codrl_mj.compile_cache import register_symbol
 
 internal = functools.partial(
     numba.njit,
@@ -73,7 +73,7 @@ f64, f32, i32, i64, u8, u64 = map(
 
 def symbol(name: str, address: int) -> Any:
     """An intrinsic for an address of this process, which compiled code knows by a name."""
-    name = linked(name, address)
+    name = register_symbol(name, address)
 
     @emitted(lambda: types.uintp())
     def at_symbol(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -17,7 +17,7 @@ import mujoco
 from numba import types
 
 from codrl_mj.actuators import BUILT_IN, Ideal, family_number, reference
-from codrl_mj.compile_cache import cfunc, external, njit
+from codrl_mj.compile_cache import cfunc, external_function, njit
 from codrl_mj.engine.doors import clip, command, inertia_at, is_disabled, user_of
 from codrl_mj.engine.families import (
     HEAD,
@@ -37,7 +37,7 @@ from codrl_mj.engine.families import (
 )
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import at, f64, internal, symbol
-from codrl_mj.plugin import FAMILY, NAME, complain, library, registered
+from codrl_mj.plugin import FAMILY, NAME, log_warning, library, registered_plugins
 
 PLUGIN_HEAD = HEAD + 1
 """The `user` data begin with `user_head` and the actuator's arm [m]."""
@@ -132,7 +132,7 @@ _configuration_of.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
 _configuration_of.restype = ctypes.c_void_p
 
 
-_configured = external(
+_configured = external_function(
     "mj_plugin_configuration", _configuration_of, types.uintp(types.uintp, types.int32, types.uintp)
 )
 """The same for compiled code."""
@@ -234,7 +234,7 @@ def compiled_entries() -> dict[str, Any]:
         for entry in range(MODEL.plugin_statenum(model)[instance]):
             f64(state)[entry] = 0.0
 
-    complaint = external("codrl_mj_judge", _JUDGE, types.int32(types.uintp, types.int32))
+    complaint = external_function("codrl_mj_judge", _JUDGE, types.int32(types.uintp, types.int32))
 
     @cfunc(types.int32(types.uintp, types.uintp, types.int32), nogil=True, error_model="numpy")
     def init(model: int, data: int, instance: int) -> int:  # noqa: ARG001
@@ -248,7 +248,7 @@ def compiled_entries() -> dict[str, Any]:
 def start(model: int, data: int, instance: int) -> int:
     """The plugin's first `init`, with addresses of mjModel and mjData: from here on MuJoCo calls what is compiled."""
     del data
-    structure = registered()[NAME][1]
+    structure = registered_plugins()[NAME][1]
     for name, function in compiled_entries().items():
         setattr(structure, name, function.address)
     return _judge(model, instance)
@@ -280,7 +280,7 @@ def _judge(model: int, instance: int) -> int:
         if verdict:
             raise ValueError(REASONS[verdict])
     except Exception as error:  # there is nobody to raise it to
-        complain(f"plugin instance {instance}: {error}")
+        log_warning(f"plugin instance {instance}: {error}")
         return -1
     return 0
 

@@ -27,7 +27,7 @@ from codrl_mj.engine.families import (
     slot_size,
 )
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEAD, REASONS
-from codrl_mj.plugin import FAMILY, NAME, registered
+from codrl_mj.plugin import FAMILY, NAME, registered_plugins
 
 
 def motors(model: mujoco.MjModel) -> dict[int, ActuatorModel]:
@@ -51,7 +51,7 @@ def motors(model: mujoco.MjModel) -> dict[int, ActuatorModel]:
             torque, or limits of its activations, which are the motor's state.
     """
     found = {}
-    slot = registered()[NAME][0]
+    slot = registered_plugins()[NAME][0]
     for index in range(model.nactuator):
         user, instance = model.actuator_user[index], model.actuator_plugin[index]
         ours = instance >= 0 and model.plugin[instance] == slot

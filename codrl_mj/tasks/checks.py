@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.user_code import call, check_form, place
+from codrl_mj.user_code import call, check_form, source_location
 
 _TEXTS = ("name", "env_id", "asset", "actuator", "agent")
 _NAMES = ("state_names", "observation_names", "motors", "integrators")
@@ -106,7 +106,7 @@ def check_functions(task: Any) -> None:
         or (np.subtract(*bounds) > 0.0).any()
     ):
         what = "the lower and the upper bounds of what is drawn, two arrays (k,) of finite numbers"
-        raise ValueError(f"{place(task.initial_bounds)}: returns {bounds!r}, must return {what}")
+        raise ValueError(f"{source_location(task.initial_bounds)}: returns {bounds!r}, must return {what}")
     low, high = np.asarray(bounds, dtype=np.float64)
     draws = np.stack([low + share * (high - low) for share in (0.25, 0.75)], axis=-1)
     before, after = (
@@ -149,7 +149,7 @@ def _returned(task: Any, name: str, names: str, *arguments: Any) -> Any:
         ~np.isfinite(array) if names else np.isnan(array)
     ).any():  # a start may have an infinite reward
         raise ValueError(
-            f"{place(function)}: returns {value} where an episode may start: must be finite"
+            f"{source_location(function)}: returns {value} where an episode may start: must be finite"
         )
     return value
 

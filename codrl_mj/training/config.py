@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.actuators import trusting
+from codrl_mj.actuators import allow_imports
 from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import ELSEWHERE, find_preset
@@ -105,7 +105,7 @@ class TrainConfig(Checked):
         """
         posed = EnvConfig(task, options=(env or {}).get("options"))
         check_fits(agent, posed)
-        preset = find_preset(agent, posed.world.preset or ELSEWHERE, settings)
+        preset = find_preset(agent, posed.source.preset or ELSEWHERE, settings)
         names = {field.name for field in dataclasses.fields(cls)} - {"env"}
         chosen = {name: value for name, value in vars(preset).items() if name in names}
         fields = {"actuator": actuator, **preset.env, **(env or {}), "task": task}
@@ -114,7 +114,7 @@ class TrainConfig(Checked):
     @property
     def evaluation_env(self) -> EnvConfig:
         """What policies are evaluated in: the environment without changes of time limit and reward."""
-        changed: dict[str, Any] = dict.fromkeys(self.env.world.posed)
+        changed: dict[str, Any] = dict.fromkeys(self.env.source.evaluation_overrides)
         return dataclasses.replace(self.env, **changed)
 
     def as_mapping(self) -> dict[str, Any]:
@@ -182,7 +182,7 @@ def default_agent(task: str, options: Any = None) -> str:
     decide on that.
     """
     posed = EnvConfig(task, options=options)
-    return posed.world.default_agent(posed)
+    return posed.source.default_agent(posed)
 
 
 def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConfig:
@@ -214,7 +214,7 @@ def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConf
                 **content,
                 **{key: value for key, value in overriding.items() if value is not None},
             }
-        with trusting(trust):
+        with allow_imports(trust):
             return TrainConfig.from_mapping(content)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None

@@ -76,7 +76,7 @@ def train(
 
     torch.set_num_threads(1)  # networks this small run several times slower on two
     with folder.taken(out, record is None), stopping(signal.SIGINT, signal.SIGTERM) as asked:
-        envs = ActuatedVecEnv(config.env.world.vector(config.env, config.num_envs))
+        envs = ActuatedVecEnv(config.env.source.vector(config.env, config.num_envs))
         with contextlib.closing(envs), _reporting_to(wandb, out, config):
             model = config.agent.make_model(envs, config.seed)
             watcher = Watcher(config, out, asked, on_progress, tensorboard)

@@ -234,7 +234,7 @@ def test_an_evaluation_that_changes_others_leaves_it_whole(monkeypatch):
     )
     config = codrl_mj.EnvConfig("Leg-v0", ACTUATORS, max_episode_steps=10)
     lag = Lag(time_constant=0.01)
-    assert config.world.overlaid(config, {"knee": "ideal"}) == {
+    assert config.source.overlaid(config, {"knee": "ideal"}) == {
         "hip_p & hip_v": lag,
         "knee": "ideal",
     }

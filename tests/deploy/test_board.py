@@ -124,7 +124,7 @@ def test_a_gain_changed_in_the_c_changes_what_the_motor_does(folder, tmp_path):
 
 
 FURUTA = EnvConfig("furuta")
-(DRIVE,) = FURUTA.driven.values()
+(DRIVE,) = FURUTA.actuators_by_name.values()
 CLAMPING = DRIVE.replaced({"controller.anti_windup": "clamping"})
 LATE_AND_SAGGING = {
     "controller.delayed": True,

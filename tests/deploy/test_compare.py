@@ -47,7 +47,7 @@ def test_a_rig_that_is_the_simulation_does_what_it_does(logged, task):
 
 
 def test_another_motor_is_seen_and_what_identifies_it_takes_the_difference_away(logged, tmp_path):
-    (drive,) = FURUTA.driven.values()
+    (drive,) = FURUTA.actuators_by_name.values()
     real = drive.replaced({"motor.torque_constant": 0.03, "motor.viscous_friction": 3e-5})
     log, contract, *_ = logged("furuta")
     done = board_test(
@@ -120,7 +120,7 @@ def test_what_cannot_be_compared_is_said(logged, tmp_path, capsys):
         assert says in capsys.readouterr().err
     with pytest.raises(ValueError, match="the policy knows none"):
         compare(EnvConfig("cartpole"), log)
-    (drive,) = FURUTA.driven.values()
+    (drive,) = FURUTA.actuators_by_name.values()
     with pytest.raises(
         ValueError, match=r"as this motor gives it, is beyond the simulation's bound, \["
     ):

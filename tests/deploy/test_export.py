@@ -172,7 +172,7 @@ CURRENTS = {"action": "current", "observe_actuator": True}
 )
 def test_units_are_those_of_state_signals_and_commands(task, changes, units, actions):
     config = EnvConfig(task, **changes)
-    seen, (acts,) = config.world.interface(config)
+    seen, (acts,) = config.source.interface(config)
     assert [one["unit"] for one in seen] == units
     assert (acts["name"], acts["unit"], acts.get("levels"), acts.get("most")) == actions
 
@@ -201,7 +201,7 @@ def test_observations_of_another_kind_or_rate_are_refused(exported, change, rate
 
 def test_another_actuator_is_refused_by_the_number_that_differs(exported):
     contract = Contract.read(exported)
-    (drive,) = EnvConfig("furuta").driven.values()
+    (drive,) = EnvConfig("furuta").actuators_by_name.values()
     contract.admit_actuators({"motor": drive})
     weaker = drive.replaced({"supply.voltage": 6.0})
     for other, message in {

@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 import codrl_mj
-from codrl_mj.envs.worlds import EnvSource
+from codrl_mj.envs.sources import EnvSource
 
 XML = """
 <mujoco model="rig">

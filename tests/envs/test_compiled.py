@@ -134,7 +134,7 @@ def test_a_compiled_loop_is_the_loop_over_the_environment_bit_for_bit(task, kind
         given = list(chosen)
     rows, rewards = np.zeros((51, *ours.observation_space.shape), np.float32), np.zeros(50)
     loop = (forces, chosen, ours.np_random, parts.low, parts.high, rows, rewards)
-    taken = _episode(parts.step, parts.reset, *loop, parts.observation, parts.where)
+    taken = _episode(parts.step, parts.reset, *loop, parts.observation, parts.pointers)
     observation, _ = theirs.reset()
     np.testing.assert_array_equal(rows[0], observation)
     for index in range(taken):

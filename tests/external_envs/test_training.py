@@ -129,7 +129,7 @@ def test_a_file_says_what_is_behind_what(tmp_path):
     )
     (tmp_path / "train.yaml").write_text(text + "agent: {name: sac, gamma: 0.98}\n")
     found = read_config(tmp_path / "train.yaml")
-    assert found.env.driven == {
+    assert found.env.actuators_by_name == {
         "b.*": Drive.of(motor_entry("maxon-ec45-flat-50w").numbers),
         "f.*": Lag(),
     }
@@ -343,7 +343,7 @@ def test_a_policy_of_stable_baselines_is_evaluated_by_the_id(capsys):
 
 
 def test_a_run_is_evaluated_on_other_motors(reacher, capsys):
-    assert load_config(reacher).env.driven == {".*": IDEAL}
+    assert load_config(reacher).env.actuators_by_name == {".*": IDEAL}
     line = (
         f"evaluate {reacher} --actuators joint0=maxon-re65 joint1=lag --episodes 2 --out"
         " result.json"

@@ -9,7 +9,7 @@ import pytest
 import codrl_mj
 from codrl_mj import EnvConfig
 from codrl_mj.__main__ import main
-from codrl_mj.envs.worlds import EnvSource, find_world, world_of
+from codrl_mj.envs.sources import EnvSource, find_source, source_of
 from codrl_mj.training import TrainConfig
 from codrl_mj.viz.view.session import Session
 from tests.envs.rig import RIG, RigEnv
@@ -35,7 +35,7 @@ def test_a_configuration_of_it_survives_json_and_makes_environments():
         disturbances={"command_delay": 0.02},
         options={"target": 0.5},
     )
-    assert find_world(NAME) is config.world is RIG
+    assert find_source(NAME) is config.source is RIG
     assert EnvConfig.from_mapping(json.loads(json.dumps(config.as_mapping()))) == config
     with config.make() as env:
         _, info = env.reset(seed=1)
@@ -43,7 +43,7 @@ def test_a_configuration_of_it_survives_json_and_makes_environments():
         env.step(np.ones(1))  # delayed by a step
         *_, info = env.step(np.ones(1))
         assert info["current"] != 0.0
-    assert TrainConfig.preset(NAME, "sac", actuator="lag").env.through == "lag"
+    assert TrainConfig.preset(NAME, "sac", actuator="lag").env.actuator_label == "lag"
 
 
 class Nameless(EnvSource):
@@ -65,7 +65,7 @@ class Nameless(EnvSource):
         ),
         (lambda: EnvConfig("tests.envs.rig:Rig"), r"^Rig: must be an instance of it: Rig\(...\)"),
         (
-            lambda: world_of(Nameless()),
+            lambda: source_of(Nameless()),
             "Nameless: must have a `name`, a text, which messages call it by",
         ),
         (
@@ -82,7 +82,7 @@ def test_what_is_no_world_or_what_it_does_not_have_is_refused(call, message):
 def test_a_world_that_makes_no_environment_is_refused(monkeypatch):
     named = Nameless()
     named.name = "named"
-    assert world_of(named) is named
+    assert source_of(named) is named
     monkeypatch.setattr(type(RIG), "make", lambda *_, **__: 3)
     with pytest.raises(
         ValueError, match=r"tests.envs.rig:RIG: its `make` returned 3: must be a gymnasium.Env"
@@ -145,7 +145,7 @@ def test_a_live_session_runs_it():
     session.set_actuator("drive", ("motor", "resistance"), 0.3)
     assert session.problem is None
     assert session.step()
-    assert session.config.driven["drive"].motor.resistance == 0.3
+    assert session.config.actuators_by_name["drive"].motor.resistance == 0.3
 
 
 def test_make_takes_of_a_world_or_task_by_its_place_what_it_says_it_takes():
