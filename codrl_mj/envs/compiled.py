@@ -146,7 +146,7 @@ def bind_observation(setup: ResolvedEnv, physics: Any) -> tuple[int, np.ndarray]
 def compiled_kernels(setup: ResolvedEnv, physics: Any) -> Kernels:
     """Return the functions for environments of one kind; they are compiled once per process."""
     task = setup.task
-    sensors = len(setup.plant.family.OBSERVED) if setup.sensors else 0
+    sensors = len(setup.simulation.family.OBSERVED) if setup.sensors else 0
     single, size = len(task.motors) == 1, len(task.state_names)
     sizes = size, len(setup.observation_names), len(setup.config.options)
     return _kernels(

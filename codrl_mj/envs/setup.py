@@ -223,7 +223,7 @@ class ResolvedEnv:
 
         If the actuator does not follow a force command, `desired_force` is the delivered force.
         """
-        signals = self._named(columns)
+        signals = self._read_info(columns)
         signals["desired_force"] = (
             desired if self.commands.is_torque_controlled else signals["actual_force"]
         )

@@ -145,7 +145,7 @@ def test_a_voltage_drives_the_winding_and_that_the_task(task, physics):
                 motor, dt, loop.substeps, loop.max_voltage, current, voltage, state[SPEED[task]]
             )
             force = motor.torque_constant * current / motor.arm_radius
-            state = np.array(driver(state, force, dt, env.setup.plant.integrator))
+            state = np.array(driver(state, force, dt, env.setup.simulation.integrator))
         info = env.step(action)[-1]
         np.testing.assert_allclose(env.state, state, rtol=0, atol=1e-12)
         assert info["current"] == pytest.approx(current, rel=0, abs=1e-12)

@@ -62,7 +62,7 @@ def _plain_step(env, task, state, force):
     for _ in range(env.setup.inner_steps):
         moved = data.qpos + model.opt.timestep * data.qvel
         mujoco.mj_step(model, data)
-        if env.setup.plant.integrator == "euler":
+        if env.setup.simulation.integrator == "euler":
             data.qpos[:] = moved
         state = np.empty_like(state)
         state[positions], state[velocities] = data.qpos, data.qvel
