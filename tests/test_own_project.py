@@ -264,7 +264,7 @@ def test_a_training_of_the_arm_that_was_stopped_comes_to_the_same_weights(tmp_pa
     assert differing(outcome(tmp_path / "whole"), outcome(stopped)) == []
 
 
-# -- the certificate ----------------------------------------------------------------------------------------
+# -- the certificate ------------------------------------------------------------------------------
 
 
 @pytest.mark.matrix

@@ -35,7 +35,7 @@ def _voltage(task):
     return {"action": "voltage"} | ({"levels": VOLTAGES} if discrete else {})
 
 
-# -- dm_env's own contract ----------------------------------------------------------------------------------
+# -- dm_env's own contract ------------------------------------------------------------------------
 
 
 def _contract(domain, task_name, options):
@@ -98,7 +98,7 @@ def test_options_are_set_over_a_configuration():
         suite.load(config, innersteps=2)
 
 
-# -- the Gymnasium environment, bit for bit -----------------------------------------------------------------
+# -- the Gymnasium environment, bit for bit -------------------------------------------------------
 
 
 def _actions(space, count, seed):
@@ -185,7 +185,7 @@ def test_a_goal_is_an_end_without_a_future(task):
     )
 
 
-# -- the time limit -----------------------------------------------------------------------------------------
+# -- the time limit -------------------------------------------------------------------------------
 
 
 @every_rebuilt
@@ -210,7 +210,7 @@ def test_an_episode_has_exactly_the_steps_of_gymnasiums(task, inner_steps):
         assert timestep.discount == 1.0
 
 
-# -- the physics --------------------------------------------------------------------------------------------
+# -- the physics ----------------------------------------------------------------------------------
 
 
 @every_task
@@ -321,7 +321,7 @@ def test_a_diverging_simulation_raises_and_works_again_after_reset(tmp_path, mon
     assert np.isfinite(_vector(env.reset())).all()
 
 
-# -- pixels -------------------------------------------------------------------------------------------------
+# -- pixels ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", but(REPRESENTATIVES, TASKS))
@@ -349,7 +349,7 @@ def test_pixels_show_the_present_state_and_change_nothing(task):
     )
 
 
-# -- environments of others ---------------------------------------------------------------------------------
+# -- environments of others -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("made", ["Hopper-v5", "Taxi-v4", "Blackjack-v1"])
@@ -384,7 +384,7 @@ def test_any_environment_of_gymnasiums_keeps_the_contract(made):
         assert env.randomization == theirs.randomization != {}
 
 
-# -- refusals -----------------------------------------------------------------------------------------------
+# -- refusals -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ class MotorSettings:
     action: str = "force"
     """Command that an action is."""
     observe_actuator: bool = False
-    """If True, observations end with the values of the motors' sensors."""
+    """True to append the values of the motors' sensors to observations."""
     randomize: Any = None
     """Distributions of the fields that are drawn at every reset."""
     disturbances: Disturbances = OFF

@@ -1,4 +1,4 @@
-"""A world from outside: a rig that is registered nowhere, found as `tests.envs.rig:RIG`."""
+"""Custom env source that is registered nowhere: `tests.envs.rig:RIG`."""
 
 import gymnasium
 import mujoco
@@ -22,12 +22,12 @@ XML = """
 
 
 class RigEnv(gymnasium.Env):
-    """A hanging rod that is to be held at one radian."""
+    """Hanging rod that must be held at one radian."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
 
     def __init__(self, target: float = 1.0, render_mode: str | None = None) -> None:
-        """Hang it up."""
+        """Build the model with the rod at rest."""
         self.model = mujoco.MjModel.from_xml_string(XML)
         self.data, self.dt, self._target, self.render_mode = (
             mujoco.MjData(self.model),
@@ -48,8 +48,8 @@ class RigEnv(gymnasium.Env):
         self.data.ctrl[:] = action
         for _ in range(10):
             mujoco.mj_step(self.model, self.data)
-        off = abs(float(self.data.qpos[0]) - self._target)
-        return self._seen(), -off, False, False, {"is_success": off < 0.1}
+        error = abs(float(self.data.qpos[0]) - self._target)
+        return self._seen(), -error, False, False, {"is_success": error < 0.1}
 
     def render(self):
         renderer = mujoco.Renderer(self.model, 120, 160)
@@ -58,12 +58,12 @@ class RigEnv(gymnasium.Env):
         renderer.close()
         return image
 
-    def _seen(self):
+    def _observation(self):
         return np.concatenate([self.data.qpos, self.data.qvel])
 
 
 class Rig(EnvSource):
-    """Environments of the rig."""
+    """Env source of the rig."""
 
     name, time_limit = "rig", 30
 

@@ -110,7 +110,7 @@ def reacher(tmp_path_factory):
     return out
 
 
-# -- descriptions ---------------------------------------------------------------------------------------------
+# -- descriptions ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -176,7 +176,7 @@ def test_a_module_of_somebodys_is_not_imported_from_a_run_folder_unasked(tmp_pat
         load_config(tmp_path)
 
 
-# -- training -------------------------------------------------------------------------------------------------
+# -- training -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", but(["reacher by currents"], CASES))
@@ -242,7 +242,7 @@ def test_the_options_of_an_environment_decide_who_can_act_in_it():
     )
 
 
-# -- measuring ------------------------------------------------------------------------------------------------
+# -- measuring ------------------------------------------------------------------------------------
 
 
 def test_every_integration_step_is_looked_at_nothing_changes_by_it_and_a_file_keeps_it():
@@ -288,7 +288,7 @@ def test_motors_of_several_families_are_measured_by_what_they_have():
     assert found.success is None  # Reacher says nothing of it
 
 
-# -- the command line -----------------------------------------------------------------------------------------
+# -- the command line -----------------------------------------------------------------------------
 
 
 def test_motors_that_are_not_named_stay_what_they_were():
