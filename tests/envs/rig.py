@@ -16,7 +16,9 @@ XML = """
     <body name="rod"><joint name="hinge" axis="0 1 0" damping="0.01"/>
       <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="0.2"/></body>
   </worldbody>
-  <actuator><motor name="drive" joint="hinge" gear="1" ctrllimited="true" ctrlrange="-1 1"/></actuator>
+  <actuator>
+    <motor name="drive" joint="hinge" gear="1" ctrllimited="true" ctrlrange="-1 1"/>
+  </actuator>
 </mujoco>
 """
 

@@ -113,7 +113,7 @@ def test_all_numbers_of_gymnasiums_environment_can_be_read(task, physics):
 @pytest.mark.parametrize(
     ("task", "values"),
     WRITES,
-    ids=lambda given: given if isinstance(given, str) else "+".join(given),
+    ids=lambda case: case if isinstance(case, str) else "+".join(case),
 )
 @pytest.mark.parametrize("physics", PHYSICS)
 def test_a_written_number_has_the_same_effect_as_in_gymnasium(task, values, physics):

@@ -10,7 +10,8 @@ WITHOUT = """
 import mujoco
 import gymnasium, codrl_mj
 from codrl_mj.physics.offscreen import RenderingUnavailableError
-env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", render_mode="rgb_array", width=64, height=48)
+view = {"render_mode": "rgb_array", "width": 64, "height": 48}
+env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", **view)
 env.reset(seed=0)
 for _ in range(2):
     try:
@@ -24,7 +25,8 @@ import multiprocessing
 import gymnasium, numpy as np, codrl_mj
 
 def made(size):
-    env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", render_mode="rgb_array", width=size, height=48)
+    view = {"render_mode": "rgb_array", "width": size, "height": 48}
+    env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", **view)
     env.reset(seed=0)
     return env, env.render()
 
