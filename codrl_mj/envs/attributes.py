@@ -118,8 +118,8 @@ def _gymnasium_env(physics: Any) -> Any:
     """Return the Gymnasium environment behind a physics without a MuJoCo model."""
     if not isinstance(physics, AnalyticPhysics) or not hasattr(physics.twin, "env"):
         raise AttributeError(
-            f"{type(physics).__name__} has neither a MuJoCo model nor a Gymnasium environment that"
-            " holds this number; use physics='mujoco'"
+            f"{type(physics).__name__} has no MuJoCo model or data, and no Gymnasium environment"
+            " that holds this number; use physics='mujoco'"
         )
     return physics.twin.env
 
@@ -170,9 +170,8 @@ def _write_forces(value: Any, setup: ResolvedEnv, model: Any, each: bool) -> Res
     task = setup.task
     if setup.config.action != "force" or setup.config.disturbances != OFF or len(task.motors) > 1:
         raise AttributeError(
-            "the forces are also used by the current loop's table, by the drive's disturbances or"
-            " for several motors: make an environment of one motor with action='force' and no"
-            " disturbances"
+            "the current loop's table, the drive's disturbances and several motors depend on the"
+            " forces: make an environment of one motor with action='force' and no disturbances"
         )
     table = task.forces
     if each:

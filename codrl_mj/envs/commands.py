@@ -349,7 +349,7 @@ class ControlCommands:
     def begin(self, key: float) -> None:
         """Reset at the start of an episode that has this key of random numbers."""
         if self._disturber.on:
-            self._disturber.reset(np.zeros(1, dtype=int), key, self._held())
+            self._disturber.reset(np.zeros(1, dtype=int), key, self._holding_commands())
             self._data.qfrc_applied[self._dofs] = 0.0
 
     def _holding_commands(self) -> Any:

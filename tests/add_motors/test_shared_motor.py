@@ -258,7 +258,7 @@ def test_both_commands_are_late_and_loads_act_once():
 
 
 def test_currents_are_no_command_of_two():
-    with pytest.raises(ValueError, match="hip_p: is no plain motor of its own"):
+    with pytest.raises(ValueError, match="hip_p: is not a plain motor"):
         codrl_mj.make(Leg, {"hip_p & hip_v": MAXON}, action="current", disable_env_checker=True)
 
 

@@ -44,14 +44,14 @@ class RigEnv(gymnasium.Env):
         super().reset(seed=seed)
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[0] = self.np_random.uniform(-0.1, 0.1)
-        return self._seen(), {}
+        return self._observation(), {}
 
     def step(self, action):
         self.data.ctrl[:] = action
         for _ in range(10):
             mujoco.mj_step(self.model, self.data)
         error = abs(float(self.data.qpos[0]) - self._target)
-        return self._seen(), -error, False, False, {"is_success": error < 0.1}
+        return self._observation(), -error, False, False, {"is_success": error < 0.1}
 
     def render(self):
         renderer = mujoco.Renderer(self.model, 120, 160)

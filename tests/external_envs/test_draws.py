@@ -241,9 +241,9 @@ def test_delayed_positions_start_at_the_initial_state_and_delayed_forces_at_0(
     path.write_text(ARM)
     creator = functools.partial(Stale if kind == "stale" else ArmEnv, path)
     delayed_env = codrl_mj.make(
-        creator, motors, command=command, disturbances={"command_delay": 0.02}, max_episode_steps=99
+        creator, motors, action=command, disturbances={"command_delay": 0.02}, max_episode_steps=99
     )
-    undelayed_env = codrl_mj.make(creator, motors, command=command, max_episode_steps=99)
+    undelayed_env = codrl_mj.make(creator, motors, action=command, max_episode_steps=99)
     for seed in (3, 4):
         observation = delayed_env.reset(seed=seed)[0]
         np.testing.assert_array_equal(undelayed_env.reset(seed=seed)[0], observation)

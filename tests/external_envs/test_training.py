@@ -117,7 +117,7 @@ def reacher(tmp_path_factory):
 @pytest.mark.parametrize("name", CASES)
 def test_a_configuration_survives_json(name):
     mapping = json.loads(json.dumps(CASES[name].as_mapping()))
-    assert TrainConfig.from_mapping(mapping, mapping=True) == CASES[name]
+    assert TrainConfig.from_mapping(mapping, whole=True) == CASES[name]
     # The Gymnasium id of a built-in task is replaced by its name.
     assert TrainConfig.from_mapping({"task": "codrl_mj/Pendulum-v0"}).env.task == "pendulum"
 
