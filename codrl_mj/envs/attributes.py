@@ -83,7 +83,7 @@ def write(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
             return setup
         if attribute is Setting.STEP:
             return _write_step(value, setup, model)
-        return _write_forces(value, setup, model, each=attribute is Setting.FORCES)
+        return _write_forces(value, setup, model, per_action=attribute is Setting.FORCES)
     except ValueError as error:
         raise ValueError(f"{name} = {value!r}: {error}") from None
     except AttributeError as error:
@@ -165,7 +165,7 @@ def _write_number(
     _number_view(attribute, model)[0] = (number / attribute.scale) ** power
 
 
-def _write_forces(value: Any, setup: ResolvedEnv, model: Any, each: bool) -> ResolvedEnv:
+def _write_forces(value: Any, setup: ResolvedEnv, model: Any, per_action: bool) -> ResolvedEnv:
     """Write the force of each action, or the largest force, to which the others are scaled."""
     task = setup.task
     if setup.config.action != "force" or setup.config.disturbances != OFF or len(task.motors) > 1:
@@ -174,13 +174,13 @@ def _write_forces(value: Any, setup: ResolvedEnv, model: Any, each: bool) -> Res
             " forces: make an environment of one motor with action='force' and no disturbances"
         )
     table = task.forces
-    if each:
+    if per_action:
         if np.shape(value) != (len(table or ()),):
             raise ValueError(f"must be {len(table or ())} numbers, one for each action")
         table = tuple(_finite_number(force, positive=False) for force in value)
         value = max(map(abs, table))
     largest = _finite_number(value, positive=True)
-    if table is not None and not each:
+    if table is not None and not per_action:
         table = tuple(largest * (force / task.max_force) for force in table)
     if isinstance(model, mujoco.MjModel):
         model.actuator(task.motors[0]).ctrlrange[:] *= largest / task.max_force

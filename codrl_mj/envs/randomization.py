@@ -66,7 +66,7 @@ class Randomization:
             allow_unstable,
         )
         matched, simulated = (
-            _matched(distributions, model, motors, fixed, model_name),
+            _match_motors(distributions, model, motors, fixed, model_name),
             list(motors.values()),
         )
         paths_of_arms, paths_of_additions = (
@@ -74,7 +74,7 @@ class Randomization:
                 path
                 for path, motor_indices in matched.items()
                 if any(
-                    _follows(quantity, simulated[motor_index], path)
+                    _depends_on(quantity, simulated[motor_index], path)
                     for motor_index in motor_indices
                 )
             ]
@@ -85,7 +85,9 @@ class Randomization:
         )
         model_only_paths = [path for path, motor_indices in matched.items() if not motor_indices]
         self.types = {
-            path: _kind(type(simulated[motor_indices[0]]), path) if motor_indices else float
+            path: _type_of_field(type(simulated[motor_indices[0]]), path)
+            if motor_indices
+            else float
             for path, motor_indices in matched.items()
         }
         """Path -> type of the field: float, int or bool."""
@@ -100,11 +102,11 @@ class Randomization:
             for motor_index in range(len(simulated))
         ]
         """For each motor: column of the drawn values -> name of the field."""
-        self.in_model = (*model_only_paths, *paths_of_additions)
+        self.model_paths = (*model_only_paths, *paths_of_additions)
         """Paths that change the model itself, and not only parameters of its motors."""
         self.variation = (
             Variation(model, model_only_paths, list(motors), mounting=bool(paths_of_additions))
-            if self.in_model
+            if self.model_paths
             else None
         )
         """Effect of the drawn fields on the model; None if they have none."""
@@ -166,6 +168,8 @@ class RandomizationState:
         while len(pending):
             draws = random(rows[pending], len(randomization.distributions))
             for column, distribution in enumerate(randomization.distributions.values()):
+                # A contiguous copy, because numpy may round strided arrays differently: a draw must
+                # give the same value in any batch.
                 values[pending, column] = distribution.transform(draws[:, column].copy())
             if randomization.allow_unstable or not randomization.draws_actuator:
                 break
@@ -190,13 +194,13 @@ class RandomizationState:
                 raise ValueError(
                     f"randomize: {MAX_REDRAWS} draws in a row have an unstable current loop at a"
                     f" step of {randomization.timestep:g} s; the last was"
-                    f" {self._last(rows[pending[:1]], values[pending[:1]])}. Narrow the bounds,"
+                    f" {self._describe_last_set(rows[pending[:1]], values[pending[:1]])}. Narrow the bounds,"
                     " shorten the step, or pass allow_unstable=True"
                 )
         self._values[rows], self._rejected[rows] = values, rejected
         self._apply_values(self, rows)
 
-    def _last(self, row: np.ndarray, values: np.ndarray) -> str:
+    def _describe_last_set(self, row: np.ndarray, values: np.ndarray) -> str:
         """Describe a simulation's drawn values, with the error of the first unstable motor."""
         randomization = self.randomization
         description = str(dict(zip(randomization.distributions, values[0].tolist(), strict=True)))
@@ -246,11 +250,11 @@ class RandomizationState:
     def parameters(self, rows: np.ndarray) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Return the motors' parameters, each (m, p), arms [m] (m, n), and additions (m, n, 3)."""
         fields, families = self._fields(rows, self._values[rows]), self.randomization.families
-        arms, additions = (each[rows] for each in self._mounting)
+        arms, additions = (array[rows] for array in self._mounting)
         if self.randomization.changes_mounting:
-            each = zip(*(motor_fields.tolist() for motor_fields in fields), strict=True)
+            simulations = zip(*(motor_fields.tolist() for motor_fields in fields), strict=True)
             arms, additions = mounting_of(
-                [list(map(from_array, families, values)) for values in each]
+                [list(map(from_array, families, values)) for values in simulations]
             )
         return list(map(parameters_from_fields, families, fields)), arms, additions
 
@@ -344,6 +348,7 @@ def check_extremes(
     for corner in (
         range(count) if count <= MAX_CORNERS else random.Random(0).sample(range(count), MAX_CORNERS)
     ):
+        # Bit `column` of `corner` selects the first or the last of the field's values: [0] or [-1].
         values = [extremes[-(corner >> column & 1)] for column, extremes in enumerate(bounds)]
         state._values[0] = values
         try:
@@ -393,7 +398,7 @@ def parameters_from_fields(family: Family, fields: np.ndarray) -> np.ndarray:
     return fields[:, [paths.index(path) for path in parameter_paths(family).values()]]
 
 
-def _matched(
+def _match_motors(
     distributions: Mapping[str, Distribution],
     model: mujoco.MjModel,
     motors: Mapping[int, ActuatorModel],
@@ -438,10 +443,10 @@ def _matched(
             ):
                 raise ValueError("it is drawn by another pattern, too")
             if not motor_indices:
-                _check_factor(field, distribution)
+                _check_model_factor(field, distribution)
             for motor in motor_indices:
-                _check(field, distribution, actuators[motor], fixed[motor])
-                if not allows_friction[motor] and _follows(
+                _check_motor_field(field, distribution, actuators[motor], fixed[motor])
+                if not allows_friction[motor] and _depends_on(
                     lambda actuator: actuator.additions.friction, actuators[motor], field
                 ):
                     raise ValueError(
@@ -477,7 +482,7 @@ def _check_known(
         )
 
 
-def _check_factor(field: str, distribution: Distribution) -> None:
+def _check_model_factor(field: str, distribution: Distribution) -> None:
     """Raise if a distribution has values that the model's field must not have."""
     low, kind = min(distribution.extremes), field.split(".")[1]
     allowed_zero = kind in ("gravity", "damping")
@@ -491,7 +496,7 @@ def _check_factor(field: str, distribution: Distribution) -> None:
         )
 
 
-def _check(
+def _check_motor_field(
     field: str, distribution: Distribution, motor: ActuatorModel, fixed: Mapping[str, str]
 ) -> None:
     """Raise if a motor's field cannot be drawn from a distribution."""
@@ -501,7 +506,7 @@ def _check(
         )
     if field in fixed:
         raise ValueError(f"{fixed[field]}; draw it with action='force'")
-    field_type, choices = _kind(type(motor), field), choices_of(type(motor), field)
+    field_type, choices = _type_of_field(type(motor), field), choices_of(type(motor), field)
     if choices:
         if not isinstance(distribution, Choice) or any(
             value not in range(len(choices)) for value in distribution.values
@@ -520,7 +525,7 @@ def _check(
         motor.replaced({field: value})
 
 
-def _kind(family: Family, path: str) -> type:
+def _type_of_field(family: Family, path: str) -> type:
     """Return the type of a family's field: float, int or bool."""
     value: Any = family()
     for part in split_path(path)[1].split("."):
@@ -528,7 +533,7 @@ def _kind(family: Family, path: str) -> type:
     return type(value) if isinstance(value, int) else float
 
 
-def _follows(quantity: Callable[[ActuatorModel], Any], motor: ActuatorModel, path: str) -> bool:
+def _depends_on(quantity: Callable[[ActuatorModel], Any], motor: ActuatorModel, path: str) -> bool:
     """Return True if a quantity of a motor depends on a field.
 
     A product with a factor of 0 hides the dependence, so it is also tried with all fields at 2.

@@ -129,7 +129,7 @@ class ResolvedEnv:
             self.simulation
         )
         if physics.scene is None and self.randomization.variation is not None:
-            names = ", ".join(self.randomization.in_model)
+            names = ", ".join(self.randomization.model_paths)
             raise ValueError(
                 f"physics = {physics_name!r}: cannot draw {names}: Gymnasium's environments have no"
                 " common names for masses, lengths and gravity, and no damping, friction and"
