@@ -194,8 +194,8 @@ class RandomizationState:
                 raise ValueError(
                     f"randomize: {MAX_REDRAWS} draws in a row have an unstable current loop at a"
                     f" step of {randomization.timestep:g} s; the last was"
-                    f" {self._describe_last_set(rows[pending[:1]], values[pending[:1]])}. Narrow the bounds,"
-                    " shorten the step, or pass allow_unstable=True"
+                    f" {self._describe_last_set(rows[pending[:1]], values[pending[:1]])}. Narrow"
+                    " the bounds, shorten the step, or pass allow_unstable=True"
                 )
         self._values[rows], self._rejected[rows] = values, rejected
         self._apply_values(self, rows)

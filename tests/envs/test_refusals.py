@@ -183,7 +183,7 @@ def test_raises_for_a_bad_argument_of_a_vector_environment(make, arguments, mess
             "actuator[1]: unknown actuator 'weka': did you mean 'weak'?",
         ),
         ({"actuator": ["weak", "weak", 3]}, "actuator[2]: actuator = 3: must be a name"),
-        ({"actuator": ["weak", "lag", "weak"]}, "actuators of several families (DCMotorActuator, Lag)"),
+        ({"actuator": ["weak", "lag", "weak"]}, "of several families (DCMotorActuator, Lag)"),
         ({"actuator": WILD}, "unstable at a step of 0.05 s: spectral radius"),
         (
             {"actuator": [STABLE, STABLE, WILD]},
