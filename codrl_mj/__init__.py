@@ -1,12 +1,11 @@
-"""Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a DC motor.
+"""Reinforcement learning with realistic actuators: classic control in MuJoCo with DC motors.
 
     >>> import gymnasium as gym
     >>> import codrl_mj
     >>> env = gym.make("codrl_mj/CartPole-v0", actuator="weaker")
 
-Importing the package registers its environments with Gymnasium (which loads no plugins since its
-version 1.0). Everything named here is imported on first use, so that `import codrl_mj` costs
-little.
+Importing the package registers its environments with Gymnasium, which has loaded no plugins since
+version 1.0. Every public name is imported on first use, so that `import codrl_mj` is fast.
 """
 
 import importlib
@@ -32,7 +31,7 @@ _PUBLIC = {
     "motors_added": "codrl_mj.external_envs.building",
     "signals": "codrl_mj.engine.reading",
     "Task": "codrl_mj.tasks",
-    "EnvSource": "codrl_mj.envs.worlds",
+    "EnvSource": "codrl_mj.envs.sources",
     "register": "codrl_mj.tasks",
     "TrainConfig": "codrl_mj.training",
     "train": "codrl_mj.training",
@@ -40,26 +39,28 @@ _PUBLIC = {
     "evaluate": "codrl_mj.evaluation",
     "validate": "codrl_mj.validation",
 }
-"""What one begins with; what experts need is in the rooms: `codrl_mj.actuators`, `.engine`, `.identify` and so on."""
+"""Main public names -> their modules; others are in `codrl_mj.actuators`, `.engine` and so on."""
 
 __all__ = ["__version__", *_PUBLIC]
 
 
-def _stopped_early(*_: object) -> None:
-    """End the program at Ctrl-C while it imports what it needs; `cli.main` puts the usual handler back."""
-    os.write(2, b"codrl-mj: stopped before anything was begun\n")
+def _exit_on_interrupt(*_: object) -> None:
+    """End the program at Ctrl-C during its imports; `cli.main` restores the usual handler."""
+    os.write(2, b"codrl-mj: stopped before it started\n")
     os._exit(130)
 
 
-def _is_program() -> bool:
-    """Whether this is the process of `codrl-mj` or `python -m codrl_mj`, with nobody else's handler of Ctrl-C."""
-    called = os.path.basename((getattr(sys, "argv", None) or [""])[0])  # noqa: PTH119 - without importing more
-    named = called == "codrl-mj" or (called == "-m" and "codrl_mj" in sys.orig_argv)
-    return named and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+def _is_command_line() -> bool:
+    """Return True in the process of the command line, if Ctrl-C still has Python's handler."""
+    # `pathlib` would have to be imported first, which takes time.
+    program = os.path.basename((getattr(sys, "argv", None) or [""])[0])  # noqa: PTH119
+    is_command = program == "codrl-mj" or (program == "-m" and "codrl_mj" in sys.orig_argv)
+    return is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def _choose_headless_backend() -> None:
-    """On Linux without a display let MuJoCo render through EGL; it reads the variable when it is first imported."""
+    """Let MuJoCo render through EGL on Linux without a display."""
+    # MuJoCo reads the variable once, when it is first imported.
     has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if sys.platform == "linux" and not has_display and "mujoco" not in sys.modules:
         os.environ.setdefault("MUJOCO_GL", "egl")
@@ -73,12 +74,14 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The public names."""
+    """Return the public names."""
     return sorted({*globals(), *__all__})
 
 
-if _is_program():
-    signal.signal(signal.SIGINT, _stopped_early)
+if _is_command_line():
+    signal.signal(signal.SIGINT, _exit_on_interrupt)
+# The plugin's module imports mujoco, which reads the variable: the order matters.
 _choose_headless_backend()
-importlib.import_module("codrl_mj.plugin").register()  # imports mujoco, which reads the variable
-importlib.import_module("codrl_mj.tasks")  # registers them with Gymnasium
+importlib.import_module("codrl_mj.plugin").register()
+# Importing the tasks registers them with Gymnasium.
+importlib.import_module("codrl_mj.tasks")

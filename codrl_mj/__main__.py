@@ -1,4 +1,4 @@
-"""`python -m codrl_mj` is the command line."""
+"""Entry point of `python -m codrl_mj`, the command line."""
 
 import sys
 

@@ -1,15 +1,16 @@
-"""Compiled functions, kept on disk: the first process compiles, the next ones load what it made.
+"""Compiled functions on disk: the first process compiles, later processes load the machine code.
 
-What is kept is machine code for one CPU, so its key has everything that was compiled in: the
-bytecode, constants, closure values and globals of every function that is reached, somebody's own
-too, and the files that these stand in; all of this package's source; MuJoCo's layout, whose offsets
-are among the constants; versions, CPU and numba's settings. What has a value that is not known here
-is not kept. Addresses of this process are known to it by name (`linked`).
+Machine code fits one CPU and everything that was compiled into it. The key of a file therefore
+contains: bytecode, constants, closure values and globals of every function that is reached, and
+the source files of users' functions; all of this package's source; MuJoCo's memory layout, whose
+offsets are constants in the code; versions, CPU and numba's settings. A function with a value that
+cannot be hashed is not stored. Compiled code refers to addresses of this process by symbol names
+(`register_symbol`).
 
-The folder is the user's cache folder, or what CODRL_MJ_CACHE names; `off` keeps nothing. numba
-unpickles what is around the code: so folder and files must belong to the user, with nobody else
-allowed to write them, or they are not used. A file is written whole or not at all, and one that is
-damaged counts as none.
+The folder is the user's cache folder, or CODRL_MJ_CACHE; with `off` nothing is stored. numba
+unpickles parts of the files, so folder and files are only used if they belong to the user and no
+other user may write them. A file is written completely or not at all; a damaged file counts as
+missing.
 """
 
 import ctypes
@@ -41,10 +42,10 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.types import containers
 from numba.extending import _Intrinsic
 
-MOST = 500_000_000
-"""Bytes that the folder may hold; beyond, what was not used for the longest time goes."""
+MAX_BYTES = 500_000_000
+"""Maximum size of the folder [bytes]; beyond it, the least recently used files are deleted."""
 _PACKAGE = Path(__file__).parent
-_OTHERS = {
+_VERSIONED_PACKAGES = {
     "builtins",
     "math",
     "numba",
@@ -56,45 +57,46 @@ _OTHERS = {
     "operator",
     "ctypes",
 }
-"""Packages of which a version says all."""
-_PLAIN = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis), np.generic)
+"""Packages whose version identifies their code."""
+_PLAIN_TYPES = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis), np.generic)
 _SYMBOLS: dict[str, int] = {}
 
 
-class _NotKnownError(Exception):
-    """A value of which it cannot be said what it makes of compiled code."""
+class _UnhashableError(Exception):
+    """The value cannot be hashed into a cache key."""
 
 
-def folder() -> Path | None:
-    """Where compiled code is kept; None: nowhere."""
-    given = os.environ.get("CODRL_MJ_CACHE")
-    if given in ("off", "0", ""):
+def cache_folder() -> Path | None:
+    """Return the folder of compiled code; None if nothing is stored."""
+    setting = os.environ.get("CODRL_MJ_CACHE")
+    if setting in ("off", "0", ""):
         return None
-    if given is not None:
-        return Path(given)
+    if setting is not None:
+        return Path(setting)
     import platformdirs
 
     return platformdirs.user_cache_path("codrl_mj") / "compiled"
 
 
-def _count_anew() -> None:
-    """Let numba's names for functions be like those of no other process.
+def _randomize_function_ids() -> None:
+    """Make numba's names for functions unique among all processes.
 
-    It tells functions of one name apart by a count, in what the linker sees too: of two functions
-    that two processes called alike it would take the one for the other, wherever both are loaded.
+    numba distinguishes functions of one name by a count, also in symbols that the linker sees. If
+    two processes gave two functions the same name, the linker would take one for the other when
+    both are loaded.
     """
     FunctionIdentity._unique_ids = itertools.count(secrets.randbits(60))  # type: ignore[attr-defined]
 
 
-_count_anew()
+_randomize_function_ids()
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_count_anew)
+    os.register_at_fork(after_in_child=_randomize_function_ids)
 
 
-def linked(name: str, address: int) -> str:
-    """The name by which compiled code, of this process and of those to come, finds what is at an address here.
+def register_symbol(name: str, address: int) -> str:
+    """Register the name by which compiled code of any process finds this process's address.
 
-    Where something else has the name, as in a copy of a module, it is another one.
+    If the name already has another address, as after a copy of a module, a new name is returned.
     """
     while _SYMBOLS.setdefault(name, address) != address:
         name += "_"
@@ -102,125 +104,129 @@ def linked(name: str, address: int) -> str:
     return name
 
 
-def external(name: str, function: Any, signature: Any) -> Any:
-    """A C function of ctypes', for compiled code."""
+def external_function(name: str, function: Any, signature: Any) -> Any:
+    """Declare a C function of ctypes for compiled code."""
     return types.ExternalFunction(
-        linked(name, ctypes.cast(function, ctypes.c_void_p).value or 0), signature
+        register_symbol(name, ctypes.cast(function, ctypes.c_void_p).value or 0), signature
     )
 
 
 def njit(function: Any = None, **options: Any) -> Any:
-    """`numba.njit` of a function that Python calls, kept on disk."""
+    """Compile a function as `numba.njit` does, for calls from Python, with the cache on disk."""
     if function is None:
         return functools.partial(njit, **options)
     compiled = numba.njit(function, **options)
-    compiled._cache = _Kept("njit", function, options)
+    compiled._cache = _FunctionCache("njit", function, options)
     return compiled
 
 
 def cfunc(signature: Any, **options: Any) -> Callable[[Any], Any]:
-    """`numba.cfunc`, kept on disk."""
+    """Compile a function as `numba.cfunc` does, with the cache on disk."""
 
     def compiled(function: Any) -> Any:
-        made: Any = CFunc(
+        compiled_callback: Any = CFunc(
             function, sigutils.normalize_signature(signature), locals={}, options=options
         )
-        made._cache = _Kept("cfunc", function, options)
-        made.compile()
-        return made
+        compiled_callback._cache = _FunctionCache("cfunc", function, options)
+        compiled_callback.compile()
+        return compiled_callback
 
     return compiled
 
 
-class Note:
-    """That something was found to hold of values, such as a function and types: a file without content."""
+class VerifiedMarker:
+    """Empty file that records a passed check of values, such as a function and types."""
 
-    def __init__(self, what: str, *about: Any) -> None:
-        """What holds, and of what."""
-        self._path = _path(what, about)
+    def __init__(self, label: str, *values: Any) -> None:
+        """Identify the check by a label and the values that it depends on."""
+        self._path = _path(label, values)
 
-    def is_there(self) -> bool:
-        """Whether it was found before."""
+    def exists(self) -> bool:
+        """Return True if the check has passed before."""
         return self._path is not None and _read(self._path) is not None
 
-    def leave(self) -> None:
-        """Say so."""
+    def write(self) -> None:
+        """Record that the check has passed."""
         if self._path is not None:
             _write(self._path, b"")
 
 
-class _Kept(_Cache):  # type: ignore[misc]
-    """What numba asks for the compiled forms of one function."""
+class _FunctionCache(_Cache):  # type: ignore[misc]
+    """Cache of one function's compiled forms, with the interface that numba expects."""
 
     def __init__(self, kind: str, function: Any, options: Any) -> None:
-        self._name, self._about = (
+        self._name, self._key_values = (
             function.__name__,
             (kind, tuple(sorted(options.items())), function),
         )
 
     @property
     def cache_path(self) -> str:
-        """Where they are."""
-        return str(folder())
+        """Folder of the compiled forms."""
+        return str(cache_folder())
 
     def enable(self) -> None:
-        """They are."""
+        """Do nothing: the cache is always enabled; numba's interface requires the method."""
 
     def disable(self) -> None:
-        """By CODRL_MJ_CACHE alone."""
+        """Do nothing: only CODRL_MJ_CACHE disables the cache."""
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: files are written at once."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled form for a signature; None where there is none that may be used."""
-        path = self._place(sig)
+        """Load the compiled form for a signature; None if there is no usable file."""
+        path = self._overload_path(sig)
         payload = None if path is None else _read(path)
         if payload is None:
             return None
+        # As in numba's own cache: the context must know all registrations before it rebuilds code.
         target_context.refresh()
         try:
             return CompileResult._rebuild(target_context, *pickle.loads(payload))
-        except Exception:  # of another making: compiled anew
+        except Exception:
+            # Another numba may have written it; it is compiled again.
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep what was compiled, if it may run in any process of the user's on this machine."""
-        path = self._place(sig)
+        """Store a compiled form if it is valid in any process of the user on this machine."""
+        path = self._overload_path(sig)
         if path is not None and not data.library.has_dynamic_globals and not data.lifted:
             try:
                 payload = serialize.dumps(data._reduce())
-            except Exception:  # something in it cannot be written
+            except Exception:
+                # A part of it cannot be pickled.
                 return
             _write(path, payload)
 
-    def _place(self, sig: Any) -> Path | None:
-        return _path(self._name, (*self._about, tuple(getattr(sig, "args", sig))))
+    def _overload_path(self, sig: Any) -> Path | None:
+        """Return the file for a signature."""
+        return _path(self._name, (*self._key_values, tuple(getattr(sig, "args", sig))))
 
 
-def _path(name: str, about: Any) -> Path | None:
-    """The file for values; None where nothing is kept, or nothing can be said of one of them."""
+def _path(name: str, values: Any) -> Path | None:
+    """Return the file for values; None if nothing is stored, or a value cannot be hashed."""
     try:
-        place, key = folder(), hashlib.sha256(_foundation())
-        if place is None:
+        directory, key = cache_folder(), hashlib.sha256(_base_key())
+        if directory is None:
             return None
-        _tell(key, about, (), {})
-    except (
-        Exception
-    ):  # whatever somebody's value does when it is looked at: then it is compiled in every process
+        _hash_value(key, values, (), {})
+    except Exception:
+        # Looking at a user's value can raise anything; the function is then compiled in every
+        # process.
         return None
-    return place / f"{name}-{key.hexdigest()}.code"
+    return directory / f"{name}-{key.hexdigest()}.code"
 
 
 def _usable(status: os.stat_result) -> bool:
-    """Whether a file or folder is the user's, and nobody else may write it."""
+    """Return True if a file or folder is the user's, and no other user may write it."""
     return not hasattr(os, "getuid") or (
         status.st_uid == os.getuid() and not status.st_mode & 0o022
     )
 
 
 def _read(path: Path) -> bytes | None:
-    """The content of a file that may be used, and is whole."""
+    """Return the content of a file that is usable and complete; otherwise None."""
     try:
         if not _usable(path.parent.stat()):
             return None
@@ -235,11 +241,12 @@ def _read(path: Path) -> bytes | None:
 
 
 def _write(path: Path, payload: bytes) -> None:
-    """Write a file whole, or not at all; what was not used for long makes room."""
+    """Write a file completely or not at all; delete the least recently used files for space."""
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not _usable(path.parent.stat()):
             return
+        # Readers never see an incomplete file, because renaming is atomic.
         handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
         try:
             with os.fdopen(handle, "wb") as file:
@@ -249,24 +256,28 @@ def _write(path: Path, payload: bytes) -> None:
             Path(temporary).unlink(missing_ok=True)
             return
         files = sorted(
-            ((one.stat().st_mtime, one.stat().st_size, one) for one in path.parent.iterdir()),
+            (
+                (entry.stat().st_mtime, entry.stat().st_size, entry)
+                for entry in path.parent.iterdir()
+            ),
             reverse=True,
         )
         total = 0
-        for _, size, one in files:
+        for _, size, entry in files:
             total += size
-            if total > MOST:
-                one.unlink(missing_ok=True)
-    except OSError:  # no room, no right: it is compiled anew next time
+            if total > MAX_BYTES:
+                entry.unlink(missing_ok=True)
+    except OSError:
+        # No space or no permission: the function is compiled again next time.
         return
 
 
 @functools.cache
-def _foundation() -> bytes:
-    """What every key begins with: versions, CPU, numba's settings, this package's source."""
+def _base_key() -> bytes:
+    """Return the common part of all keys: versions, CPU, numba's settings, the package's source."""
     key = hashlib.sha256()
-    for one in (numba, llvmlite, np, mujoco):
-        key.update(f"{one.__name__} {one.__version__}\n".encode())
+    for library in (numba, llvmlite, np, mujoco):
+        key.update(f"{library.__name__} {library.__version__}\n".encode())
     cpu = (
         binding.get_host_cpu_name(),
         binding.get_host_cpu_features().flatten(),
@@ -278,49 +289,54 @@ def _foundation() -> bytes:
     named = (
         (name, value) for name, value in vars(numba.config).items() if not name.startswith("__")
     )
-    settings = sorted((name, repr(value)) for name, value in named if isinstance(value, _PLAIN))
+    settings = sorted(
+        (name, repr(value)) for name, value in named if isinstance(value, _PLAIN_TYPES)
+    )
     key.update(repr((cpu, settings)).encode())
     sources = sorted(_PACKAGE.rglob("*.py"))
     if not sources:
-        raise _NotKnownError("this package's source")
+        raise _UnhashableError("this package's source")
     for path in sources:
         key.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
     return key.digest()
 
 
 @functools.cache
-def _file(module: str) -> bytes:
-    """The content of a module's file; of one without a file nothing."""
+def _source_of(module: str) -> bytes:
+    """Return the content of a module's file; empty if it has none."""
     path = getattr(sys.modules.get(module), "__file__", None)
     return Path(path).read_bytes() if path and Path(path).is_file() else b""
 
 
-def _tell(key: Any, value: Any, names: tuple[str, ...], told: dict[int, Any]) -> None:
-    """Put a value into a key, and all that it reaches; of a module what has one of the names."""
-    if isinstance(value, _PLAIN):
+def _hash_value(key: Any, value: Any, names: tuple[str, ...], visited: dict[int, Any]) -> None:
+    """Hash a value and everything it reaches; for a module only the attributes with these names."""
+    if isinstance(value, _PLAIN_TYPES):
         key.update(f"{type(value).__qualname__} {value!r}\n".encode())
         return
     if isinstance(value, tuple | list | frozenset):
         key.update(f"{type(value).__qualname__} {len(value)}\n".encode())
-        for one in sorted(value, key=repr) if isinstance(value, frozenset) else value:
-            _tell(key, one, names, told)
+        for element in sorted(value, key=repr) if isinstance(value, frozenset) else value:
+            _hash_value(key, element, names, visited)
         return
     if not isinstance(value, python.ModuleType):
-        if id(value) in told:
-            key.update(f"again {[*told].index(id(value))}\n".encode())
+        # Recursive functions reach themselves: a second visit hashes only the order of the first.
+        if id(value) in visited:
+            key.update(f"again {[*visited].index(id(value))}\n".encode())
             return
-        told[id(value)] = value
+        visited[id(value)] = value
     root = str(getattr(value, "__module__", None) or "").partition(".")[0]
     match value:
         case Dispatcher():
-            _tell(key, tuple(sorted(value.targetoptions.items(), key=repr)), names, told)
-            _tell(key, value.py_func, names, told)
+            _hash_value(key, tuple(sorted(value.targetoptions.items(), key=repr)), names, visited)
+            _hash_value(key, value.py_func, names, visited)
         case CFunc():
-            _tell(key, tuple(getattr(value, name) for name in ("_sig", "_pyfunc")), names, told)
+            _hash_value(
+                key, tuple(getattr(value, name) for name in ("_sig", "_pyfunc")), names, visited
+            )
         case _Intrinsic():
-            _tell(key, value._defn, names, told)
+            _hash_value(key, value._defn, names, visited)
         case python.FunctionType():
-            _tell_function(key, value, told)
+            _hash_function(key, value, visited)
         case python.CodeType():
             parts = (
                 value.co_code,
@@ -329,31 +345,37 @@ def _tell(key: Any, value: Any, names: tuple[str, ...], told: dict[int, Any]) ->
                 value.co_freevars,
                 value.co_argcount,
             )
-            _tell(
-                key, (*parts, value.co_kwonlyargcount, value.co_flags, value.co_consts), names, told
+            _hash_value(
+                key,
+                (*parts, value.co_kwonlyargcount, value.co_flags, value.co_consts),
+                names,
+                visited,
             )
         case python.ModuleType():
             key.update(f"module {value.__name__}\n".encode())
-            if value.__name__.partition(".")[0] not in _OTHERS:
+            if value.__name__.partition(".")[0] not in _VERSIONED_PACKAGES:
                 for name in names:
                     if hasattr(value, name):
                         key.update(f".{name} ".encode())
-                        _tell(key, getattr(value, name), names, told)
+                        _hash_value(key, getattr(value, name), names, visited)
         case np.ndarray():
             key.update(f"{value.dtype.str} {value.shape}\n".encode() + value.tobytes())
         case types.ExternalFunction():
             key.update(f"external {value.symbol} {value.sig}\n".encode())
         case containers.NamedTuple() | containers.NamedUniTuple():
             key.update(f"{value.name}\n".encode())
-            _tell(key, (value.instance_class, tuple(value)), names, told)
+            _hash_value(key, (value.instance_class, tuple(value)), names, visited)
         case types.Type():
             key.update(f"{type(value).__qualname__} {value.name}\n".encode())
-        case type() if hasattr(value, "_fields") or root in (*_OTHERS, "codrl_mj"):
+        case type() if hasattr(value, "_fields") or root in (*_VERSIONED_PACKAGES, "codrl_mj"):
             key.update(
-                f"class {value.__module__}.{value.__qualname__} {getattr(value, '_fields', ())}\n".encode()
+                f"class {value.__module__}.{value.__qualname__}"
+                f" {getattr(value, '_fields', ())}\n".encode()
             )
         case functools.partial():
-            _tell(key, (value.func, value.args, tuple(sorted(value.keywords.items()))), names, told)
+            _hash_value(
+                key, (value.func, value.args, tuple(sorted(value.keywords.items()))), names, visited
+            )
         case _ if isinstance(value, python.BuiltinFunctionType | np.ufunc) or root in (
             "numba",
             "numpy",
@@ -361,42 +383,42 @@ def _tell(key: Any, value: Any, names: tuple[str, ...], told: dict[int, Any]) ->
         ):
             key.update(f"{root} {getattr(value, '__qualname__', None) or repr(value)}\n".encode())
         case _:
-            raise _NotKnownError(repr(value))
+            raise _UnhashableError(repr(value))
 
 
-def _tell_function(key: Any, function: Any, told: dict[int, Any]) -> None:
-    """A function: its code, its defaults, what it closes over, the globals that it names, the file that it is in."""
+def _hash_function(key: Any, function: Any, visited: dict[int, Any]) -> None:
+    """Hash a function: its code, defaults, closure, the globals that it names, its source file."""
     code, scope, root = (
         function.__code__,
         function.__globals__,
         str(function.__module__).partition(".")[0],
     )
     key.update(f"function {function.__module__}.{function.__qualname__}\n".encode())
-    if root not in (*_OTHERS, "codrl_mj"):
-        key.update(hashlib.sha256(_file(function.__module__)).digest())
-    if root in _OTHERS:
+    if root not in (*_VERSIONED_PACKAGES, "codrl_mj"):
+        key.update(hashlib.sha256(_source_of(function.__module__)).digest())
+    if root in _VERSIONED_PACKAGES:
         return
-    names = _named(code)
-    _tell(key, code, names, told)
-    _tell(
+    names = _referenced_names(code)
+    _hash_value(key, code, names, visited)
+    _hash_value(
         key,
         (function.__defaults__, tuple(sorted((function.__kwdefaults__ or {}).items()))),
         names,
-        told,
+        visited,
     )
     for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
         key.update(f"closure {name} ".encode())
         try:
-            _tell(key, cell.cell_contents, names, told)
+            _hash_value(key, cell.cell_contents, names, visited)
         except ValueError:
-            raise _NotKnownError(name) from None
+            raise _UnhashableError(name) from None
     for name in names:
         if name in scope:
             key.update(f"global {name} ".encode())
-            _tell(key, scope[name], names, told)
+            _hash_value(key, scope[name], names, visited)
 
 
-def _named(code: Any) -> tuple[str, ...]:
-    """Names of globals and attributes in a function and the functions in it."""
-    inner = (one for one in code.co_consts if isinstance(one, python.CodeType))
-    return (*code.co_names, *(name for one in inner for name in _named(one)))
+def _referenced_names(code: Any) -> tuple[str, ...]:
+    """Return the names of globals and attributes in a function and the functions inside it."""
+    inner = (constant for constant in code.co_consts if isinstance(constant, python.CodeType))
+    return (*code.co_names, *(name for constant in inner for name in _referenced_names(constant)))

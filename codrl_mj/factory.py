@@ -1,4 +1,4 @@
-"""What makes environments of whatever world: one, or many at once."""
+"""Creation of single and vectorized environments."""
 
 import functools
 from collections.abc import Callable
@@ -9,49 +9,49 @@ from gymnasium.vector import VectorEnv
 
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.serial import SerialVectorEnv
-from codrl_mj.envs.worlds import VECTOR_ARGUMENTS, by_pattern, find_world
+from codrl_mj.envs.sources import VECTOR_ARGUMENTS, actuators_by_pattern, find_source
 from codrl_mj.external_envs import environments
 
 
 def make(
     env: str | EnvConfig | Callable[..., Any], actuator: Any = None, **arguments: Any
 ) -> "gymnasium.Env[Any, Any]":
-    """An environment with motors behind its actuators.
+    """Create an environment with motors behind its actuators.
 
         >>> env = codrl_mj.make("pendulum", "maxon-dcx22l")
         >>> env = codrl_mj.make("HalfCheetah-v5", {"b.*": "maxon-ec45-flat-50w", "f.*": "lag"})
 
-    Processes are given functions that call this, such as `functools.partial(codrl_mj.make,
-    "Hopper-v5", "lag")`.
+    Libraries that start processes need functions that make environments, such as
+    `functools.partial(codrl_mj.make, "Hopper-v5", "lag")`.
 
     Args:
-        env: a task's name or id, such as `pendulum`; the id of anybody's environment; `module:NAME`
-            of a task or world of one's own; an `EnvConfig`; or a function or class that makes an
-            environment, which needs no id.
-        actuator: what its forces go through: a name, an actuator, or a mapping of patterns of
-            motors to these; None: a task's own motor, and nothing at all elsewhere. With `"ideal"`
-            an environment is, bit for bit, the one without motors.
+        env: a task's name or id, such as `pendulum`; the id of a third-party environment;
+            `module:NAME` of a custom task or env source; an `EnvConfig`; or a function or class
+            that makes an environment, which needs no id.
+        actuator: actuator that transmits the forces: a name, an actuator, or a mapping of patterns
+            of motors to these. None selects a task's own motor, and no motor in other environments.
+            With `"ideal"` an environment is, bit for bit, the one without motors.
         **arguments: other fields of `EnvConfig`, and options of the task, or of `gymnasium.make`
-            and the environment, such as `render_mode` and `max_episode_steps`; of an `EnvConfig`,
+            and the environment, such as `render_mode` and `max_episode_steps`; for an `EnvConfig`
             those of its `make`.
 
     Raises:
         gymnasium.error.UnregisteredEnv: there is no such environment.
-        ValueError: names or arguments that are unknown, or do not go with each other; the message
-            has the remedy.
+        ValueError: a name or an argument is unknown, or arguments contradict each other; the
+            message has the remedy.
     """
-    given = {} if actuator is None else {"actuator": actuator}
+    actuator_argument = {} if actuator is None else {"actuator": actuator}
     if isinstance(env, EnvConfig):
-        return env.make(**arguments, **given)
+        return env.make(**arguments, **actuator_argument)
     if isinstance(env, str):
-        if env_id := find_world(env).env_id:
-            return gymnasium.make(env_id, **given, **arguments)
+        if env_id := find_source(env).env_id:
+            return gymnasium.make(env_id, **actuator_argument, **arguments)
         if ":" in env:
-            config, arguments = _configured(env, actuator, arguments)
+            config, arguments = _resolve_config(env, actuator, arguments)
             return config.make(**arguments)
         arguments |= dict(arguments.pop("options", None) or {})
     return environments.make(
-        env, by_pattern("default" if actuator is None else actuator), **arguments
+        env, actuators_by_pattern("default" if actuator is None else actuator), **arguments
     )
 
 
@@ -61,46 +61,53 @@ def make_vec(
     actuator: Any = None,
     **arguments: Any,
 ) -> "VectorEnv[Any, Any, Any]":
-    """Many environments as one of Gymnasium's vectors, which is reset in the step that ends an episode.
+    """Create a Gymnasium vector environment, which resets in the step that ends an episode.
 
-        >>> envs = codrl_mj.make_vec("pendulum", 1024, "weak", randomize={"motor.resistance": "uniform(1, 2)"})
+        >>> randomize = {"motor.resistance": "uniform(1, 2)"}
+        >>> envs = codrl_mj.make_vec("pendulum", 1024, "weak", randomize=randomize)
 
-    Tasks on MuJoCo are stepped as a batch, in threads, also where they are rendered: an
-    `ActuatedVectorEnv`. For everything else (environments of others, functions,
-    `physics="analytic"`) a `SerialVectorEnv` is all there is, which steps one environment after the
-    other. A warning says so where a task falls back to it: for `render_mode="human"`.
+    Tasks on MuJoCo are stepped as a batch, in threads, and can be rendered too: an
+    `ActuatedVectorEnv`. All others (third-party environments, functions, `physics="analytic"`) are
+    stepped one after the other: a `SerialVectorEnv`. A warning is issued if a task on MuJoCo needs
+    the latter, which `render_mode="human"` does.
 
     Args:
         env: as for `make`.
-        num_envs: how many, >= 1.
-        actuator: as for `make`; or of a task a list with one for each environment.
+        num_envs: number of environments, >= 1.
+        actuator: as for `make`; for a task also a list with one for each environment.
         **arguments: as for `make`, and those of the vector: `num_threads` (of a batch),
-            `autoreset_mode` (`SameStep` unless given), `render_mode`. They do the same beside a
-            name and beside an `EnvConfig`.
+            `autoreset_mode` (default `SameStep`), `render_mode`. They have the same meaning with a
+            name and with an `EnvConfig`.
 
     Raises:
-        ValueError: see `make`; or more than memory holds.
+        ValueError: see `make`; or the memory is too small.
     """
     if not isinstance(env, EnvConfig | str):
-        own = {name: arguments.pop(name) for name in VECTOR_ARGUMENTS if name in arguments}
-        return SerialVectorEnv(num_envs, functools.partial(make, env, actuator, **arguments), **own)
-    config, arguments = _configured(env, actuator, arguments)
-    vector: VectorEnv[Any, Any, Any] = config.make_vec(num_envs, **arguments)
-    return vector
+        vector_arguments = {
+            name: arguments.pop(name) for name in VECTOR_ARGUMENTS if name in arguments
+        }
+        return SerialVectorEnv(
+            num_envs, functools.partial(make, env, actuator, **arguments), **vector_arguments
+        )
+    config, arguments = _resolve_config(env, actuator, arguments)
+    envs: VectorEnv[Any, Any, Any] = config.make_vec(num_envs, **arguments)
+    return envs
 
 
-def _configured(
+def _resolve_config(
     env: str | EnvConfig, actuator: Any, arguments: dict[str, Any]
 ) -> tuple[EnvConfig, dict[str, Any]]:
-    """Return the configuration of a name, and the arguments that its `make` or `make_vec` takes besides."""
+    """Return a name's configuration, and the remaining arguments for its `make` or `make_vec`."""
     if isinstance(env, EnvConfig):
         config = env
-    elif ":" in env and not find_world(env).env_id:
-        # A world of one's own, or a package's environment: keyword arguments that are no fields are
-        # its options.
+    elif ":" in env and not find_source(env).env_id:
+        # For a custom source or a package's environment, keyword arguments that are not fields are
+        # options.
         names = "max_episode_steps", "render_mode", *VECTOR_ARGUMENTS
-        own = {name: arguments.pop(name) for name in names if name in arguments}
-        return EnvConfig.of(env, "default" if actuator is None else actuator, arguments), own
+        remaining_arguments = {name: arguments.pop(name) for name in names if name in arguments}
+        return EnvConfig.from_arguments(
+            env, "default" if actuator is None else actuator, arguments
+        ), remaining_arguments
     else:
         config = EnvConfig(env)
     return config, arguments if actuator is None else {**arguments, "actuator": actuator}

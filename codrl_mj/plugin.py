@@ -1,9 +1,9 @@
-"""Registers our MuJoCo actuator plugin, one for all motors, when the package is imported; and MuJoCo's own library.
+"""Registration of the MuJoCo actuator plugin, a single one for all motors, at package import.
 
-MuJoCo knows a plugin by a structure of addresses of functions. `.mjb` files and pickles store the
-slot that it was registered in, so there is exactly one of ours, registered at a time that depends
-on nothing else. Importing numba and compiling would make `import codrl_mj` slow: what is registered
-here are two Python functions. When a first model reaches them, the others are compiled
+MuJoCo knows a plugin as a structure of function addresses. `.mjb` files and pickles store the slot
+of its registration, so exactly one plugin is registered, at a time that depends on nothing else.
+Importing numba and compiling would make `import codrl_mj` slow; the functions registered here are
+therefore two Python functions. When the first model calls them, the other functions are compiled
 (`codrl_mj.engine.plugin`) and their addresses written into the structure.
 """
 
@@ -15,9 +15,9 @@ from typing import Any
 import mujoco
 
 NAME = "codrl_mj.actuator"
-"""The plugin's name in models."""
+"""Name of the plugin in models."""
 FAMILY = "family"
-"""Its only configuration attribute: the family of the actuator, as `module:Class`."""
+"""Name of its only configuration attribute: the actuator's family, as `module:Class`."""
 
 _FUNCTIONS = (
     *(
@@ -40,14 +40,17 @@ _FUNCTIONS = (
         "sdf_aabb",
     ),
 )
-_OF_PID = {"nstate", "init", "destroy", "reset", "compute", "advance", "actuator_act_dot"}
-"""The functions that MuJoCo's own plugin `mujoco.pid` has."""
+_PID_FUNCTIONS = {"nstate", "init", "destroy", "reset", "compute", "advance", "actuator_act_dot"}
+"""Functions that MuJoCo's own plugin `mujoco.pid` defines."""
 _ACTUATOR = 1
-"""mjPLUGIN_ACTUATOR of mjplugin.h, which the bindings do not show."""
+"""mjPLUGIN_ACTUATOR of mjplugin.h, which the Python bindings do not have."""
 
 
 class LayoutError(RuntimeError):
-    """MuJoCo's memory is not laid out as it says, or as we know it: nothing of ours must run in it."""
+    """MuJoCo's memory layout differs from its own description, or from the known one.
+
+    No compiled function of this package may access such memory.
+    """
 
 
 class Plugin(ctypes.Structure):
@@ -60,12 +63,14 @@ class Plugin(ctypes.Structure):
         ("capabilityflags", ctypes.c_int),
         ("needstage", ctypes.c_int),
         *((function, ctypes.c_void_p) for function in _FUNCTIONS),
-        ("later", ctypes.c_byte * 256),  # registering copies a structure that may have grown
+        # Registration copies the structure; a later MuJoCo's may be longer, and must not read
+        # beyond the end.
+        ("later", ctypes.c_byte * 256),
     )
 
 
 def library() -> ctypes.CDLL:
-    """MuJoCo's shared library, which the bindings have loaded."""
+    """Return MuJoCo's shared library, which the bindings have loaded."""
     for pattern in ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll"):
         for path in Path(mujoco.__file__).parent.glob(pattern):
             return ctypes.CDLL(str(path))
@@ -74,90 +79,97 @@ def library() -> ctypes.CDLL:
     )
 
 
-def registered() -> dict[str, tuple[int, Any]]:
-    """Name -> (slot, structure) of every plugin that MuJoCo knows."""
+def registered_plugins() -> dict[str, tuple[int, Any]]:
+    """Return name -> (slot, structure) of every plugin that MuJoCo knows."""
     mujoco_library = library()
-    at_slot = mujoco_library.mjp_getPluginAtSlot
-    at_slot.argtypes, at_slot.restype = (ctypes.c_int,), ctypes.POINTER(Plugin)
-    found = ((slot, at_slot(slot).contents) for slot in range(mujoco_library.mjp_pluginCount()))
-    return {plugin.name.decode(): (slot, plugin) for slot, plugin in found}
+    plugin_at_slot = mujoco_library.mjp_getPluginAtSlot
+    plugin_at_slot.argtypes, plugin_at_slot.restype = (ctypes.c_int,), ctypes.POINTER(Plugin)
+    plugins = (
+        (slot, plugin_at_slot(slot).contents) for slot in range(mujoco_library.mjp_pluginCount())
+    )
+    return {plugin.name.decode(): (slot, plugin) for slot, plugin in plugins}
 
 
-def check_structure(known: dict[str, tuple[int, Any]]) -> None:
-    """Compare `Plugin` with the one that MuJoCo itself filled for `mujoco.pid`."""
-    pid = known["mujoco.pid"][1] if "mujoco.pid" in known else Plugin()
+def check_structure(plugins: dict[str, tuple[int, Any]]) -> None:
+    """Compare `Plugin` with the structure that MuJoCo itself filled for `mujoco.pid`; raise."""
+    pid = plugins["mujoco.pid"][1] if "mujoco.pid" in plugins else Plugin()
     attributes = (
         {pid.attributes[index] for index in range(pid.nattribute)}
         if 0 < pid.nattribute < 20
         else set()
     )
-    filled = {function for function in _FUNCTIONS if getattr(pid, function)}
+    defined_functions = {function for function in _FUNCTIONS if getattr(pid, function)}
     if (
         not {b"kp", b"ki", b"kd"} <= attributes
         or pid.capabilityflags != _ACTUATOR
-        or filled != _OF_PID
+        or defined_functions != _PID_FUNCTIONS
     ):
         raise LayoutError(
             f"MuJoCo {mujoco.__version__}: its plugin mujoco.pid is not as expected (functions"
-            f" {', '.join(sorted(filled))}). Install a MuJoCo that this version of codrl_mj was"
-            " tested with (see pyproject.toml)"
+            f" {', '.join(sorted(defined_functions))}). Install a MuJoCo that this version of"
+            " codrl_mj was tested with (see pyproject.toml)"
         )
 
 
-_KEPT: list[Any] = []
-"""What MuJoCo holds addresses of."""
+_REFERENCES: list[Any] = []
+"""Objects to whose memory MuJoCo has pointers; they must never be freed."""
 
 
 def register() -> None:
-    """Register the plugin; harmless when this module has done it.
+    """Register the plugin; a no-op if this module has done so before.
 
     Raises:
-        LayoutError: MuJoCo's structure is not the one that we know.
-        RuntimeError: another copy of this package has registered a plugin of the name.
+        LayoutError: MuJoCo's structure is not the known one.
+        RuntimeError: another copy of this package has registered a plugin with this name.
     """
-    if _KEPT:
+    if _REFERENCES:
         return
-    known = registered()
-    check_structure(known)
-    if NAME in known:  # MuJoCo would end the process
+    plugins = registered_plugins()
+    check_structure(plugins)
+    # MuJoCo itself would end the process.
+    if NAME in plugins:
         raise RuntimeError(
             f"MuJoCo has a plugin {NAME} already: another copy of codrl_mj was imported in this"
-            " process, which can have one only"
+            " process, which can have only one"
         )
-    states = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int)(_states)
+    states = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int)(_count_states)
     start = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int)(_start)
-    unreached = ctypes.CFUNCTYPE(None)(lambda: None)  # has to be there; replaced before any step
+    # MuJoCo requires the function; it is replaced before the first step.
+    placeholder = ctypes.CFUNCTYPE(None)(lambda: None)
     attributes = (ctypes.c_char_p * 1)(FAMILY.encode())
     plugin = Plugin(NAME.encode(), 1, attributes, _ACTUATOR)
-    functions = {"nstate": states, "init": start, "reset": unreached, "compute": unreached}
+    functions = {"nstate": states, "init": start, "reset": placeholder, "compute": placeholder}
     for name, function in functions.items():
         setattr(plugin, name, ctypes.cast(function, ctypes.c_void_p).value)
-    _KEPT.extend((attributes, *functions.values()))
+    _REFERENCES.extend((attributes, *functions.values()))
     library().mjp_registerPlugin(ctypes.byref(plugin))
 
 
-def complain(text: str) -> None:
-    """Say why a model is refused, where MuJoCo says such things: all that a plugin can tell it is that it failed."""
+def log_warning(text: str) -> None:
+    """Report by MuJoCo's warning why a model is refused; a plugin can only return a failure."""
     library().mju_warning(f"{NAME}: {text}".replace("%", "%%").encode())
 
 
-def _door() -> Any:
-    """The compiled side; by its name, because it stands above this module."""
+def _compiled_backend() -> Any:
+    """Return the compiled functions' module."""
+    # Imported by name, because it is in a layer above this module.
     return importlib.import_module("codrl_mj.engine.plugin")
 
 
-def _states(model: int, instance: int) -> int:
-    """`nstate`: asked once by the compiler of a model, which asks `init` next."""
+def _count_states(model: int, instance: int) -> int:
+    """Number of states, `nstate`: MuJoCo's compiler calls it once, and `init` next."""
     try:
-        return _door().num_states(model, instance)
+        return _compiled_backend().num_states(model, instance)
     except Exception:
-        return 0  # `init` will say why
+        # `init` is called next, fails too, and reports the error.
+        return 0
 
 
 def _start(model: int, data: int, instance: int) -> int:
-    """`init`, until it is replaced: compile, then be what was compiled."""
+    """Compile the plugin's functions, and run the compiled `init` in place of this one."""
     try:
-        return _door().start(model, data, instance)
-    except Exception as error:  # there is nobody to raise it to
-        complain(f"{type(error).__name__}: {error}")
+        return _compiled_backend().start(model, data, instance)
+    # An exception cannot pass through MuJoCo's C code.
+    except Exception as error:
+        log_warning(f"{type(error).__name__}: {error}")
         return -1

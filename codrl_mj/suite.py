@@ -1,8 +1,8 @@
-"""Environments as dm_env agents know them: `suite.load("pendulum", "gym")`, or any of Gymnasium's in a `DmEnvironment`.
+"""Environments with the interface of dm_env: `suite.load("pendulum", "gym")`, or `DmEnvironment`.
 
-Dynamics, rewards and ends are the Gymnasium environment's, bit for bit. Needs the extra
-`dm-control`, which brings MuJoCo 3. With MuJoCo 4 it works where dm_env is installed, but for
-`physics`: dm_control 1.0.50 needs MuJoCo 3.
+`DmEnvironment` wraps any Gymnasium environment; dynamics, rewards and terminations are its own, bit
+for bit. Needs the extra `dm-control`, which installs MuJoCo 3. With MuJoCo 4 everything works if
+dm_env is installed, except `physics`: dm_control 1.0.50 needs MuJoCo 3.
 """
 
 import copy
@@ -24,20 +24,20 @@ from codrl_mj.tasks import TASKS
 
 TASK_NAME = "gym"
 _DEFAULT = object()
-"""The actuator where none is given: the task's, or a configuration's own."""
+"""Marker of an actuator that is not given: the task's, or a configuration's own, is used."""
 
 
 def __getattr__(name: str) -> Any:
-    """`ALL_TASKS`: every (domain, task) that `load` knows by name at present, tasks of one's own included."""
+    """Return `ALL_TASKS`: (domain, task) of all tasks at present, including custom ones."""
     if name == "ALL_TASKS":
         return tuple((domain, TASK_NAME) for domain in TASKS)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 class DmEnvironment(dm_env.Environment):
-    """A Gymnasium environment with dm_env's interface; whatever else that one has is had through this.
+    """A Gymnasium environment with dm_env's interface, and with all its own attributes.
 
-    Such as `state`, `model`, `data`, `render` and `randomization`. The `info` of the last step,
+    Examples are `state`, `model`, `data`, `render` and `randomization`. The last step's `info`,
     with the actuators' signals, is in `info`.
     """
 
@@ -47,10 +47,10 @@ class DmEnvironment(dm_env.Environment):
         """Wrap an environment.
 
         Args:
-            env: the environment, of discrete actions or a box of them.
-            random: a seed or a `numpy.random.Generator` for the initial states; any if None.
-            flat_observation: whether our tasks' observations are one vector, `observations`, as
-                those of others are that have no names.
+            env: the environment, with discrete actions or a box of them.
+            random: a seed or a `numpy.random.Generator` for the initial states; None: any.
+            flat_observation: True for a single vector, `observations`, even if the entries have
+                names; third-party observations without names always are.
         """
         self.env, self.info = env, dict[str, Any]()
         self._ended, self._seed = True, None
@@ -59,9 +59,8 @@ class DmEnvironment(dm_env.Environment):
         elif random is not None:
             self._seed = operator.index(random)
         self._names = () if flat_observation else getattr(env.unwrapped, "observation_names", ())
-        self._physics: Any = (
-            None  # a dm_control.mujoco.Physics, which is imported when it is first asked for
-        )
+        # A dm_control.mujoco.Physics; dm_control is imported on first use.
+        self._physics: Any = None
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode."""
@@ -70,14 +69,14 @@ class DmEnvironment(dm_env.Environment):
         return dm_env.restart(self._entries(observation))
 
     def step(self, action: Any) -> dm_env.TimeStep:
-        """Advance by one environment step; an episode that has ended starts anew.
+        """Advance by one environment step; the step after the end of an episode resets.
 
-        An episode ends with discount 0 where the task says so and with discount 1 at the time
-        limit; a last step that is both has discount 1, as everywhere in dm_control.
+        If the task terminates an episode, the last discount is 0; at the time limit it is 1. If
+        both happen in the same step, it is 1, as everywhere in dm_control.
 
         Raises:
-            ValueError: the action is not of the action spec.
-            SimulationDivergedError: the simulation left the finite numbers.
+            ValueError: the action is not one of the action spec.
+            SimulationDivergedError: a value of the simulation is not finite.
         """
         if self._ended:
             return self.reset()
@@ -93,25 +92,26 @@ class DmEnvironment(dm_env.Environment):
         return dm_env.TimeStep(kind, reward, discount, self._entries(observation))
 
     def _entries(self, observation: Any) -> dict[str, np.ndarray]:
-        """The observation's entries by name, real ones in float64."""
+        """Return the observation's entries by name, floating-point ones in float64."""
         entries = observation if isinstance(observation, dict) else {"observations": observation}
         if self._names:
             entries = {name: [value] for name, value in zip(self._names, observation, strict=True)}
         arrays = {name: np.array(values) for name, values in entries.items()}
         return {
-            name: one.astype(np.float64) if one.dtype.kind == "f" else one
-            for name, one in arrays.items()
+            name: array.astype(np.float64) if array.dtype.kind == "f" else array
+            for name, array in arrays.items()
         }
 
     def observation_spec(self) -> dict[str, specs.Array]:
-        """The observation space, by name."""
-        some = self._entries(
-            copy.deepcopy(self.env.observation_space).sample()
-        )  # whose generator is the user's
-        return {name: specs.Array(one.shape, one.dtype, name) for name, one in some.items()}
+        """Return the specification of the observation space, by name."""
+        # Sampling changes a space's generator, which is the user's: a copy is sampled.
+        entries = self._entries(copy.deepcopy(self.env.observation_space).sample())
+        return {
+            name: specs.Array(array.shape, array.dtype, name) for name, array in entries.items()
+        }
 
     def action_spec(self) -> specs.Array:
-        """The action space."""
+        """Return the specification of the action space."""
         space = self.env.action_space
         if isinstance(space, spaces.Discrete):
             return specs.DiscreteArray(int(space.n), name="action")
@@ -120,10 +120,10 @@ class DmEnvironment(dm_env.Environment):
 
     @property
     def physics(self) -> Any:
-        """dm_control's view of the simulation's present model and data: named indexing, `render`, `reset_context`.
+        """The present model and data as a `dm_control.mujoco.Physics`.
 
-        It is a `dm_control.mujoco.Physics`. Steps are the environment's own; so are complete saved
-        states, `snapshot` and `restore`.
+        It offers named indexing, `render` and `reset_context`. Steps must be the environment's own;
+        use `snapshot` and `restore` for complete states.
 
         Raises:
             RuntimeError: dm_control does not work with the installed MuJoCo.
@@ -139,50 +139,50 @@ class DmEnvironment(dm_env.Environment):
         return self._physics
 
     def control_timestep(self) -> float:
-        """The duration of a step [s]."""
-        own = self.env.unwrapped
-        return float(own.step_duration if hasattr(own, "step_duration") else self.dt)
+        """Return the duration of a step [s]."""
+        env = self.env.unwrapped
+        return float(env.step_duration if hasattr(env, "step_duration") else self.dt)
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on, as plain arrays: the environment's own, and its time limit's count."""
-        own: dict[str, np.ndarray] = self.env.get_wrapper_attr("snapshot")()
-        return own | {"elapsed": elapsed_steps(self.env), "ended": np.array(self._ended)}
+        """Return the complete state as arrays: the environment's, and its time limit's count."""
+        env_state: dict[str, np.ndarray] = self.env.get_wrapper_attr("snapshot")()
+        return env_state | {"elapsed": elapsed_steps(self.env), "ended": np.array(self._ended)}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
-        """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
+        """Continue from a snapshot, bit for bit, in an environment made with the same arguments.
 
         Returns:
-            None; or the first observation of an episode, where the environment could only start one
-            anew.
+            None; or the first observation, if the environment could only start a new episode.
 
         Raises:
             ValueError: the snapshot is of another environment or other arguments; nothing was
                 changed.
         """
         check_snapshot(snapshot, self.snapshot())
-        self.env.reset()  # which Gymnasium's wrappers insist on
-        own = {
+        # Gymnasium's wrappers refuse to be used before a first reset.
+        self.env.reset()
+        env_state = {
             name: values for name, values in snapshot.items() if name not in ("elapsed", "ended")
         }
-        begun = self.env.get_wrapper_attr("restore")(own)
-        self._ended = begun is None and bool(snapshot["ended"])
-        if begun is not None:
-            return self._entries(begun)
+        first_observation = self.env.get_wrapper_attr("restore")(env_state)
+        self._ended = first_observation is None and bool(snapshot["ended"])
+        if first_observation is not None:
+            return self._entries(first_observation)
         set_elapsed_steps(self.env, snapshot["elapsed"])
         return None
 
     def close(self) -> None:
-        """Free what the environment holds."""
+        """Close the environment."""
         self.env.close()
 
     def __getattr__(self, name: str) -> Any:
-        """What else the environment has."""
+        """Return another attribute of the environment."""
         if name.startswith("__") or name == "env":
             raise AttributeError(name)
         return self.env.get_wrapper_attr(name)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the view of the simulation, which a copy has of its own."""
+        """Return all but the view of the simulation; a copy makes a new one."""
         return self.__dict__ | {"_physics": None}
 
 
@@ -194,35 +194,34 @@ def load(
     environment_kwargs: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> DmEnvironment:
-    """A task as a dm_env environment.
+    """Load a task as a dm_env environment.
 
     Args:
-        domain_name: task name, such as `pendulum`; or an environment's whole configuration.
+        domain_name: task name, such as `pendulum`; or an `EnvConfig`.
         task_name: `gym`.
-        actuator: as for `codrl_mj.envs.ActuatedEnv`, the task's own unless given; over a
-            configuration's.
+        actuator: as for `codrl_mj.envs.ActuatedEnv`; by default the task's or the configuration's.
         task_kwargs: `random`, as for `DmEnvironment`.
         environment_kwargs: `flat_observation`, as for `DmEnvironment`.
-        **options: the other fields of `codrl_mj.envs.config.EnvConfig`, and the task's own options,
-            over a configuration's.
+        **options: the other fields of `codrl_mj.envs.config.EnvConfig`, and options of the task;
+            they replace those of a configuration.
     """
     if task_name != TASK_NAME:
         raise ValueError(f"task_name = {task_name!r}: every domain has one task, {TASK_NAME!r}")
-    given = task_kwargs or {}
-    if given.keys() - {"random"}:
-        raise ValueError(f"task_kwargs = {dict(given)!r}: may only hold 'random'")
+    task_arguments = task_kwargs or {}
+    if task_arguments.keys() - {"random"}:
+        raise ValueError(f"task_kwargs = {dict(task_arguments)!r}: may only hold 'random'")
     if isinstance(domain_name, str):
-        limit = options.pop("max_episode_steps", None)
-        config: Any = EnvConfig.of(
+        max_episode_steps = options.pop("max_episode_steps", None)
+        config: Any = EnvConfig.from_arguments(
             domain_name, "default" if actuator is _DEFAULT else actuator, options
         )
-        config = dataclasses.replace(config, max_episode_steps=limit)
+        config = dataclasses.replace(config, max_episode_steps=max_episode_steps)
     elif not isinstance(domain_name, EnvConfig):
         raise ValueError(
-            f"domain_name = {domain_name!r}: must be a task's name or an EnvConfig; others go into"
-            " DmEnvironment(...)"
+            f"domain_name = {domain_name!r}: must be a task's name or an EnvConfig; wrap other"
+            " environments in DmEnvironment(...)"
         )
     else:
-        over = options if actuator is _DEFAULT else {"actuator": actuator, **options}
-        config = EnvConfig.from_mapping(over, domain_name)
-    return DmEnvironment(config.make(), given.get("random"), **(environment_kwargs or {}))
+        overrides = options if actuator is _DEFAULT else {"actuator": actuator, **options}
+        config = EnvConfig.from_mapping(overrides, domain_name)
+    return DmEnvironment(config.make(), task_arguments.get("random"), **(environment_kwargs or {}))

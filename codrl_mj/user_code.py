@@ -1,6 +1,6 @@
-"""What users write: modules and model files that names stand for, and functions, called once before they are compiled.
+"""Code and files of users: loading of modules and models by name, and checks of functions.
 
-Errors in them are one sentence.
+Functions are called once before they are compiled. Errors in users' code become one sentence.
 """
 
 import codecs
@@ -23,72 +23,74 @@ import numpy as np
 from codrl_mj import fields
 
 Form = Any
-"""What a function is to return: the name of a number, or a tuple of forms."""
+"""Form of a return value: the name of a number, or a tuple of forms."""
 
 
 def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """What a function of a user's, known by a name in messages, returns."""
+    """Call a user's function; errors name it as `name`."""
     if not inspect.isfunction(function):
         raise ValueError(f"{name} = {function!r}: must be a function in plain Python")
     try:
         with np.errstate(all="ignore"):
             return function(*arguments)
     except Exception as error:
-        own = [
-            f
-            for f in traceback.extract_tb(error.__traceback__)
-            if f.filename == function.__code__.co_filename
+        own_frames = [
+            frame
+            for frame in traceback.extract_tb(error.__traceback__)
+            if frame.filename == function.__code__.co_filename
         ]
-        where = place(function, own[-1].lineno if own else None)
-        raise ValueError(f"{where}: {type(error).__name__}: {error}") from error
+        location = source_location(function, own_frames[-1].lineno if own_frames else None)
+        raise ValueError(f"{location}: {type(error).__name__}: {error}") from error
 
 
-def place(function: Callable[..., Any], line: int | None = None) -> str:
-    """File, line (where it begins, unless told otherwise) and name of a function, for messages."""
+def source_location(function: Callable[..., Any], line: int | None = None) -> str:
+    """Return file, line (default: its first) and name of a function, for messages."""
     code = function.__code__
     return f"{Path(code.co_filename).name}:{line or code.co_firstlineno}, in {code.co_name}"
 
 
 def check_form(function: Callable[..., Any], value: Any, form: Form, declared: str) -> Any:
-    """What a function returns (or numba says that it does), which has to be of a form; `declared` says where."""
+    """Return a function's return value if it has the form that is described in `declared`.
+
+    The value may also be the type that numba inferred.
+    """
     if not _fits(value, form):
         raise ValueError(
-            f"{place(function)}: returns {_said(value)}, must return {_wanted(form)}: see"
-            f" {declared}"
+            f"{source_location(function)}: returns {_describe_value(value)}, must return"
+            f" {_describe_form(form)}: see {declared}"
         )
     return value
 
 
 def _fits(value: Any, form: Form) -> bool:
     if isinstance(form, str):
-        scalar = (
-            isinstance(value, np.ndarray) and value.shape == () and value.dtype.kind in "biuf"
-        )  # of np.where
+        # Functions such as np.where return arrays without dimensions.
+        scalar = isinstance(value, np.ndarray) and value.shape == () and value.dtype.kind in "biuf"
         return scalar or isinstance(value, numbers.Real | np.bool_)
     return isinstance(value, tuple) and len(value) == len(form) and all(map(_fits, value, form))
 
 
-def _said(value: Any) -> str:
-    """What was returned, in words; numba's types have names."""
+def _describe_value(value: Any) -> str:
+    """Describe a returned value; numba's types have names."""
     if isinstance(value, tuple):
         flat = _fits(value, ("",) * len(value))
-        return f"a tuple of {len(value)}" if flat else f"({', '.join(map(_said, value))})"
+        return f"a tuple of {len(value)}" if flat else f"({', '.join(map(_describe_value, value))})"
     return "a number" if _fits(value, "") else str(getattr(value, "name", type(value).__name__))
 
 
-def _wanted(form: Form) -> str:
+def _describe_form(form: Form) -> str:
     if isinstance(form, str):
         return "a number"
-    flat = all(isinstance(one, str) for one in form)
+    flat = all(isinstance(entry, str) for entry in form)
     return (
         f"a tuple of {len(form)} ({', '.join(form)})"
         if flat
-        else f"({', '.join(map(_wanted, form))})"
+        else f"({', '.join(map(_describe_form, form))})"
     )
 
 
-def not_compiled(function: Callable[..., Any], error: Exception) -> str:
-    """What numba says of a function that it does not compile, as a sentence."""
+def compile_error_message(function: Callable[..., Any], error: Exception) -> str:
+    """Return numba's error about a function that it cannot compile, as one sentence."""
     text = str(error)
     lines = [
         line.strip()
@@ -98,16 +100,18 @@ def not_compiled(function: Callable[..., Any], error: Exception) -> str:
     causes = [
         cause for cause in re.findall(r"\w*Error: (.+)", text) if not cause.startswith("Failed in")
     ]
-    said = causes[-1] if causes else " ".join(lines[:2] if lines[0].endswith(":") else lines[:1])
+    last_cause = (
+        causes[-1] if causes else " ".join(lines[:2] if lines[0].endswith(":") else lines[:1])
+    )
     line = re.search(r'(?m)^\s*File ".+", line (\d+):', text)
     return (
-        f"{place(function, int(line[1]) if line else None)}: numba does not compile it:"
-        f" {said.strip()}"
+        f"{source_location(function, int(line[1]) if line else None)}: numba does not compile it:"
+        f" {last_cause.strip()}"
     )
 
 
 def asset_folder() -> Path:
-    """The folder of our MJCF files and of `motors/`: in a checkout `assets/`, in a wheel inside the package."""
+    """Return the folder of MJCF files and `motors/`: `assets/`, in a wheel inside the package."""
     package = Path(__file__).parent
     for folder in (package / "_assets", package.parent / "assets"):
         if folder.is_dir():
@@ -118,7 +122,7 @@ def asset_folder() -> Path:
 
 
 def asset_path(name: str) -> Path:
-    """Path of an MJCF file: somebody's own, or of ours the one of that name."""
+    """Return the path of an MJCF file: a user's, or the package's file of this name."""
     for path in (Path(name), asset_folder() / name):
         if path.is_file():
             return path
@@ -130,17 +134,17 @@ def asset_path(name: str) -> Path:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file, without the byte order mark that some editors put in front.
+    """Return the text of a file, without the byte order mark that some editors write.
 
     Raises:
-        ValueError: it is not UTF-8; the message has the line, and the character if it was saved in
-            Windows-1252.
+        ValueError: the file is not UTF-8; the message has the line, and the character if it was
+            saved in Windows-1252.
     """
     content = path.read_bytes()
     try:
-        wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+        is_utf16 = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
         return (
-            content.decode("utf-16" if wide else "utf-8-sig")
+            content.decode("utf-16" if is_utf16 else "utf-8-sig")
             .replace("\r\n", "\n")
             .replace("\r", "\n")
         )
@@ -149,18 +153,18 @@ def read_text(path: Path) -> str:
             content.count(b"\n", 0, error.start) + 1,
             content[error.start : error.start + 1],
         )
-        meant = byte.decode("cp1252", "replace")
+        character = byte.decode("cp1252", "replace")
         raise ValueError(
-            f"line {line} has the byte 0x{byte.hex()} ({meant} in Windows-1252), which is not"
+            f"line {line} has the byte 0x{byte.hex()} ({character} in Windows-1252), which is not"
             " UTF-8: save the file as UTF-8"
         ) from None
 
 
 def read_yaml(path: Path) -> Any:
-    """Return what a YAML or JSON file holds, with numbers as in YAML 1.2 and JSON: 3e-4, Infinity; 20:1 is a text.
+    """Read a YAML or JSON file, with numbers as in YAML 1.2 and JSON: 3e-4, Infinity; not 20:1.
 
     Raises:
-        ValueError: it is not YAML, or one mapping has a key twice.
+        ValueError: the file is not YAML, or a mapping has a key twice.
     """
     import yaml
 
@@ -174,15 +178,15 @@ def read_yaml(path: Path) -> Any:
                     )
             return super().construct_mapping(node, deep)
 
-    kinds = {
+    patterns = {
         "int": r"[-+]?(0|[1-9][\d_]*)$|0x[\da-fA-F]+$",
         "float": r"[-+]?(\d[\d_]*(\.\d*)?|\.\d+)([eE][-+]?\d+)?$",
     }
-    kinds["float"] += r"|[-+]?(\.(inf|Inf|INF)|Infinity)$|\.?(nan|NaN|NAN)$"
-    tags = {f"tag:yaml.org,2002:{kind}": re.compile(text) for kind, text in kinds.items()}
+    patterns["float"] += r"|[-+]?(\.(inf|Inf|INF)|Infinity)$|\.?(nan|NaN|NAN)$"
+    tags = {f"tag:yaml.org,2002:{kind}": re.compile(text) for kind, text in patterns.items()}
     Loader.yaml_implicit_resolvers = {
-        start: [one for one in several if one[0] not in tags]
-        for start, several in yaml.SafeLoader.yaml_implicit_resolvers.items()
+        start: [resolver for resolver in resolvers if resolver[0] not in tags]
+        for start, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
     for tag, pattern in tags.items():
         Loader.add_implicit_resolver(tag, pattern, list("-+.0123456789INn"))
@@ -193,37 +197,37 @@ def read_yaml(path: Path) -> Any:
 
 
 class UntrustedCodeError(ValueError):
-    """A module that a file names, and that nobody said to trust."""
+    """A refused import of a module that a file names and that the user has not trusted."""
 
 
-_TRUSTED = contextvars.ContextVar("trusted", default=True)
+_IMPORTS_ALLOWED = contextvars.ContextVar("trusted", default=True)
 FILES_TRUSTED = contextvars.ContextVar("files_trusted", default=True)
-"""Whether actuator files may name modules; the command line sets it to its `--trust`."""
+"""True if actuator files may name modules; the command line sets it to its `--trust`."""
 
 
 @contextlib.contextmanager
-def trusting(trust: bool) -> Iterator[None]:
-    """While the block runs, let `module:NAME` import modules, or refuse it."""
-    token = _TRUSTED.set(trust)
+def allow_imports(trust: bool) -> Iterator[None]:
+    """Allow or refuse imports by `module:NAME` while the block runs."""
+    token = _IMPORTS_ALLOWED.set(trust)
     try:
         yield
     finally:
-        _TRUSTED.reset(token)
+        _IMPORTS_ALLOWED.reset(token)
 
 
-def trusting_files() -> contextlib.AbstractContextManager[None]:
-    """While the block runs, let `module:NAME` of an actuator file import modules only if files are trusted."""
-    return trusting(_TRUSTED.get() and FILES_TRUSTED.get())
+def allow_imports_from_files() -> contextlib.AbstractContextManager[None]:
+    """Allow imports named in actuator files while the block runs, if files are trusted."""
+    return allow_imports(_IMPORTS_ALLOWED.get() and FILES_TRUSTED.get())
 
 
 def load_module(text: str) -> Any:
-    """The module of `module:NAME`."""
+    """Import the module of `module:NAME`."""
     module = text.partition(":")[0]
-    if not _TRUSTED.get():
+    if not _IMPORTS_ALLOWED.get():
         raise UntrustedCodeError(
             f"{text!r}: needs the module {module}, and importing it executes whatever its author"
-            " put there. Pass --trust (in Python: trust=True) if that author is you, or somebody"
-            " whose programs you would run"
+            " put there. Pass --trust (in Python: trust=True) if you are the author, or if you"
+            " would run the author's programs"
         )
     try:
         return importlib.import_module(module)
@@ -235,36 +239,41 @@ def load_module(text: str) -> Any:
                 f"{text!r}: {error}; must be module:NAME of a module that is installed or in the"
                 f" present folder, {Path.cwd()}; on the command line FILE.py:NAME does as well"
             ) from None
-        where, ours = _origin(error)
-        said = str(error) if ours else f"importing {module} failed: {type(error).__name__}: {error}"
-        raise ValueError(f"{text!r}: {said} ({where})") from error
+        location, is_package_error = _origin(error)
+        description = (
+            str(error)
+            if is_package_error
+            else f"importing {module} failed: {type(error).__name__}: {error}"
+        )
+        raise ValueError(f"{text!r}: {description} ({location})") from error
 
 
 def _origin(error: Exception) -> tuple[str, bool]:
-    """Return the user's file and line that an error comes from, and whether it is one that this package raised."""
+    """Return the user's file and line of an error, and True if this package raised it."""
     frames, package = traceback.extract_tb(error.__traceback__), Path(__file__).parent
-    places = [
+    locations = [
         (frame.filename, frame.lineno) for frame in frames if not frame.filename.startswith("<")
     ]
-    if (
-        isinstance(error, SyntaxError) and error.filename
-    ):  # no frame is in the file that is not parsed
-        places.append((error.filename, error.lineno))
+    # A file that cannot be parsed has no frame in the traceback.
+    if isinstance(error, SyntaxError) and error.filename:
+        locations.append((error.filename, error.lineno))
     installed = [
         Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")
     ]
-    others = [place for place in places if not Path(place[0]).is_relative_to(package)]
-    users = [
-        one
-        for one in others
-        if not any(Path(one[0]).is_relative_to(folder) for folder in installed)
+    outside_package = [
+        location for location in locations if not Path(location[0]).is_relative_to(package)
     ]
-    file, line = (users or others)[-1]
+    user_locations = [
+        candidate
+        for candidate in outside_package
+        if not any(Path(candidate[0]).is_relative_to(folder) for folder in installed)
+    ]
+    file, line = (user_locations or outside_package)[-1]
     return f"{file}, line {line}", Path(frames[-1].filename).is_relative_to(package)
 
 
 def load_object(text: str) -> Any:
-    """What stands at `module:NAME`."""
+    """Load the object at `module:NAME`."""
     module, name = load_module(text), text.partition(":")[2]
     try:
         return functools.reduce(getattr, name.split("."), module)
@@ -278,24 +287,37 @@ def load_object(text: str) -> Any:
 def look_up(
     name: str,
     known: Mapping[str, Any],
-    what: str,
-    anybodys: bool = True,
-    of: type | None = None,
-    others: Mapping[str, Iterable[str]] | None = None,
+    label: str,
+    allow_user_code: bool = True,
+    base_class: type | None = None,
+    suggestions: Mapping[str, Iterable[str]] | None = None,
 ) -> Any:
-    """What a name stands for: a value of `known`, which are ours, or, if `anybodys`, what stands at `module:NAME`.
+    """Return the value for a name: one of `known`, or the object at `module:NAME`.
 
-    Messages call it `what`. What is not ours has to be a subclass `of` a class, if one is given.
-    `others` are names that are known elsewhere, to be suggested but not listed, by what lists them.
+    Args:
+        name: the name.
+        known: built-in names -> values.
+        label: kind of the value, for messages.
+        allow_user_code: False to refuse `module:NAME`.
+        base_class: class that a user's object must be a subclass of; None for any object.
+        suggestions: group -> names that are known elsewhere, which messages may suggest.
     """
     if isinstance(name, str) and name in known:
         return known[name]
-    if anybodys and ":" in str(name):
-        found = load_object(name)
-        if of is None or (isinstance(found, type) and issubclass(found, of)):
-            return found
-        raise ValueError(f"{what} {name!r}: {found!r} is no subclass of codrl_mj's {of.__name__}")
-    hint = fields.did_you_mean(name, [*known, *itertools.chain(*(others or {}).values())])
-    listed = hint + "It can be" if hint else f"Known: {', '.join([*known, *(others or {})])}, or"
-    own = f"{listed} module:NAME of your own" if anybodys else hint or listed.removesuffix(", or")
-    raise ValueError(f"unknown {what} {name!r}: {own.rstrip()}")
+    if allow_user_code and ":" in str(name):
+        value = load_object(name)
+        if base_class is None or (isinstance(value, type) and issubclass(value, base_class)):
+            return value
+        raise ValueError(
+            f"{label} {name!r}: {value!r} is no subclass of codrl_mj's {base_class.__name__}"
+        )
+    hint = fields.did_you_mean(name, [*known, *itertools.chain(*(suggestions or {}).values())])
+    choices = (
+        hint + "It can be" if hint else f"Known: {', '.join([*known, *(suggestions or {})])}, or"
+    )
+    remedy = (
+        f"{choices} module:NAME of your own"
+        if allow_user_code
+        else hint or choices.removesuffix(", or")
+    )
+    raise ValueError(f"unknown {label} {name!r}: {remedy.rstrip()}")

@@ -14,7 +14,7 @@ from pathlib import Path
 from codrl_mj.actuators import Drive
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.worlds import find_world
+from codrl_mj.envs.sources import find_source
 from codrl_mj.fields import field_docs
 from codrl_mj.runs.files import writing
 from codrl_mj.tasks import TASKS, named_actuator
@@ -63,7 +63,7 @@ def common_arguments() -> str:
             f"ActuatedEnv documents {', '.join(meanings)} but takes {', '.join(parameters)}"
         )
     defaults = {field.name: field.default for field in dataclasses.fields(EnvConfig)[1:]}
-    common = {*find_world("pendulum").fields} - {"options"}  # which each task's own page has
+    common = {*find_source("pendulum").fields} - {"options"}  # which each task's own page has
     defaults = {name: default for name, default in defaults.items() if name in common}
     meanings |= field_docs(EnvConfig)
     defaults |= {

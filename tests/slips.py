@@ -342,7 +342,7 @@ def run(face: str, task_to_run: Any, actuator: Any = "ideal", **options: Any) ->
         from codrl_mj.envs.compiled import compiled_env
 
         if (parts := compiled_env(env.unwrapped)) is not None:
-            parts.reset(env.unwrapped.np_random, parts.low, parts.high, parts.where)
+            parts.reset(env.unwrapped.np_random, parts.low, parts.high, parts.pointers)
     elif face == "vector":
         envs = gymnasium.make_vec(
             task_to_run.env_id,

@@ -1,4 +1,4 @@
-"""Everything that the README offers without extras works where only the core dependencies are installed."""
+"""All that the README offers without extras works with only the core dependencies."""
 
 import importlib.metadata
 import json
@@ -27,9 +27,11 @@ import codrl_mj
 
 done = {}
 for task in ("pendulum", "furuta"):
-    env = codrl_mj.make(task, "maxon-ec45-flat-50w" if task == "pendulum" else None, render_mode="rgb_array")
+    motor = "maxon-ec45-flat-50w" if task == "pendulum" else None
+    env = codrl_mj.make(task, motor, render_mode="rgb_array")
     env.reset(seed=0)
-    done[task] = bool(np.isfinite(env.step(env.action_space.sample())[1])) and env.render().std() > 0
+    reward = env.step(env.action_space.sample())[1]
+    done[task] = bool(np.isfinite(reward)) and env.render().std() > 0
 envs = codrl_mj.make_vec("cartpole", 4, "weaker")
 done["vector"] = envs.reset(seed=0)[0].shape == (4, 4)
 cheetah = codrl_mj.make("HalfCheetah-v5", {".*": "lag"})
@@ -47,22 +49,24 @@ COMMANDS = [
         " time=time:s,voltage=voltage:V,current=current:A,position=position:rad"
     ),
 ]
-"""Verbs that neither train nor draw."""
+"""Commands that neither train nor draw."""
 
 
 def _core_distributions():
-    """Names of the core dependencies and of everything that these need, from the metadata of what is installed."""
+    """Return the names of all core dependencies, from the metadata of installed packages."""
     waiting, names = [Requirement(text) for text in PROJECT["dependencies"]], set()
     while waiting:
         requirement = waiting.pop()
         name = re.sub(r"[-_.]+", "-", requirement.name).lower()
-        wanted = [{"extra": extra} for extra in ("", *requirement.extras)]
+        extras_environments = [{"extra": extra} for extra in ("", *requirement.extras)]
         if name in names or (requirement.marker and not requirement.marker.evaluate({"extra": ""})):
             continue
         names.add(name)
         for text in importlib.metadata.requires(name) or []:
             needed = Requirement(text)
-            if needed.marker is None or any(needed.marker.evaluate(extra) for extra in wanted):
+            if needed.marker is None or any(
+                needed.marker.evaluate(extra) for extra in extras_environments
+            ):
                 needed.marker = None
                 waiting.append(needed)
     return names
@@ -70,7 +74,7 @@ def _core_distributions():
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory):
-    """Run Python in a virtual environment that has this package and the core dependencies, and nothing else."""
+    """Return a function that runs Python in an environment with only the core dependencies."""
     folder = tmp_path_factory.mktemp("core")
     venv.create(folder, symlinks=True)
     library = Path(
@@ -86,18 +90,18 @@ def python(tmp_path_factory):
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
     def run(*arguments):
-        line = [folder / "bin" / "python", *arguments]
+        command = [folder / "bin" / "python", *arguments]
         return subprocess.run(
-            line, cwd=folder, env=clean, capture_output=True, text=True, timeout=300, check=False
+            command, cwd=folder, env=clean, capture_output=True, text=True, timeout=300, check=False
         )
 
     return run
 
 
 def test_environments_work_with_the_core_dependencies_alone(python):
-    done = python("-c", USE)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout.splitlines()[-1]) == {
+    process = python("-c", USE)
+    assert process.returncode == 0, process.stderr
+    assert json.loads(process.stdout.splitlines()[-1]) == {
         "pendulum": True,
         "furuta": True,
         "vector": True,
@@ -124,9 +128,9 @@ def test_the_extras_are_really_missing_there(python):
 def test_verbs_that_neither_train_nor_draw_work_with_the_core_dependencies_alone(python):
     program = "import sys; from codrl_mj.cli import main; import json\n"
     program += f"print([main(line.split()) for line in {COMMANDS}])"
-    done = python("-c", program)
-    assert done.stdout.splitlines()[-1:] == [str([0] * len(COMMANDS))], (
-        done.stdout[-500:] + done.stderr
+    process = python("-c", program)
+    assert process.stdout.splitlines()[-1:] == [str([0] * len(COMMANDS))], (
+        process.stdout[-500:] + process.stderr
     )
 
 
@@ -143,24 +147,24 @@ for name in {list(VERBS)}:
         silent.append(name)
 print(silent)
 """
-    done = python("-c", program)
-    assert done.stdout.splitlines()[-1:] == ["[]"], done.stdout + done.stderr
+    process = python("-c", program)
+    assert process.stdout.splitlines()[-1:] == ["[]"], process.stdout + process.stderr
 
 
 @pytest.mark.parametrize(
-    ("line", "module", "extra"),
+    ("command", "module", "extra"),
     [
         ("train pendulum --total-steps 10 --out runs/a", "stable_baselines3", "train"),
         ("view pendulum", "trimesh", "view"),
     ],
 )
-def test_a_verb_that_needs_an_extra_names_it(python, line, module, extra):
-    done = python(
-        "-c", f"import sys; from codrl_mj.cli import main; sys.exit(main({line.split()}))"
+def test_a_verb_that_needs_an_extra_names_it(python, command, module, extra):
+    process = python(
+        "-c", f"import sys; from codrl_mj.cli import main; sys.exit(main({command.split()}))"
     )
-    assert done.returncode == 2
-    assert f"pip install 'codrl-mj[{extra}]'" in done.stderr
-    assert module in done.stderr.replace("-", "_")
+    assert process.returncode == 2
+    assert f"pip install 'codrl-mj[{extra}]'" in process.stderr
+    assert module in process.stderr.replace("-", "_")
 
 
 @pytest.mark.parametrize(
@@ -178,7 +182,8 @@ def test_the_message_on_a_missing_module_names_the_extras_that_declare_it(module
     declaring = [
         name for name in brought_by if any(text.startswith(distribution) for text in EXTRAS[name])
     ]
-    assert declaring == brought_by  # pyproject.toml says the same
+    # pyproject.toml must declare the same.
+    assert declaring == brought_by
     text = extras.missing_module_message(
         ModuleNotFoundError(f"No module named {module!r}", name=module)
     )

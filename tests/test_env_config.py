@@ -143,7 +143,7 @@ def test_a_configuration_survives_json_and_keyword_arguments(config, random):
     )
     arguments = config.as_arguments()
     arguments.pop("max_episode_steps", None)
-    again = EnvConfig.of(config.task, arguments.pop("actuator"), arguments)
+    again = EnvConfig.from_arguments(config.task, arguments.pop("actuator"), arguments)
     assert again == dataclasses.replace(config, max_episode_steps=None)
 
 
@@ -159,7 +159,7 @@ def test_every_face_is_built_from_it():
     )
     single, many, theirs = config.make(), make_sb3_vec_env(config, 2), suite.load(config)
     for setup in (single.unwrapped.setup, many.env.setup, theirs.setup):
-        plant = setup.plant
+        plant = setup.simulation
         assert (plant.actuators, plant.inner_steps) == (config.actuators, 2)
         assert (plant.disturbances, plant.joint) == (config.disturbances, config.joint)
         assert setup.config.options == (0.02, False)

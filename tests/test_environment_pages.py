@@ -16,7 +16,7 @@ import environment_pages
 import page_pictures_tasks
 from codrl_mj.envs import ActuatedEnv
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.worlds import find_world
+from codrl_mj.envs.sources import find_source
 from codrl_mj.tasks import TASKS
 from tests.tasks.faces import every_rebuilt
 
@@ -130,7 +130,7 @@ def test_every_argument_is_in_the_page_with_its_default_and_the_tasks_own_option
         for row in _table((FOLDER / "arguments.md").read_text())
     }
     assert "(arguments.md)" in _section(task, "Arguments")
-    known = find_world(task).fields
+    known = find_source(task).fields
     fields = {
         field.name: repr(field.default)
         for field in dataclasses.fields(EnvConfig)[1:]  # without the task

@@ -1,4 +1,4 @@
-"""`make` and `make_vec` take whatever an environment is of, and make what its own face makes."""
+"""`make` and `make_vec` accept all kinds of environments, and equal their own constructors."""
 
 import functools
 
@@ -11,13 +11,13 @@ from codrl_mj.actuators import Lag
 from codrl_mj.envs import ActuatedVectorEnv, SerialVectorEnv
 
 
-def walked(env, seed=3, steps=5):
-    """Observations of an episode's beginning."""
-    found = [env.reset(seed=seed)[0]]
+def observations_of(env, seed=3, steps=5):
+    """Return the observations of an episode's first steps."""
+    observations = [env.reset(seed=seed)[0]]
     env.action_space.seed(seed)
-    found += [env.step(env.action_space.sample())[0] for _ in range(steps)]
+    observations += [env.step(env.action_space.sample())[0] for _ in range(steps)]
     env.close()
-    return np.array(found)
+    return np.array(observations)
 
 
 def pendulum(**options):
@@ -28,7 +28,7 @@ REACHER = {".*": "lag"}
 
 
 @pytest.mark.parametrize(
-    ("given", "same"),
+    ("arguments", "make_expected"),
     [
         (("pendulum", "weak"), lambda: gym.make("codrl_mj/Pendulum-v0", actuator="weak")),
         (("codrl_mj/Pendulum-v0",), lambda: gym.make("codrl_mj/Pendulum-v0")),
@@ -46,12 +46,14 @@ REACHER = {".*": "lag"}
     ],
     ids=["task", "id", "configuration", "without motors", "one for all", "by pattern", "function"],
 )
-def test_one_is_made_of_a_name_an_id_a_configuration_or_a_function(given, same):
-    np.testing.assert_array_equal(walked(codrl_mj.make(*given)), walked(same()))
+def test_make_accepts_a_name_an_id_a_configuration_and_a_function(arguments, make_expected):
+    np.testing.assert_array_equal(
+        observations_of(codrl_mj.make(*arguments)), observations_of(make_expected())
+    )
 
 
 @pytest.mark.parametrize(
-    ("given", "options", "kind"),
+    ("arguments", "options", "kind"),
     [
         (("pendulum", 2, "weak"), {}, ActuatedVectorEnv),
         (("pendulum", 2, "weak"), {"max_episode_steps": 3}, ActuatedVectorEnv),
@@ -62,19 +64,19 @@ def test_one_is_made_of_a_name_an_id_a_configuration_or_a_function(given, same):
     ],
     ids=["batch", "time limit", "configuration", "environments of others", "their own", "function"],
 )
-def test_many_are_as_one_by_one(given, options, kind):
-    env, num_envs, *actuator = given
+def test_vector_environments_equal_single_ones(arguments, options, kind):
+    env, num_envs, *actuator = arguments
     envs = codrl_mj.make_vec(env, num_envs, *actuator, **options)
     assert isinstance(envs, kind)
-    seen, _ = envs.reset(seed=7)
+    observations, _ = envs.reset(seed=7)
     envs.single_action_space.seed(0)
     actions = [
         np.stack([envs.single_action_space.sample() for _ in range(num_envs)]) for _ in range(3)
     ]
     for index in range(num_envs):
-        alone = codrl_mj.make(env, *actuator, **options)
-        np.testing.assert_array_equal(alone.reset(seed=7 + index)[0], seen[index])
-        alone.close()
+        single = codrl_mj.make(env, *actuator, **options)
+        np.testing.assert_array_equal(single.reset(seed=7 + index)[0], observations[index])
+        single.close()
     for step, action in enumerate(actions):
         *_, truncated, _ = envs.step(action)
         assert truncated.all() == (options.get("max_episode_steps") == step + 1)
@@ -82,8 +84,8 @@ def test_many_are_as_one_by_one(given, options, kind):
 
 
 @pytest.mark.parametrize("limit", [3, 1003], ids=["shorter", "longer"])
-def test_a_time_limit_that_is_given_is_the_one_that_holds(limit):
-    faces = (
+def test_a_given_time_limit_applies(limit):
+    vector_envs = (
         codrl_mj.make_vec("HalfCheetah-v5", 1, "lag", max_episode_steps=limit),
         codrl_mj.make_vec(codrl_mj.EnvConfig("HalfCheetah-v5", "lag"), 1, max_episode_steps=limit),
         codrl_mj.make_sb3_vec_env(
@@ -96,18 +98,18 @@ def test_a_time_limit_that_is_given_is_the_one_that_holds(limit):
             height=48,
         ),
     )
-    for env in faces:
+    for env in vector_envs:
         env.reset()
         action = np.zeros((1, 6), np.float32)
-        ended = [(env.step(action)[2 if env is faces[2] else 3]).any() for _ in range(limit)]
+        ended = [(env.step(action)[2 if env is vector_envs[2] else 3]).any() for _ in range(limit)]
         assert ended == [False] * (limit - 1) + [True]
-        if env is faces[2]:
+        if env is vector_envs[2]:
             assert env.render().shape == (48, 64, 3)
         env.close()
 
 
 @pytest.mark.parametrize("view", [{}, {"render_mode": "rgb_array"}], ids=["blind", "seen"])
-def test_what_is_given_beside_a_configuration_is_set_over_it(view):
+def test_arguments_replace_fields_of_a_configuration(view):
     config = codrl_mj.EnvConfig("pendulum", max_episode_steps=5)
     with codrl_mj.make(config, "weak", max_episode_steps=7, **view) as env:
         assert env.unwrapped.actuator == codrl_mj.EnvConfig("pendulum", "weak").actuator
@@ -121,7 +123,7 @@ def test_what_is_given_beside_a_configuration_is_set_over_it(view):
 
 
 @pytest.mark.parametrize(
-    "made", [codrl_mj.make, lambda env, *actuator: codrl_mj.make_vec(env, 1, *actuator)]
+    "factory", [codrl_mj.make, lambda env, *actuator: codrl_mj.make_vec(env, 1, *actuator)]
 )
 @pytest.mark.parametrize(
     ("arguments", "message"),
@@ -130,9 +132,9 @@ def test_what_is_given_beside_a_configuration_is_set_over_it(view):
         (("pendulum", "wek"), "wek"),
         (("pendulum", {"leg": "lag"}), "leg"),
         (("Reacher-v5", {"leg.*": "lag"}), "leg"),
-        (("Reacher-v5", {}), r"actuator = \{\}: must be one for all, or what drives what"),
+        (("Reacher-v5", {}), r"actuator = \{\}: must be one for all motors, or a mapping of pat"),
     ],
 )
-def test_what_is_unknown_is_named(made, arguments, message):
+def test_raises_and_names_what_is_unknown(factory, arguments, message):
     with pytest.raises((ValueError, gym.error.Error), match=message):
-        made(*arguments)
+        factory(*arguments)

@@ -1,4 +1,4 @@
-"""What `import codrl_mj` does and does not do, in a process that has imported nothing yet."""
+"""Effects of `import codrl_mj` in a process that has not imported anything yet."""
 
 import json
 import os
@@ -14,7 +14,8 @@ import json, os, sys
 import gymnasium, codrl_mj
 
 def loaded():
-    heavy = "numba llvmlite torch stable_baselines3 matplotlib imageio scipy tyro rich dm_control pint"
+    heavy = "numba llvmlite torch stable_baselines3 matplotlib imageio scipy tyro rich"
+    heavy += " dm_control pint"
     return [name for name in heavy.split() if name in sys.modules]
 
 found = {"package": loaded(), "ids": [*gymnasium.registry], "backend": os.environ.get("MUJOCO_GL")}
@@ -26,37 +27,39 @@ print(json.dumps(found | {"board": loaded()}))
 
 
 @pytest.fixture(scope="module")
-def found():
-    """What a process without a display has after one import and the next."""
-    clean = {
+def loaded_modules():
+    """Return the modules that a process without a display has loaded after each import."""
+    environment = {
         name: value
         for name, value in os.environ.items()
         if name not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
     }
-    line = [sys.executable, "-c", PROGRAM]
-    done = subprocess.run(line, env=clean, capture_output=True, text=True, timeout=120, check=True)
-    assert done.stderr == ""
-    return json.loads(done.stdout)
+    command = [sys.executable, "-c", PROGRAM]
+    process = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=120, check=True
+    )
+    assert process.stderr == ""
+    return json.loads(process.stdout)
 
 
-def test_importing_the_package_imports_nothing_heavy(found):
-    assert found["package"] == []
+def test_importing_the_package_imports_nothing_heavy(loaded_modules):
+    assert loaded_modules["package"] == []
 
 
-def test_importing_the_package_registers_every_environment(found):
-    assert {task.env_id for task in codrl_mj.tasks.TASKS.values()} <= {*found["ids"]}
+def test_importing_the_package_registers_every_environment(loaded_modules):
+    assert {task.env_id for task in codrl_mj.tasks.TASKS.values()} <= {*loaded_modules["ids"]}
 
 
-def test_importing_the_motor_imports_no_engine(found):
-    assert not {"numba", "torch"} & {*found["motor"]}
+def test_importing_the_motor_imports_no_engine(loaded_modules):
+    assert not {"numba", "torch"} & {*loaded_modules["motor"]}
 
 
-def test_a_board_s_log_is_checked_without_what_trains(found):
-    assert not {"torch", "stable_baselines3"} & {*found["board"]}
+def test_a_board_s_log_is_checked_without_training_libraries(loaded_modules):
+    assert not {"torch", "stable_baselines3"} & {*loaded_modules["board"]}
 
 
-def test_rendering_goes_through_egl(found):
-    assert found["backend"] == ("egl" if sys.platform == "linux" else None)
+def test_rendering_goes_through_egl(loaded_modules):
+    assert loaded_modules["backend"] == ("egl" if sys.platform == "linux" else None)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +81,7 @@ def test_rendering_goes_through_egl(found):
         "mujoco imported first",
     ],
 )
-def test_but_not_where_there_is_a_display_or_another_was_chosen(
+def test_the_backend_depends_on_the_display_and_on_the_user_s_choice(
     monkeypatch, environment, imported, expected
 ):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
@@ -92,7 +95,7 @@ def test_but_not_where_there_is_a_display_or_another_was_chosen(
     assert os.environ.pop("MUJOCO_GL", None) == expected
 
 
-def test_every_public_name_can_be_had_and_listed():
+def test_every_public_name_can_be_imported_and_listed():
     assert all(
         getattr(codrl_mj, name) is not None and name in dir(codrl_mj) for name in codrl_mj.__all__
     )

@@ -1,4 +1,4 @@
-"""Who imports whom: read from the source, so that a cycle or a shortcut fails here."""
+"""Imports between layers, read from the source, so that a cycle or a shortcut fails here."""
 
 import ast
 import functools
@@ -12,8 +12,8 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "codrl_mj"
 
 ALLOWED = {
-    # a layer: a room, a module at the top, or a module that stands lower than its room -> the
-    # layers it may import
+    # Layer (a package, a top-level module, or a module in a lower layer than its package) -> layers
+    # that it may import.
     "fields": set(),
     "user_code": {"fields"},
     "actuators": {"catalogue", "fields", "user_code"},
@@ -34,8 +34,8 @@ ALLOWED = {
         "tasks",
     },
     "envs.distributions": {"fields"},
-    "envs.worlds": {"actuators", "engine", "user_code", "tasks"},
-    "envs.config": {"actuators", "disturbances", "envs.distributions", "envs.worlds", "fields"},
+    "envs.sources": {"actuators", "engine", "user_code", "tasks"},
+    "envs.config": {"actuators", "disturbances", "envs.distributions", "envs.sources", "fields"},
     "envs": {
         *(
             "actuators",
@@ -43,7 +43,7 @@ ALLOWED = {
             "engine",
             "envs.config",
             "envs.distributions",
-            "envs.worlds",
+            "envs.sources",
             "fields",
         ),
         *("compile_cache", "user_code", "physics", "tasks"),
@@ -59,9 +59,9 @@ ALLOWED = {
             "fields",
             "physics",
         ),
-        *("envs.worlds", "user_code", "tasks"),
+        *("envs.sources", "user_code", "tasks"),
     },
-    "factory": {"envs", "envs.config", "envs.worlds", "external_envs"},
+    "factory": {"envs", "envs.config", "envs.sources", "external_envs"},
     "suite": {"actuators", "envs", "envs.config", "external_envs", "physics", "tasks"},
     "agents": {
         "actuators",
@@ -74,7 +74,7 @@ ALLOWED = {
     },
     "runs": set(),
     "runs.files": set(),
-    "runs.summaries": {"actuators", "envs.worlds", "fields", "runs.files", "runs", "tasks"},
+    "runs.summaries": {"actuators", "envs.sources", "fields", "runs.files", "runs", "tasks"},
     "runs.policies": {"actuators", "agents", "envs.config", "runs.files", "runs"},
     "evaluation.measures": set(),
     "evaluation": {
@@ -82,7 +82,7 @@ ALLOWED = {
             "actuators",
             "envs",
             "envs.config",
-            "envs.worlds",
+            "envs.sources",
             "evaluation.measures",
             "fields",
             "physics",
@@ -186,7 +186,7 @@ ALLOWED = {
             "catalogue",
             "disturbances",
             "envs.config",
-            "envs.worlds",
+            "envs.sources",
             "evaluation",
         ),
         *("deploy", "evaluation.measures", "fields", "viz.films", "compile_cache", "user_code"),
@@ -213,7 +213,7 @@ ALLOWED = {
     "__main__": {"cli"},
 }
 LIBRARIES = {
-    # room or module: what it may import besides the standard library
+    # Package or module -> libraries that it may import besides the standard library.
     "fields": set(),
     "user_code": {"numpy", "yaml"},
     "actuators": {"numpy"},
@@ -245,7 +245,7 @@ GYMNASIUM_IN_TASKS = {
 
 
 def _layer(module):
-    """The layer of a module such as `envs.config`: the longest beginning of its name that is one."""
+    """Return the layer of a module such as `envs.config`: the longest matching prefix."""
     parts = module.split(".")
     known = (".".join(parts[:length]) for length in range(len(parts), 0, -1))
     return next((name for name in known if name in ALLOWED), module)
@@ -262,20 +262,20 @@ def _files(layer):
 
 @functools.cache
 def _modules(path):
-    """Every module that a file imports anywhere, with `from a import b` as both a and a.b."""
-    found = set()
+    """Return every module that a file imports, with `from a import b` as both a and a.b."""
+    modules = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return found
+            modules |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return modules
 
 
 @functools.cache
-def _ours(path):
-    """Our layers that a file imports; names that are no module or package of ours are attributes of it."""
+def _imported_layers(path):
+    """Return the layers that a file imports; names that are no module are attributes of one."""
     names = {
         name.removeprefix("codrl_mj.") for name in _modules(path) if name.startswith("codrl_mj.")
     }
@@ -283,16 +283,18 @@ def _ours(path):
 
 
 def _is_module(name):
-    place = PACKAGE.joinpath(*name.split("."))
-    return place.is_dir() or place.with_suffix(".py").is_file()
+    path = PACKAGE.joinpath(*name.split("."))
+    return path.is_dir() or path.with_suffix(".py").is_file()
 
 
 EVERY_FILE = sorted(PACKAGE.rglob("*.py"))
 
 
-def test_the_reader_sees_what_is_there():
-    """The oracle itself: known imports are found."""
-    assert {"actuators", "engine", "tasks"} <= set().union(*map(_ours, _files("physics")))
+def test_the_reader_finds_known_imports():
+    """Check the oracle itself."""
+    assert {"actuators", "engine", "tasks"} <= set().union(
+        *map(_imported_layers, _files("physics"))
+    )
     assert "mujoco" in _modules(PACKAGE / "engine" / "control.py")
     assert len(EVERY_FILE) > 20
 
@@ -300,7 +302,7 @@ def test_the_reader_sees_what_is_there():
 @pytest.mark.parametrize("layer", ALLOWED)
 def test_a_layer_imports_only_the_layers_below_it(layer):
     for path in _files(layer):
-        assert _ours(path) - {layer} <= ALLOWED[layer], path
+        assert _imported_layers(path) - {layer} <= ALLOWED[layer], path
 
 
 def test_every_file_belongs_to_a_layer():
@@ -311,7 +313,7 @@ def test_no_layers_import_each_other_in_a_circle():
     graph = {}
     for path in EVERY_FILE:
         layer = _layer(_module(path))
-        graph.setdefault(layer, set()).update(_ours(path) - {layer})
+        graph.setdefault(layer, set()).update(_imported_layers(path) - {layer})
     assert set(TopologicalSorter(graph).static_order()) >= ALLOWED.keys()  # raises CycleError
 
 
@@ -326,14 +328,18 @@ def test_a_layer_imports_only_its_own_libraries(layer):
         assert roots <= LIBRARIES[layer], path
 
 
-def test_tasks_take_from_gymnasium_only_spaces_reset_bounds_and_its_registry():
+def test_tasks_import_from_gymnasium_only_spaces_reset_bounds_and_registry():
     for path in _files("tasks"):
         names = {
             name for name in _modules(path) if name.startswith("gymnasium.")
         }  # twins make environments
-        packages = {name for other in GYMNASIUM_IN_TASKS for name in (other.rpartition(".")[0],)}
+        packages = {
+            name
+            for allowed_name in GYMNASIUM_IN_TASKS
+            for name in (allowed_name.rpartition(".")[0],)
+        }
         assert all(
-            name in packages or any(name.startswith(good) for good in GYMNASIUM_IN_TASKS)
+            name in packages or any(name.startswith(allowed) for allowed in GYMNASIUM_IN_TASKS)
             for name in names
         ), path
 
@@ -341,7 +347,7 @@ def test_tasks_take_from_gymnasium_only_spaces_reset_bounds_and_its_registry():
 def test_nothing_imports_the_command_line():
     for path in EVERY_FILE:
         if path.relative_to(PACKAGE).parts[0] not in ("cli", "__main__.py"):
-            assert "cli" not in _ours(path), path
+            assert "cli" not in _imported_layers(path), path
 
 
 def test_nothing_hides_an_import_behind_type_checking():
@@ -349,11 +355,11 @@ def test_nothing_hides_an_import_behind_type_checking():
         assert "TYPE_CHECKING" not in path.read_text(), path
 
 
-def test_names_are_suggested_in_one_place():
+def test_only_the_module_fields_suggests_names():
     assert [path for path in EVERY_FILE if "difflib" in path.read_text()] == [PACKAGE / "fields.py"]
 
 
-def test_only_the_engines_room_touches_raw_memory():
+def test_only_the_engine_accesses_raw_memory():
     for path in EVERY_FILE:
         if "engine" not in path.parts and path.name != "compile_cache.py":
             assert not re.search(r"\._address\b", path.read_text()), path  # of mjModel and mjData

@@ -1,4 +1,4 @@
-"""What docs/own_robot.md tells a reader to type works as it stands, and the robot is what it says it is."""
+"""The code and commands of docs/own_robot.md work as printed, and the robot is as described."""
 
 import dataclasses
 import math
@@ -22,12 +22,12 @@ PAGE = (ROOT / "docs" / "own_robot.md").read_text()
 BLOCKS = re.findall(r"```(xml|python)\n(.*?)```", PAGE, re.DOTALL)
 FILES, COMMANDS = BLOCKS[:2], re.findall(r"^\$ codrl-mj (.*)$", PAGE, re.MULTILINE)
 SHORT = {"100000": "512", "50": "1"}
-"""Numbers of the page's commands -> those of the tests, whose machine has other things to do."""
+"""Numbers in the page's commands -> smaller ones for the tests."""
 
 
 @pytest.fixture(autouse=True)
-def copied(tmp_path, monkeypatch):
-    """The two files in a folder of their own, as `python` sees them there, imported anew."""
+def robot_files(tmp_path, monkeypatch):
+    """Copy the two files into a new folder, from which Python imports them again."""
     shutil.copytree(FOLDER, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -36,7 +36,7 @@ def copied(tmp_path, monkeypatch):
     sys.modules.pop("ball_and_beam", None)
 
 
-def test_the_page_has_the_task_whole_and_of_the_model_its_actuator():
+def test_the_page_has_the_whole_task_and_the_actuator_of_the_model():
     kinds, (part, module) = zip(*FILES, strict=True)
     assert kinds == ("xml", "python")
     assert module == (FOLDER / "ball_and_beam.py").read_text()
@@ -52,15 +52,15 @@ def test_the_page_has_every_field_of_a_task():
 def test_the_python_examples_run(capsys):
     namespace = {}
     for _, block in BLOCKS[2:]:
-        exec(
-            compile(block, "own_robot.md", "exec"), namespace
-        )  # one after the other, as a reader would
-    of_one, of_thousands, drawn = capsys.readouterr().out.splitlines()
-    desired, actual, _, voltage = map(float, of_one.split())
-    assert 0.0 < abs(actual) < abs(desired)  # what the gear passes on
+        # The blocks continue each other.
+        exec(compile(block, "own_robot.md", "exec"), namespace)
+    single_output, batch_output, randomization_output = capsys.readouterr().out.splitlines()
+    desired, actual, _, voltage = map(float, single_output.split())
+    # The gear transmits only a part of the torque.
+    assert 0.0 < abs(actual) < abs(desired)
     assert abs(voltage) <= 6.0
-    assert of_thousands == "(4096, 4) (4096,)"
-    assert "model.mass.ball" in drawn
+    assert batch_output == "(4096, 4) (4096,)"
+    assert "model.mass.ball" in randomization_output
     namespace["envs"].close()
 
 
@@ -87,20 +87,19 @@ def test_all_commands_run_one_after_the_other():
     assert Path("ball.gif").stat().st_size > 1000
 
 
-def test_the_ball_rolls_as_a_ball_does():
-    """Down a beam that is held it accelerates by 5/7 g sin(angle): Galilei's, of a solid ball."""
+def test_the_ball_rolls_like_a_solid_ball():
+    """Compare with 5/7 g sin(angle), the acceleration of a solid ball on a beam that is held."""
     model = mujoco.MjModel.from_xml_path("ball_and_beam.xml")
     data = mujoco.MjData(model)
     data.qpos[:] = 0.3, 0.1
     mujoco.mj_forward(model, data)
     force = np.zeros(2)
-    mujoco.mj_mulM(
-        model, data, force, np.array([0.0, 1.0])
-    )  # of the ball's unit acceleration, the beam's being 0
+    # The force for a unit acceleration of the ball, if the beam does not accelerate.
+    mujoco.mj_mulM(model, data, force, np.array([0.0, 1.0]))
     assert -data.qfrc_bias[1] / force[1] == pytest.approx(5 / 7 * 9.81 * math.sin(0.3), rel=1e-12)
 
 
-def test_what_a_task_does_not_say_follows():
+def test_fields_that_a_task_omits_are_derived():
     import ball_and_beam
 
     task = ball_and_beam.TASK

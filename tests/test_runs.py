@@ -129,8 +129,8 @@ def test_motors_keep_the_names_that_the_run_was_told(tmp_path):
     run = read_run(folder)
     assert (
         run.actuator
-        == load_config(folder).env.through
-        == config.env.through
+        == load_config(folder).env.actuator_label
+        == config.env.actuator_label
         == "kraken-x60, drawer, ideal"
     )
     sentence = " ".join(report._sentence(run).split())

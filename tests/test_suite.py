@@ -1,4 +1,4 @@
-"""The dm_control face: dm_env's contract, and the Gymnasium environment bit for bit."""
+"""The dm_control interface keeps dm_env's contract, and equals the Gymnasium environment."""
 
 import copy
 import itertools
@@ -35,11 +35,11 @@ def _voltage(task):
     return {"action": "voltage"} | ({"levels": VOLTAGES} if discrete else {})
 
 
-# -- dm_env's own contract ----------------------------------------------------------------------------------
+# -- dm_env's own contract ------------------------------------------------------------------------
 
 
 def _contract(domain, task_name, options):
-    """A test case of dm_env's contract, with random actions to the end of an episode and beyond."""
+    """Return a test case of dm_env's contract, with actions beyond the end of an episode."""
 
     class Contract(test_utils.EnvironmentTestMixin, TestCase):
         def make_object_under_test(self):
@@ -70,25 +70,25 @@ for _domain, _task_name in suite.ALL_TASKS:
         globals()[_name] = type(_name, (_contract(_domain, _task_name, _options),), {})
 
 
-def test_every_task_is_offered():
+def test_all_tasks_are_listed():
     assert [domain for domain, _ in suite.ALL_TASKS] == list(TASKS)
     assert {name for _, name in suite.ALL_TASKS} == {"gym"}
 
 
-def test_options_are_set_over_a_configuration():
+def test_options_replace_those_of_a_configuration():
     config = EnvConfig(
         "cartpole", "weak", inner_steps=4, options={"center_radius": 0.5}, max_episode_steps=7
     )
     same = suite.load(config)
     assert (same.setup.config.actuator, same.setup.inner_steps) == (config.actuator, 4)
     assert same.setup.config.options.center_radius == 0.5
-    over = suite.load(config, actuator="weaker", inner_steps=2, sutton_barto_reward=True)
-    assert over.setup.config.actuator == named_actuator("weaker", "cartpole")
-    assert over.setup.inner_steps == 2
-    assert over.setup.config.options == (0.5, True)
+    overridden = suite.load(config, actuator="weaker", inner_steps=2, sutton_barto_reward=True)
+    assert overridden.setup.config.actuator == named_actuator("weaker", "cartpole")
+    assert overridden.setup.inner_steps == 2
+    assert overridden.setup.config.options == (0.5, True)
     assert suite.load(config, actuator=None).setup.config.actuator == IDEAL
-    over.reset(), same.reset()
-    assert [sum(not env.step(0).last() for _ in range(7)) for env in (over, same)] == [6, 6]
+    overridden.reset(), same.reset()
+    assert [sum(not env.step(0).last() for _ in range(7)) for env in (overridden, same)] == [6, 6]
     limited = suite.load("pendulum", "gym", max_episode_steps=5)
     limited.reset()
     assert [limited.step([0.0]).last() for _ in range(5)] == [False] * 4 + [True]
@@ -98,7 +98,7 @@ def test_options_are_set_over_a_configuration():
         suite.load(config, innersteps=2)
 
 
-# -- the Gymnasium environment, bit for bit -----------------------------------------------------------------
+# -- the Gymnasium environment, bit for bit -------------------------------------------------------
 
 
 def _actions(space, count, seed):
@@ -138,14 +138,14 @@ CASES = [
 @pytest.mark.parametrize(("task", "options"), CASES)
 def test_episodes_are_those_of_the_gymnasium_environment(task, options):
     options = dict(options) | (_voltage(task) if "action" in options else {})
-    face = options.pop("environment_kwargs", {})
-    ours = suite.load(task, task_kwargs={"random": 5}, environment_kwargs=face, **options)
+    face_options = options.pop("environment_kwargs", {})
+    ours = suite.load(task, task_kwargs={"random": 5}, environment_kwargs=face_options, **options)
     theirs = gymnasium.make(TASKS[task].env_id, disable_env_checker=True, **options)
     first, (observation, _) = ours.reset(), theirs.reset(seed=5)
     assert first.step_type is dm_env.StepType.FIRST
     names = [*TASKS[task].observation_names, "current", "reference_current"]
     names = names if options.get("observe_actuator") else names[:-2]
-    assert list(first.observation) == (["observations"] if face else names)
+    assert list(first.observation) == (["observations"] if face_options else names)
     np.testing.assert_array_equal(_vector(first), observation)
     rewards = set()
     for action in _actions(theirs.action_space, 150, 0):
@@ -159,7 +159,8 @@ def test_episodes_are_those_of_the_gymnasium_environment(task, options):
         assert timestep.last() == (terminated or truncated)
         assert timestep.discount == (0.0 if terminated else 1.0)
         rewards.add(reward)
-        if timestep.last():  # the next episode continues the random stream
+        # The next episode continues the random stream.
+        if timestep.last():
             np.testing.assert_array_equal(_vector(ours.step(action)), theirs.reset()[0])
     assert rewards == {0.0, 1.0} or "center_radius" not in options
 
@@ -174,8 +175,8 @@ GOALS = {
 
 
 @pytest.mark.parametrize("task", GOALS)
-def test_a_goal_is_an_end_without_a_future(task):
-    """Discount 0 where the task ends the episode; the pendulum's never does."""
+def test_reaching_the_goal_terminates_with_discount_0(task):
+    """Check the discount: 0 if the task terminates; the pendulum never does."""
     env = suite.load(task)
     env.reset()
     env.env.unwrapped.physics.reset(np.array(GOALS[task]))
@@ -185,14 +186,13 @@ def test_a_goal_is_an_end_without_a_future(task):
     )
 
 
-# -- the time limit -----------------------------------------------------------------------------------------
+# -- the time limit -------------------------------------------------------------------------------
 
 
 @every_rebuilt
-@pytest.mark.parametrize(
-    "inner_steps", [None, 19, 49, 73]
-)  # quotients that rounding lifts over the limit
-def test_an_episode_has_exactly_the_steps_of_gymnasiums(task, inner_steps):
+# The quotients of these numbers are rounded to more than the limit.
+@pytest.mark.parametrize("inner_steps", [None, 19, 49, 73])
+def test_an_episode_has_as_many_steps_as_in_gymnasium(task, inner_steps):
     env = suite.load(task, actuator="ideal", inner_steps=inner_steps)
     env.env.unwrapped.step = lambda _: (
         np.zeros(len(TASKS[task].observation_names)),
@@ -210,11 +210,11 @@ def test_an_episode_has_exactly_the_steps_of_gymnasiums(task, inner_steps):
         assert timestep.discount == 1.0
 
 
-# -- the physics --------------------------------------------------------------------------------------------
+# -- the physics ----------------------------------------------------------------------------------
 
 
 @every_task
-def test_the_physics_shows_the_simulation_that_is_run(task):
+def test_the_physics_is_a_view_of_the_simulation(task):
     env = suite.load(task)
     env.reset()
     assert env.physics.data.ptr is env.data is env.env.unwrapped.data
@@ -226,18 +226,22 @@ def test_the_physics_shows_the_simulation_that_is_run(task):
     assert env.physics.named.data.qpos.shape == (len(TASKS[task].qpos),)
 
 
-def _whole(physics):
-    """Everything that a simulation is continued from: time, positions, velocities, motors, controls."""
+def _complete_state(physics):
+    """Return the state to continue from: time, positions, velocities, motors, controls."""
     sig = mujoco.mjtState.mjSTATE_INTEGRATION
     state = np.empty(mujoco.mj_stateSize(physics.model.ptr, sig))
     mujoco.mj_getState(physics.model.ptr, physics.data.ptr, state, sig)
     return state
 
 
-def _continued(env, actions):
-    steps = [(env.step(action), _whole(env.physics)) for action in actions]
+def _run_actions(env, actions):
+    steps = [(env.step(action), _complete_state(env.physics)) for action in actions]
     return np.array(
-        [[*_vector(one), one.reward, one.discount, *whole] for one, whole in steps], float
+        [
+            [*_vector(timestep), timestep.reward, timestep.discount, *complete_state]
+            for timestep, complete_state in steps
+        ],
+        float,
     )
 
 
@@ -251,48 +255,50 @@ def test_a_copy_of_the_environment_continues_bit_for_bit(task, duplicate, option
     env.reset()
     first, *actions = _actions(env.action_space, 24, 1)
     env.step(first)
-    before, twin = _whole(env.physics), duplicate(env)
+    before, twin = _complete_state(env.physics), duplicate(env)
     assert twin.physics.data.ptr is twin.data is not env.data
-    np.testing.assert_array_equal([_whole(env.physics), _whole(twin.physics)], [before, before])
-    np.testing.assert_array_equal(_continued(twin, actions), _continued(env, actions))
+    np.testing.assert_array_equal(
+        [_complete_state(env.physics), _complete_state(twin.physics)], [before, before]
+    )
+    np.testing.assert_array_equal(_run_actions(twin, actions), _run_actions(env, actions))
 
 
 @every_task
 @pytest.mark.parametrize("ahead", range(-3, 4))
-def test_a_restored_snapshot_continues_as_it_did_at_whatever_time_it_is_restored(task, ahead):
-    """Into a simulation whose own clock is behind, equal or ahead: the motor's tick depends on the time."""
+def test_a_snapshot_continues_the_same_at_any_time_of_restoring(task, ahead):
+    """Restore when the clock is behind, equal or ahead, because the motor's tick depends on it."""
     env = suite.load(task, actuator=MOTOR, task_kwargs={"random": 0}, inner_steps=20)
     actions = _actions(env.action_space, 12, 2)
     env.reset()
-    _continued(env, actions[:5])
-    saved, whole = env.snapshot(), _whole(env.physics)
-    rest = _continued(env, actions[5:])
+    _run_actions(env, actions[:5])
+    saved, complete_state = env.snapshot(), _complete_state(env.physics)
+    rest = _run_actions(env, actions[5:])
     env.reset()
-    _continued(env, actions[: 5 + ahead])
-    # one integration step off a whole number of them, where a tick could be mistaken for another
+    _run_actions(env, actions[: 5 + ahead])
+    # Half of the cases are one integration step off, where a tick could be mistaken for another.
     env.data.time += env.model.opt.timestep * (ahead % 2)
     env.restore(saved)
-    np.testing.assert_array_equal(_whole(env.physics), whole)
-    np.testing.assert_array_equal(_continued(env, actions[5:]), rest)
+    np.testing.assert_array_equal(_complete_state(env.physics), complete_state)
+    np.testing.assert_array_equal(_run_actions(env, actions[5:]), rest)
 
 
-def test_a_snapshot_has_the_time_limits_count_and_goes_into_an_environment_that_was_never_reset():
+def test_a_snapshot_with_the_step_count_can_be_restored_before_a_first_reset():
     config = EnvConfig("cartpole", "weak", max_episode_steps=7)
-    env, other = suite.load(config, task_kwargs={"random": 0}), suite.load(config)
+    env, other_env = suite.load(config, task_kwargs={"random": 0}), suite.load(config)
     env.reset()
-    _continued(env, [0, 1])
-    other.restore(env.snapshot())
+    _run_actions(env, [0, 1])
+    other_env.restore(env.snapshot())
     np.testing.assert_array_equal(
-        _continued(other, [0, 1, 1, 0, 1]), _continued(env, [0, 1, 1, 0, 1])
+        _run_actions(other_env, [0, 1, 1, 0, 1]), _run_actions(env, [0, 1, 1, 0, 1])
     )
-    assert other.step(0).first()
+    assert other_env.step(0).first()
     with pytest.raises(ValueError, match=r"snapshot\['physics'\] is of shape \(3,\)"):
         env.restore(env.snapshot() | {"physics": np.zeros(3)})
 
 
 @every_task
-def test_dm_controls_own_reset_context(task):
-    """It runs forward passes around what the user sets; the motor stays at rest and the state is the user's."""
+def test_dm_controls_reset_context_keeps_the_user_s_state(task):
+    """Check that dm_control's forward passes keep the user's state, and the motor at rest."""
     env = suite.load(task, actuator=MOTOR)
     env.reset()
     env.step(env.action_spec().generate_value())
@@ -303,44 +309,50 @@ def test_dm_controls_own_reset_context(task):
     np.testing.assert_array_equal(env.physics.position(), 0.1)
     np.testing.assert_array_equal(env.physics.velocity(), 0.02)
     np.testing.assert_array_equal(env.data.act, 0.0)
-    twin = suite.load(task, actuator=MOTOR)
-    twin.reset()
-    twin.env.unwrapped.physics.reset(env.state)
+    reference = suite.load(task, actuator=MOTOR)
+    reference.reset()
+    reference.env.unwrapped.physics.reset(env.state)
     for action in _actions(env.action_space, 3, 0):
-        env.step(action), twin.step(action)
-    np.testing.assert_array_equal(_whole(env.physics), _whole(twin.physics))
+        env.step(action), reference.step(action)
+    np.testing.assert_array_equal(_complete_state(env.physics), _complete_state(reference.physics))
 
 
 def test_a_diverging_simulation_raises_and_works_again_after_reset(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # the engine writes a log
+    # The engine writes a log into the present folder.
+    monkeypatch.chdir(tmp_path)
     wild = DCMotorActuator(Motor(), CurrentLoop(kp=1000.0, max_voltage=float("inf")))
     env = suite.load("pendulum", actuator=wild, allow_unstable=True)
     env.reset()
     with pytest.raises(SimulationDivergedError):
-        _continued(env, [np.ones(1)] * 200)
+        _run_actions(env, [np.ones(1)] * 200)
     assert np.isfinite(_vector(env.reset())).all()
 
 
-# -- pixels -------------------------------------------------------------------------------------------------
+# -- pixels ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", matrix_params(REPRESENTATIVES, TASKS))
 def test_pixels_show_the_present_state_and_change_nothing(task):
-    env, blind = (suite.load(task, task_kwargs={"random": 3}, actuator="ideal") for _ in range(2))
+    env, unrendered = (
+        suite.load(task, task_kwargs={"random": 3}, actuator="ideal") for _ in range(2)
+    )
     wrapped = pixels.Wrapper(env, render_kwargs={"height": 48, "width": 64, "camera_id": "fixed"})
     assert wrapped.observation_spec()["pixels"].shape == (48, 64, 3)
     images = [wrapped.reset().observation["pixels"].copy()]
-    blind.reset()
-    action = env.action_spec().maximum  # to the right all the time
+    unrendered.reset()
+    # The cart moves to the right all the time.
+    action = env.action_spec().maximum
     for _ in range(8):
         images.append(wrapped.step(action).observation["pixels"].copy())
-        blind.step(action)
-        np.testing.assert_array_equal(_whole(env.physics), _whole(blind.physics))
+        unrendered.step(action)
+        np.testing.assert_array_equal(
+            _complete_state(env.physics), _complete_state(unrendered.physics)
+        )
     for image in images:
         assert image.dtype == np.uint8
         assert image.std() > 5.0
     assert np.any(np.abs(images[0].astype(int) - images[-1]).max(axis=2) > 30)
-    # the same picture as of a simulation that was put into this very state
+    # The image must equal that of another simulation with the same state.
     fresh = suite.load(task, actuator="ideal")
     with fresh.physics.reset_context() as physics:
         physics.data.qpos[:] = env.physics.position()
@@ -349,42 +361,42 @@ def test_pixels_show_the_present_state_and_change_nothing(task):
     )
 
 
-# -- environments of others ---------------------------------------------------------------------------------
+# -- third-party environments ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("made", ["Hopper-v5", "Taxi-v4", "Blackjack-v1"])
-def test_any_environment_of_gymnasiums_keeps_the_contract(made):
-    """Vectors, numbers and tuples of them; with motors, and without."""
-    ours, theirs = (gymnasium.make(made, disable_env_checker=True) for _ in range(2))
-    if made == "Hopper-v5":
+@pytest.mark.parametrize("env_id", ["Hopper-v5", "Taxi-v4", "Blackjack-v1"])
+def test_any_gymnasium_environment_keeps_the_contract(env_id):
+    """Check vectors, numbers and tuples of them, with and without motors."""
+    ours, theirs = (gymnasium.make(env_id, disable_env_checker=True) for _ in range(2))
+    if env_id == "Hopper-v5":
         config = EnvConfig(
-            made, {".*": "lag"}, randomize={".*": {"time_constant": "uniform(0.01, 0.02)"}}
+            env_id, {".*": "lag"}, randomize={".*": {"time_constant": "uniform(0.01, 0.02)"}}
         )
         env, theirs = suite.load(config, task_kwargs={"random": 4}), config.make()
         assert env.physics.named.data.qpos["rootz"] == env.data.qpos[1]
         assert env.control_timestep() == env.dt == 0.008
     else:
         env = suite.DmEnvironment(ours, 4)
-    seen, expected = [env.reset()], [theirs.reset(seed=4)]
+    timesteps, expected = [env.reset()], [theirs.reset(seed=4)]
     for action in _actions(theirs.action_space, 60, 0):
-        seen.append(env.step(action))
+        timesteps.append(env.step(action))
         expected.append(theirs.step(action))
-        assert (seen[-1].reward, seen[-1].last()) == (
+        assert (timesteps[-1].reward, timesteps[-1].last()) == (
             expected[-1][1],
             expected[-1][2] or expected[-1][3],
         )
-        if seen[-1].last():
-            seen.append(env.step(action))
+        if timesteps[-1].last():
+            timesteps.append(env.step(action))
             expected.append(theirs.reset())
-    for one, other in zip(seen, expected, strict=True):
-        np.testing.assert_array_equal(one.observation["observations"], other[0])
-        env.observation_spec()["observations"].validate(one.observation["observations"])
-    if made == "Hopper-v5":
+    for timestep, expected_step in zip(timesteps, expected, strict=True):
+        np.testing.assert_array_equal(timestep.observation["observations"], expected_step[0])
+        env.observation_spec()["observations"].validate(timestep.observation["observations"])
+    if env_id == "Hopper-v5":
         assert env.info["desired_force"].shape == (3,)
         assert env.randomization == theirs.randomization != {}
 
 
-# -- refusals -----------------------------------------------------------------------------------------------
+# -- refusals -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -406,28 +418,29 @@ def test_any_environment_of_gymnasiums_keeps_the_contract(made):
         ),
     ],
 )
-def test_a_bad_argument_is_refused(arguments, options, message):
+def test_raises_for_bad_arguments(arguments, options, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         suite.load(*arguments, **options)
 
 
-NONE = [0.5, -1, 3, None, "1", np.nan, np.array([0, 1])]
+INVALID = [0.5, -1, 3, None, "1", np.nan, np.array([0, 1])]
 BAD_ACTIONS = {
-    "cartpole": [*NONE, 1.0, np.array([0.7])],
-    "pendulum": [*NONE, 1.0, np.array([np.nan])],
+    "cartpole": [*INVALID, 1.0, np.array([0.7])],
+    "pendulum": [*INVALID, 1.0, np.array([np.nan])],
 }
 
 
 @pytest.mark.parametrize(
-    ("task", "action"), [(task, one) for task, wrong in BAD_ACTIONS.items() for one in wrong]
+    ("task", "action"),
+    [(task, bad_action) for task, bad_actions in BAD_ACTIONS.items() for bad_action in bad_actions],
 )
-def test_a_bad_action_is_refused_and_changes_nothing(task, action):
+def test_raises_for_a_bad_action_and_changes_nothing(task, action):
     env = suite.load(task)
     env.reset()
-    before = _whole(env.physics)
+    before = _complete_state(env.physics)
     with pytest.raises(ValueError, match="action = "):
         env.step(action)
-    np.testing.assert_array_equal(_whole(env.physics), before)
+    np.testing.assert_array_equal(_complete_state(env.physics), before)
 
 
 @pytest.mark.parametrize("kind", [int, np.int32, np.int64, np.uint8, np.array])
@@ -438,16 +451,17 @@ def test_a_discrete_action_may_be_any_integer(kind):
     np.testing.assert_array_equal(_vector(env.step(kind(1))), _vector(reference.step(1)))
 
 
-def test_a_generator_may_be_shared():
-    generator, twin = np.random.default_rng(4), np.random.default_rng(4)
-    one, two = (
+def test_a_generator_can_be_shared():
+    generator, same_generator = np.random.default_rng(4), np.random.default_rng(4)
+    env, unseeded_env = (
         suite.load("pendulum", task_kwargs={"random": generator}),
         suite.load("pendulum", task_kwargs=None),
     )
     expected = gymnasium.make(TASKS["pendulum"].env_id)
     expected.reset(seed=4)
-    one.reset()
-    np.testing.assert_array_equal(one.state, expected.unwrapped.state)
-    assert generator.random() != twin.random()
-    two.reset()  # no seed: any start
-    assert not np.array_equal(two.state, expected.unwrapped.state)
+    env.reset()
+    np.testing.assert_array_equal(env.state, expected.unwrapped.state)
+    assert generator.random() != same_generator.random()
+    # Without a seed, the start is arbitrary.
+    unseeded_env.reset()
+    assert not np.array_equal(unseeded_env.state, expected.unwrapped.state)

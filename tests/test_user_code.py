@@ -1,4 +1,4 @@
-"""What users write for tasks and families is refused in one sentence where it is wrong, and never ends the process."""
+"""Mistakes in users' tasks and families give one sentence, and never end the process."""
 
 import itertools
 import math
@@ -24,15 +24,15 @@ from codrl_mj.user_code import read_yaml
 from tests import slips
 from tests.matrix import matrix_params
 
-FOUND, FACES = None, ("single", "vector", "training")
+FAMILY, FACES = None, ("single", "vector", "training")
 
 
-def refused(act, begins=r"slips?\.py:\d+, in "):
-    """Refused in one sentence that begins with a place or a name; returned."""
-    with pytest.raises(ValueError, match=f"^({begins})") as caught:
-        act()
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+def error_message(call, beginning=r"slips?\.py:\d+, in "):
+    """Return the error of a call, one sentence that begins with a location or a name."""
+    with pytest.raises(ValueError, match=f"^({beginning})") as error_info:
+        call()
+    assert "\n" not in str(error_info.value)
+    return str(error_info.value)
 
 
 def name_of(case):
@@ -40,81 +40,84 @@ def name_of(case):
 
 
 @pytest.mark.parametrize(("field", "value"), slips.TASKS, ids=name_of)
-def test_a_task_with_a_slip_is_refused_when_it_is_made(field, value):
-    refused(lambda: slips.task(**{field: value}), r"slips?\.py:\d+, in |Task\.|unknown integrator")
+def test_raises_for_a_task_with_a_mistake(field, value):
+    error_message(
+        lambda: slips.task(**{field: value}), r"slips?\.py:\d+, in |Task\.|unknown integrator"
+    )
 
 
 @pytest.mark.parametrize(("part", "value"), slips.FAMILIES, ids=name_of)
-def test_a_family_with_a_slip_is_refused_at_every_door_before_it_is_compiled(
-    part, value, monkeypatch
-):
+def test_raises_for_a_family_with_a_mistake_before_it_is_compiled(part, value, monkeypatch):
     family = slips.family(**{part: value})
-    monkeypatch.setattr(sys.modules[__name__], "FOUND", family)
-    begins = r"slips?\.py:\d+, in |Slipped|unknown (signal SIGNAL_UNITS|field RANDOM)"
-    doors = lambda: load_family(family), lambda: resolve(f"{__name__}:FOUND", None, "")
-    assert len({refused(door, begins) for door in doors}) == 1
+    monkeypatch.setattr(sys.modules[__name__], "FAMILY", family)
+    beginning = r"slips?\.py:\d+, in |Slipped|unknown (signal SIGNAL_UNITS|field RANDOM)"
+    entry_points = lambda: load_family(family), lambda: resolve(f"{__name__}:FAMILY", None, "")
+    assert len({error_message(entry_point, beginning) for entry_point in entry_points}) == 1
 
 
-def test_a_family_that_is_no_dataclass_or_has_no_advance_is_refused():
+def test_raises_for_a_family_without_dataclass_or_advance():
     class Undecorated(codrl_mj.actuators.ActuatorModel):
         gain = slips.real(1.0)
 
     class Idle(codrl_mj.actuators.ActuatorModel):
         pass
 
-    refused(
+    error_message(
         lambda: load_family(Undecorated),
         "Undecorated: must be decorated with @dataclasses.dataclass",
     )
-    refused(lambda: load_family(Idle), "Idle: has no `advance`")
+    error_message(lambda: load_family(Idle), "Idle: has no `advance`")
 
 
 NUMBA = (*slips.LATE[1:], *slips.LATE_FAMILIES)
 
 
 @pytest.mark.parametrize(("name", "body"), matrix_params(NUMBA[::4], NUMBA), ids=name_of)
-def test_what_only_numba_can_refuse_is_a_sentence_too(name, body):
+def test_errors_of_numba_become_one_sentence(name, body):
     if name in slips.PARTS:
         family = slips.family(**{name: body})
-        told = refused(lambda: (load_family(family), compiled_observe(family)))
+        message = error_message(lambda: (load_family(family), compiled_observe(family)))
     else:
         task = slips.late_task(name, body)
-        given = task.constrain, task.state_names, task.qpos, task.qvel
-        told = refused(lambda: (compiled_outcomes(task), compiled_constrain(*given)))
-    assert f"in {name}: numba does not compile it: " in told or f"in {name}: returns " in told
+        constraint_arguments = task.constrain, task.state_names, task.qpos, task.qvel
+        message = error_message(
+            lambda: (compiled_outcomes(task), compiled_constrain(*constraint_arguments))
+        )
+    assert f"in {name}: numba does not compile it: " in message or f"in {name}: returns " in message
 
 
-def test_the_message_has_what_numba_says_of_it_and_where():
+def test_the_message_has_numbas_error_and_its_line():
     task = slips.task(reward="x = next_state[0]\n    return float(np.linalg.norm(x))")
-    told = refused(lambda: compiled_outcomes(task))
+    message = error_message(lambda: compiled_outcomes(task))
     assert (
-        told
+        message
         == "slip.py:3, in reward: numba does not compile it: np.linalg.norm() only supported for"
         " array types"
     )
 
 
-@pytest.mark.parametrize("called", ["plain(state)", "tests.slips.plain(state)"])
-def test_functions_that_a_function_calls_are_found_by_their_names_or_their_package(called):
-    terminated = compiled_outcomes(slips.task(terminated=called)).terminated
+@pytest.mark.parametrize("body", ["plain(state)", "tests.slips.plain(state)"])
+def test_a_function_can_call_others_by_name_or_package(body):
+    terminated = compiled_outcomes(slips.task(terminated=body)).terminated
     assert [terminated(np.array([position, 0.0, 0.0])) for position in (0.5, 1.5)] == [False, True]
 
 
 @pytest.mark.parametrize(
-    ("face", "every"), matrix_params([("vector", 4)], [("vector", 4), *((one, 1) for one in FACES)])
+    ("interface", "stride"),
+    matrix_params([("vector", 4)], [("vector", 4), *((name, 1) for name in FACES)]),
 )
-def test_no_slip_ends_the_process(face, every):
-    program = [sys.executable, "-m", "tests.slips", face, str(every)]
-    done = subprocess.run(program, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr
-    *told, last = done.stdout.splitlines()
-    assert last == "the sound one runs"
-    assert len(told) > 10 / every
-    assert all(line.startswith("refused") for line in told)
+def test_no_mistake_ends_the_process(interface, stride):
+    program = [sys.executable, "-m", "tests.slips", interface, str(stride)]
+    process = subprocess.run(program, capture_output=True, text=True, timeout=600, check=False)
+    assert process.returncode == 0, process.stderr
+    *messages, last_line = process.stdout.splitlines()
+    assert last_line == "the sound one runs"
+    assert len(messages) > 10 / stride
+    assert all(line.startswith("refused") for line in messages)
 
 
-def test_an_integer_or_a_flag_among_the_numbers_is_a_number():
-    """In every function that returns several, of one kind of number or of many."""
+def test_integers_and_flags_are_accepted_as_numbers():
+    """Check every function that returns several numbers, of one type or of several."""
     task = slips.task(
         initial_state="draws[0], 0, False, 0.5",
         observation="state[0] > 5.0, 1, np.float32(0.5)",
@@ -132,7 +135,7 @@ def test_an_integer_or_a_flag_among_the_numbers_is_a_number():
 
 SHOULDER, ARM = 'joint="shoulder"/', (slips.ROOT / "own_project" / "arm.xml").read_text()
 MODELS = [
-    # what stands in the model, what takes its place, and what is said of it
+    # Text of the model, its replacement, and the error.
     ("RK4", "Euler", ": its <option> has integrator EULER, so Task.integrators cannot have rk4"),
     (SHOULDER, 'site="tip"/', ": actuator 'shoulder' must drive a hinge or a slide joint"),
     (
@@ -165,16 +168,18 @@ MODELS = [
 ]
 
 
-@pytest.mark.parametrize(("good", "bad", "message"), MODELS)
-def test_a_models_joints_and_integrator_are_compared_with_the_task(tmp_path, good, bad, message):
+@pytest.mark.parametrize(("original", "replacement", "message"), MODELS)
+def test_a_models_joints_and_integrator_are_compared_with_the_task(
+    tmp_path, original, replacement, message
+):
     model = ARM.replace('<body name="upper">', '<body name="upper"><site name="tip"/>')
     path = tmp_path / "model.xml"
-    path.write_text(model.replace(good, bad, 1))
+    path.write_text(model.replace(original, replacement, 1))
     task = codrl_mj.register(slips.task(asset=str(path)))
-    refused(lambda: gymnasium.make(task.env_id, actuator="ideal"), f"{path}{message}")
+    error_message(lambda: gymnasium.make(task.env_id, actuator="ideal"), f"{path}{message}")
 
 
-def test_a_model_that_is_not_there_is_refused_when_the_task_is_made():
+def test_raises_if_the_model_of_a_task_is_missing():
     with pytest.raises(FileNotFoundError, match=r"no model file /nowhere/arm\.xml"):
         slips.task(asset="/nowhere/arm.xml")
 
@@ -192,7 +197,7 @@ def reset(task, **options):
 
 
 @pytest.mark.parametrize(
-    ("door", "given", "message"),
+    ("function", "arguments", "message"),
     [
         (
             codrl_mj.add_motors,
@@ -216,12 +221,12 @@ def reset(task, **options):
         ),
     ],
 )
-def test_other_doors_say_what_they_want(door, given, message):
-    refused(lambda: door(*given), message)
+def test_functions_name_what_they_expect(function, arguments, message):
+    error_message(lambda: function(*arguments), message)
 
 
 @pytest.mark.parametrize(
-    ("text", "read"),
+    ("text", "values"),
     [
         (
             "{a: 3e-4, b: -Infinity, c: 010, d: 0x1F, e: 1_000, f: .5, g: NaN2}",
@@ -231,14 +236,14 @@ def test_other_doors_say_what_they_want(door, given, message):
         ("\ufeffa: µ\r\nb: yes", ["µ", True]),
     ],
 )
-def test_numbers_of_a_yaml_file_are_those_of_yaml_1_2_and_json(tmp_path, text, read):
+def test_numbers_of_yaml_files_follow_yaml_1_2_and_json(tmp_path, text, values):
     file = tmp_path / "read.yaml"
     for encoding in ("utf-8", "utf-16"):
         file.write_bytes(text.encode(encoding))
-        assert [*read_yaml(file).values()] == read
+        assert [*read_yaml(file).values()] == values
 
 
-def test_what_is_no_yaml_file_is_refused_with_its_line(tmp_path):
+def test_raises_with_the_line_for_an_invalid_yaml_file(tmp_path):
     file = tmp_path / "read.yaml"
     for content, message in {
         b"a: 1\nb: \xb5m": (
@@ -253,31 +258,31 @@ def test_what_is_no_yaml_file_is_refused_with_its_line(tmp_path):
 
 
 def test_an_actuator_file_names_modules_only_with_trust(tmp_path, monkeypatch, capsys):
-    """A file comes from elsewhere more often than the words of a command line."""
+    """Check that files are trusted less than the command line, because they come from elsewhere."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
 
-    def made(verb):
+    def make_environment(verb):
         return int(environment(verb, "cartpole", verb.actuator_name, EnvConfig("cartpole")) is None)
 
-    monkeypatch.setattr(find_verb("evaluate"), "run", made)
-    Path("of_theirs.py").write_text(
-        "open('executed', 'w').close()\nfrom codrl_mj.actuators import Lag as Theirs\n"
+    monkeypatch.setattr(find_verb("evaluate"), "run", make_environment)
+    Path("third_party.py").write_text(
+        "open('executed', 'w').close()\nfrom codrl_mj.actuators import Lag as CustomLag\n"
     )
-    Path("theirs.yaml").write_text("family: of_theirs:Theirs\n")
-    Path("all.yaml").write_text("'.*': {family: 'of_theirs:Theirs'}\n")
+    Path("custom.yaml").write_text("family: third_party:CustomLag\n")
+    Path("all.yaml").write_text("'.*': {family: 'third_party:CustomLag'}\n")
     for flags in (
-        ["--actuator", "theirs.yaml"],
-        ["--actuators", ".*=theirs.yaml"],
+        ["--actuator", "custom.yaml"],
+        ["--actuators", ".*=custom.yaml"],
         ["--actuators", "all.yaml"],
     ):
         line = ["evaluate", "run", "--task", "cartpole", *flags]
         assert main(line) == 2
-        assert "'of_theirs:Theirs': needs the module of_theirs" in capsys.readouterr().err
+        assert "'third_party:CustomLag': needs the module third_party" in capsys.readouterr().err
         assert not Path("executed").exists()
         assert main([*line, "--trust"]) == 0
         Path("executed").unlink()
-        sys.modules.pop("of_theirs")
+        sys.modules.pop("third_party")
 
 
 LOCATED = itertools.count()
@@ -298,21 +303,21 @@ LOCATED = itertools.count()
         ("def f():\n    return 1 / 0\n\n\nf()\n", 2),
     ],
 )
-@pytest.mark.parametrize("imported", ["itself", "by another"])
-def test_an_error_in_a_users_module_is_at_its_own_file_and_line(
-    tmp_path, monkeypatch, text, line, imported
+@pytest.mark.parametrize("import_path", ["itself", "by another"])
+def test_an_error_in_a_users_module_has_its_file_and_line(
+    tmp_path, monkeypatch, text, line, import_path
 ):
     monkeypatch.syspath_prepend(tmp_path)
     name = f"located{next(LOCATED)}"
     (tmp_path / f"{name}.py").write_text(text)
     (tmp_path / f"by_{name}.py").write_text(f"import {name}\n")
-    module = name if imported == "itself" else f"by_{name}"
-    told = refused(lambda: codrl_mj.make(f"{module}:TASK"), f"'{module}:TASK': ")
-    assert told.endswith(f"({tmp_path / f'{name}.py'}, line {line})")
+    module = name if import_path == "itself" else f"by_{name}"
+    message = error_message(lambda: codrl_mj.make(f"{module}:TASK"), f"'{module}:TASK': ")
+    assert message.endswith(f"({tmp_path / f'{name}.py'}, line {line})")
 
 
 class Winds(NamedTuple):
-    """Options whose defaults are zero, negative and positive."""
+    """Options whose defaults are zero, negative, positive and a flag."""
 
     wind: float = 0.0
     slope: float = -0.5
@@ -320,27 +325,30 @@ class Winds(NamedTuple):
     gusts: bool = False
 
 
-def test_an_option_takes_its_own_default_and_what_is_of_its_kind():
+def test_options_accept_their_defaults_and_values_of_the_same_kind():
     task = codrl_mj.register(slips.task(options=Winds))
     config = codrl_mj.EnvConfig(task.name, "ideal")
-    for given in Winds()._asdict(), {"wind": -3.0, "slope": 0.0, "length": 1}:
-        for env in codrl_mj.make(task.name, "ideal", **given), codrl_mj.make(config, **given):
-            assert env.unwrapped.setup.config.options == Winds(**given)
-    for given, kind in [
+    for options in Winds()._asdict(), {"wind": -3.0, "slope": 0.0, "length": 1}:
+        for env in codrl_mj.make(task.name, "ideal", **options), codrl_mj.make(config, **options):
+            assert env.unwrapped.setup.config.options == Winds(**options)
+    for options, expected in [
         ({"wind": np.nan}, "a finite number"),
         ({"slope": np.inf}, "a finite number"),
         ({"wind": True}, "a finite number"),
         ({"length": 0.0}, "a number > 0"),
         ({"gusts": 0}, "True or False"),
     ]:
-        refused(lambda given=given: codrl_mj.make(task.name, **given), rf"\w+ = .*: must be {kind}")
+        error_message(
+            lambda options=options: codrl_mj.make(task.name, **options),
+            rf"\w+ = .*: must be {expected}",
+        )
 
 
-def test_a_default_that_is_no_number_is_refused_with_the_task():
+def test_raises_for_an_option_whose_default_is_no_number():
     class Lost(NamedTuple):
         wind: float = float("nan")
 
-    refused(
+    error_message(
         lambda: slips.task(options=Lost),
         "Task.options = .*a typing.NamedTuple of numbers and flags",
     )

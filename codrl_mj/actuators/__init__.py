@@ -54,7 +54,7 @@ from codrl_mj.actuators.sampled_loop import SampledLoop
 from codrl_mj.actuators.servo import Servo, ServoLoop
 from codrl_mj.actuators.stability import check_stable, spectral_radii, spectral_radius
 from codrl_mj.actuators.torque_speed import TorqueSpeed
-from codrl_mj.user_code import trusting
+from codrl_mj.user_code import allow_imports
 
 __all__ = [
     "BUILT_IN",
@@ -107,6 +107,6 @@ __all__ = [
     "resolve",
     "spectral_radii",
     "spectral_radius",
-    "trusting",
+    "allow_imports",
     "from_array",
 ]

@@ -25,7 +25,7 @@ from codrl_mj.actuators.parameters import (
     parameters_type,
     value_at,
 )
-from codrl_mj.user_code import Form, call, check_form, place
+from codrl_mj.user_code import Form, call, check_form, source_location
 
 
 class Inputs(NamedTuple):
@@ -403,7 +403,7 @@ def check_family(cls: Family) -> None:
     after, torque, _ = check_form(cls.advance, result, *advance_form(cls))
     if not np.isfinite([*after, torque]).all():
         raise ValueError(
-            f"{place(cls.advance)}: returns the state {(*map(float, after),)} and the torque"
+            f"{source_location(cls.advance)}: returns the state {(*map(float, after),)} and the torque"
             f" {torque}: must be finite"
         )
     if cls.OBSERVED:

@@ -14,7 +14,7 @@ from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.ideal import IDEAL, Ideal
 from codrl_mj.actuators.model import FAMILIES, ActuatorModel, Family, check_family, family_name
 from codrl_mj.actuators.servo import Servo
-from codrl_mj.user_code import look_up, read_yaml, trusting_files
+from codrl_mj.user_code import allow_imports_from_files, look_up, read_yaml
 
 NAMED: dict[str, tuple[str, Callable[[DCMotorActuator], ActuatorModel]]] = {
     "ideal": ("force = desired force: no motor at all", lambda _: IDEAL),
@@ -46,7 +46,7 @@ def find_family(name: str) -> Family:
     Raises:
         ValueError: there is none; the nearest known name is suggested.
     """
-    family: Family = look_up(name, FAMILIES, "family", of=ActuatorModel)
+    family: Family = look_up(name, FAMILIES, "family", base_class=ActuatorModel)
     check_family(family)
     return family
 
@@ -208,7 +208,7 @@ def resolve(given: Any, paper: DCMotorActuator | None, whose: str) -> Any:
         given,
         NAMED | FAMILIES,
         "actuator",
-        others={"the motors of `codrl-mj motor list`": motor_names()},
+        suggestions={"the motors of `codrl-mj motor list`": motor_names()},
     )
     if is_family(found):
         return resolve(found, paper, whose)
@@ -254,7 +254,7 @@ def _from_file(path: Path, paper: DCMotorActuator | None, whose: str) -> Any:
                 f"name = {fields['name']!r}: must be an actuator's name, or a file that names no"
                 " other"
             )
-        with trusting_files():
+        with allow_imports_from_files():
             made = resolve(fields, paper, whose)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None

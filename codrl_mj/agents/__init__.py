@@ -40,7 +40,7 @@ def find_agent(name: str) -> type[AgentConfig]:
     Raises:
         ValueError: unknown agent; the nearest known one is suggested.
     """
-    agent: type[AgentConfig] = look_up(name, AGENTS, "agent", of=AgentConfig)
+    agent: type[AgentConfig] = look_up(name, AGENTS, "agent", base_class=AgentConfig)
     return agent
 
 

@@ -27,7 +27,7 @@ from codrl_mj.agents.tile_coding import (
 )
 from codrl_mj.compile_cache import njit
 from codrl_mj.envs import ActuatedVectorEnv
-from codrl_mj.envs.compiled import bound, compiled_kernels
+from codrl_mj.envs.compiled import bind_observation, compiled_kernels
 from codrl_mj.envs.sb3 import ActuatedVecEnv
 from codrl_mj.physics.streams import set_words, words_of
 
@@ -267,7 +267,7 @@ class CompiledEpisodes:
         vector: Any = env.env
         self._physics: Any = vector.setup.simulate()
         self._step = compiled_kernels(vector.setup, self._physics).step
-        self._pointers, self._observation = bound(vector.setup, self._physics)
+        self._pointers, self._observation = bind_observation(vector.setup, self._physics)
         self._forces = vector.setup.commands.action_forces
         self._record = np.empty((vector.max_episode_steps, self._physics.trace.shape[2]))
 
@@ -283,7 +283,7 @@ class CompiledEpisodes:
             and isinstance(env.env, ActuatedVectorEnv)
             and env.num_envs == 1
             and not env.env.setup.randomization.distributions
-            and not env.env.looks
+            and not env.env.model_fields
             and len(env.env.task.motors) == 1
             and env.env.max_episode_steps is not None
         )

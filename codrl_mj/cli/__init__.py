@@ -113,7 +113,7 @@ def main(arguments: list[str] | None = None) -> int:
         after Ctrl-C, 141 if
             nobody reads on, 143 after SIGTERM.
     """
-    if signal.getsignal(signal.SIGINT) is codrl_mj._stopped_early:
+    if signal.getsignal(signal.SIGINT) is codrl_mj._exit_on_interrupt:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     given = sys.argv[1:] if arguments is None else arguments
     if given[:1] == ["--version"]:

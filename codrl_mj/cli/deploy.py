@@ -371,9 +371,7 @@ class CompareLog:
                 strict=True,
             )
         )
-        title = (
-            f"{self.log.name} through {self.actuator or env.through}: {len(found.starts)} windows"
-        )
+        title = f"{self.log.name} through {self.actuator or env.actuator_label}: {len(found.starts)} windows"
         rows = [
             (name, unit or "?", f"{error:.3g}", f"{moved:.3g}")
             for name, unit, error, moved in columns

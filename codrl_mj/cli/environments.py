@@ -22,10 +22,10 @@ from codrl_mj.actuators import (
     identified_ranges,
 )
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.worlds import find_world, is_world
+from codrl_mj.envs.sources import find_source, is_source_name
 from codrl_mj.fields import field_docs, parts
 from codrl_mj.runs import CONFIG
-from codrl_mj.user_code import read_yaml, trusting_files
+from codrl_mj.user_code import allow_imports_from_files, read_yaml
 
 
 def flags(
@@ -98,7 +98,7 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
     `environment` reads what `dataclasses.make_dataclass` makes; `chosen` is what `scan` found of
     the two.
     """
-    world, every = defaults.world, (field.name for field in dataclasses.fields(EnvConfig))
+    world, every = defaults.source, (field.name for field in dataclasses.fields(EnvConfig))
     without = tuple(
         one for one in every if one not in world.fields or one in ("task", "actuator", "options")
     )
@@ -156,7 +156,7 @@ def scan(arguments: Sequence[str], *names: str) -> argparse.Namespace:
         chosen = argparse.Namespace(**dict.fromkeys((*names, "task", "options")), trust=False)
     behind = itertools.pairwise(["", *arguments])
     chosen.task = chosen.task or next(
-        (word for flag, word in behind if is_world(word) and not flag.startswith("--")), None
+        (word for flag, word in behind if is_source_name(word) and not flag.startswith("--")), None
     )
     return chosen
 
@@ -195,19 +195,21 @@ def environment(verb: Any, task: str, name: str, known: EnvConfig) -> EnvConfig:
                 f" there: for {name} as it is add --env.randomize None",
                 stacklevel=2,
             )
-    world, flags = find_world(task), dict(vars(verb.env))
+    world, flags = find_source(task), dict(vars(verb.env))
     names = [field.name for field in dataclasses.fields(EnvConfig) if field.name != "options"]
     fields = {name: flags.pop(name) for name in names if name in flags}
     fields |= {part: vars(fields[part]) for part in ("disturbances", "joint") if part in fields}
     options = world.options_of(flags)
     patterns = _patterns(verb.actuators)
     fields["randomize"] = _ranges(fields["randomize"], name, patterns)
-    named = known.driven if as_known else dict.fromkeys(known.driven, name)
+    named = known.actuators_by_name if as_known else dict.fromkeys(known.actuators_by_name, name)
     config = EnvConfig(task, named, options=options)
     if patterns:
         config = EnvConfig(task, world.overlaid(config, patterns), options=options)
     over = _given(verb.actuator_fields)
-    changed = {pattern: actuator_over(one, over) for pattern, one in config.driven.items()}
+    changed = {
+        pattern: actuator_over(one, over) for pattern, one in config.actuators_by_name.items()
+    }
     return EnvConfig(task, changed, options=options, **fields)
 
 
@@ -222,7 +224,7 @@ def _patterns(items: Sequence[str]) -> dict[str, Any]:
                 content = read_yaml(Path(item))
                 if not isinstance(content, Mapping):
                     raise ValueError("must be a mapping of patterns to actuators")
-                with trusting_files():
+                with allow_imports_from_files():
                     found |= resolve_patterns(content, f"the file {item}")
             except ValueError as error:
                 raise ValueError(f"--actuators {item}: {error}") from None

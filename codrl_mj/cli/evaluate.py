@@ -71,7 +71,7 @@ class Evaluate:
             subject = verb.source.load(path)
             env = environment(verb, subject.env.task, verb.actuator_name, subject.env)
             subject.check_interface(env)
-            to_do[f"{name} on {env.through}"] = subject.policy, env
+            to_do[f"{name} on {env.actuator_label}"] = subject.policy, env
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             for name, (policy, env) in to_do.items():
                 row = bar.add_task("evaluating" if len(to_do) == 1 else name, total=self.episodes)

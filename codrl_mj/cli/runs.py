@@ -163,7 +163,7 @@ class Cache:
 
     def run(self) -> int:
         """Show or clear."""
-        place = compile_cache.folder()
+        place = compile_cache.cache_folder()
         if place is None:
             print("off: CODRL_MJ_CACHE says so")
             return 0
@@ -182,7 +182,7 @@ class Cache:
             + (
                 ", cleared"
                 if self.clear and files
-                else f"; at most {compile_cache.MOST / 1e6:.0f} MB"
+                else f"; at most {compile_cache.MAX_BYTES / 1e6:.0f} MB"
             )
         )
         return 0

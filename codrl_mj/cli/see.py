@@ -12,13 +12,13 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from codrl_mj.actuators import trusting
+from codrl_mj.actuators import allow_imports
 from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, with_environment
 from codrl_mj.cli.parsing import Trust
 from codrl_mj.cli.subject import Source, policy_and_environment
 from codrl_mj.cli.terminal import progress_bar
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.worlds import is_world
+from codrl_mj.envs.sources import is_source_name
 from codrl_mj.fields import did_you_mean
 from codrl_mj.runs import told_apart
 
@@ -137,7 +137,7 @@ def _rank(verb: Any, env: Any, episode: Any) -> str:
 
     evaluation = read_evaluation(Path(verb.subject), verb.source.which == "best") or {}
     try:
-        with trusting(verb.source.trust):
+        with allow_imports(verb.source.trust):
             same = EnvConfig.from_mapping(evaluation["conditions"]["env"]) == env
     except (
         KeyError,
@@ -209,7 +209,7 @@ class LiveView(OfEpisodes):
         """Name -> policy, made when it is chosen: what is watched, its other one, and other runs."""
         found: dict[str, Callable[[], Any]] = {}
         subject = Path(self.subject)
-        if not is_world(self.subject):
+        if not is_source_name(self.subject):
             found[self.source.which] = lambda: given
             if (subject / "best").is_dir():
                 other = "best" if self.source.which == "last" else "last"

@@ -9,7 +9,7 @@ import tyro
 
 from codrl_mj.cli.environments import environment
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.worlds import is_world
+from codrl_mj.envs.sources import is_source_name
 from codrl_mj.fields import did_you_mean
 from codrl_mj.runs import CONFIG, finished
 from codrl_mj.tasks import TASKS
@@ -142,7 +142,7 @@ class Source:
 
 def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig, str]:
     """What acts, in what, and a title for both, by a verb's `subject` and its flags: random actions of a task or id."""
-    if not (random := is_world(verb.subject)) and not Path(verb.subject).exists():
+    if not (random := is_source_name(verb.subject)) and not Path(verb.subject).exists():
         hint = did_you_mean(verb.subject, TASKS)
         raise FileNotFoundError(
             f"no run configuration at {verb.subject}/{CONFIG}: {hint}It is no run and no task"
@@ -160,4 +160,4 @@ def policy_and_environment(verb: Any) -> tuple[Any, EnvConfig, str]:
 
         with contextlib.closing(env.make()) as made:
             policy = RandomPolicy(made.action_space, verb.seed)
-    return policy, env, f"{Path(verb.subject).name} on {env.through}"
+    return policy, env, f"{Path(verb.subject).name} on {env.actuator_label}"

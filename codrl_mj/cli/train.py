@@ -26,7 +26,7 @@ from codrl_mj.cli.environments import (
 )
 from codrl_mj.cli.parsing import AsJson
 from codrl_mj.cli.terminal import progress_bar, say
-from codrl_mj.envs.worlds import find_world
+from codrl_mj.envs.sources import find_source
 from codrl_mj.fields import command
 from codrl_mj.runs import PROGRESS, RESULT, finished
 from codrl_mj.runs.files import read_json
@@ -44,7 +44,7 @@ def train_verb(arguments: list[str]) -> Any:
     chosen = scan(arguments, "agent", "settings", "actuator", FAMILY, "config", "resume")
     if chosen.task is None and arguments and not arguments[0].startswith("-"):
         try:
-            find_world(arguments[0])
+            find_source(arguments[0])
         except ValueError as error:
             others = "an environment of Gymnasium's goes by its id, such as HalfCheetah-v5"
             raise ValueError(f"{error}; {others}") from None
@@ -91,7 +91,7 @@ def train_verb(arguments: list[str]) -> Any:
         (
             "actuator_name",
             ActuatorName,
-            AS_CONFIGURED if configured else base.env.world.default_actuator,
+            AS_CONFIGURED if configured else base.env.source.default_actuator,
         ),
         *((field.name, field.type, field.default) for field in dataclasses.fields(rest)),
         (
@@ -152,7 +152,7 @@ class Train:
         from codrl_mj.training import train
 
         if (
-            find_world(self.task).reference != find_world(self.base.task).reference
+            find_source(self.task).reference != find_source(self.base.task).reference
             and self.resume is None
         ):
             raise ValueError(
@@ -283,7 +283,7 @@ def _base(chosen: argparse.Namespace) -> TrainConfig:
         given = {name: getattr(chosen, name) for name in ("task", "agent", "settings")}
         return read_config(Path(chosen.config), chosen.trust, **given)
     task = chosen.task or "cartpole"
-    world = find_world(task)
+    world = find_source(task)
     options = world.options_of({"options": chosen.options}) if chosen.options else {}
     agent = (
         chosen.agent

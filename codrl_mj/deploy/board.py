@@ -179,7 +179,9 @@ class Board(contextlib.AbstractContextManager["Board"]):
         trained = type(self.env.actuators[0])
         if actuator is not None:
             self.env = dataclasses.replace(
-                self.env, actuator=dict.fromkeys(self.env.driven, actuator), randomize=None
+                self.env,
+                actuator=dict.fromkeys(self.env.actuators_by_name, actuator),
+                randomize=None,
             )
         motor: Any = self.env.actuators[0]
         if self.loop is not None and type(motor) is not trained:
@@ -193,7 +195,7 @@ class Board(contextlib.AbstractContextManager["Board"]):
         if self.loop is not None and actuator is not None and self.loop["kind"] == "sampled":
             unlimited = motor.replaced({"controller.max_current": np.inf})
             self.rig = dataclasses.replace(
-                self.env, actuator=dict.fromkeys(self.env.driven, unlimited)
+                self.env, actuator=dict.fromkeys(self.env.actuators_by_name, unlimited)
             )
         steps = self._converters()
         with contextlib.ExitStack() as stack:

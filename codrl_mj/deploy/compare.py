@@ -87,7 +87,7 @@ def compare(
     simulated_env = (
         env
         if actuator is None
-        else dataclasses.replace(env, actuator=dict.fromkeys(env.driven, actuator))
+        else dataclasses.replace(env, actuator=dict.fromkeys(env.actuators_by_name, actuator))
     )
     if env.action == "force" and interface.levels is None:
         # Force at the joint for one ampere. An actuator without a motor gets 0 and its commands are

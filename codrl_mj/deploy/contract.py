@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.actuators import mapping_of, trusting
+from codrl_mj.actuators import allow_imports, mapping_of
 from codrl_mj.deploy.loops import loop_parameters
 from codrl_mj.deploy.network import extract_network
 from codrl_mj.envs.config import EnvConfig
@@ -90,7 +90,7 @@ class Interface:
         """Return the interface of an environment."""
         with contextlib.closing(env.make()) as instance:
             rate = 1.0 / _step_duration(instance)
-        return cls(env.task, rate, *env.world.interface(env))
+        return cls(env.task, rate, *env.source.interface(env))
 
     @property
     def levels(self) -> np.ndarray | None:
@@ -228,7 +228,8 @@ class Contract(Interface):
             **vars(interface),
             agent=agent,
             actuators={
-                name: _with_digest(mapping_of(actuator)) for name, actuator in env.driven.items()
+                name: _with_digest(mapping_of(actuator))
+                for name, actuator in env.actuators_by_name.items()
             },
             # The round trip turns tuples into lists, as in a contract that is read from a file.
             assumed=json.loads(json.dumps(env.as_mapping())),
@@ -275,7 +276,7 @@ class Contract(Interface):
         Args:
             trust: True to import the modules that it names; otherwise they raise an error.
         """
-        with trusting(trust):
+        with allow_imports(trust):
             return EnvConfig.from_mapping(self.assumed)
 
     def write(self, folder: Path) -> None:

@@ -19,7 +19,7 @@ from numba import types
 from codrl_mj.actuators import DCMotorActuator, Drive, Servo, current_loop, drive, servo, shaft
 from codrl_mj.actuators.model import Family
 from codrl_mj.actuators.shaft import Winding
-from codrl_mj.compile_cache import external
+from codrl_mj.compile_cache import external_function
 from codrl_mj.engine.families import family_replaced
 from codrl_mj.engine.memory import entry_address, f64, named_address, u64
 
@@ -35,9 +35,11 @@ _TO, _AMPERES, _CURRENT, _VOLTAGE, _SAMPLES, _LOST = 0, 2, 3, 4, 5, 6
 # The C library of this process, whose functions compiled code can call.
 _C: Any = ctypes.CDLL(None)
 _size = types.uintp
-_write = external("codrl_mj_board_write", _C.write, types.int64(types.int32, _size, _size))
-_read = external("codrl_mj_board_read", _C.read, types.int64(types.int32, _size, _size))
-_poll = external("codrl_mj_board_poll", _C.poll, types.int32(_size, types.uint64, types.int32))
+_write = external_function("codrl_mj_board_write", _C.write, types.int64(types.int32, _size, _size))
+_read = external_function("codrl_mj_board_read", _C.read, types.int64(types.int32, _size, _size))
+_poll = external_function(
+    "codrl_mj_board_poll", _C.poll, types.int32(_size, types.uint64, types.int32)
+)
 
 
 def quantized(value: float, step: float) -> float:

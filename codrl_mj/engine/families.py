@@ -19,7 +19,7 @@ from numba.extending import register_jitable
 
 from codrl_mj.actuators import Family, Inputs, family_number, parameters_type, reference
 from codrl_mj.actuators.model import advance_form, check_family
-from codrl_mj.compile_cache import Note, cfunc
+from codrl_mj.compile_cache import VerifiedMarker, cfunc
 from codrl_mj.engine.memory import (
     call,
     f64,
@@ -33,7 +33,7 @@ from codrl_mj.engine.memory import (
     write,
 )
 from codrl_mj.engine.model_access import load_inertia
-from codrl_mj.user_code import Form, check_form, not_compiled
+from codrl_mj.user_code import Form, check_form, compile_error_message
 
 SIGNATURE = (250700.0, 268401.0)
 """First two numbers of the `user` data of our actuators and joints: the paper's arXiv identifier.
@@ -208,16 +208,16 @@ def compiled_function(function: Callable[..., Any], form: Form, declared: str, *
 
     The check needs a compilation. It is skipped if an earlier process has checked this function.
     """
-    compiled, marker = internal(function), Note("fits", function, form, kinds)
+    compiled, marker = internal(function), VerifiedMarker("fits", function, form, kinds)
     try:
         _register_callees(function)
-        if marker.is_there():
+        if marker.exists():
             return compiled
         compiled.compile(kinds)
     except Exception as error:
-        raise ValueError(not_compiled(function, error)) from error
+        raise ValueError(compile_error_message(function, error)) from error
     check_form(function, _example(compiled.overloads[kinds].signature.return_type), form, declared)
-    marker.leave()
+    marker.write()
     return compiled
 
 

@@ -27,7 +27,7 @@ from numba import types
 from numba.core.registry import cpu_target
 from numba.core.typing.ctypes_utils import from_ctypes
 
-from codrl_mj.compile_cache import external
+from codrl_mj.compile_cache import external_function
 from codrl_mj.engine.memory import llvm_intrinsic, to_pointer
 from codrl_mj.plugin import LayoutError, library
 
@@ -255,6 +255,6 @@ def field_address(owner: Any, name: str) -> int:
 @functools.cache
 def engine_function(name: str) -> Any:
     """Return MuJoCo's function of (model, data), such as `mj_step`, for compiled code."""
-    return external(
+    return external_function(
         f"codrl_mj_{name}", getattr(library(), name), types.void(types.uintp, types.uintp)
     )

@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from codrl_mj.compile_cache import linked
+from codrl_mj.compile_cache import register_symbol
 
 internal = functools.partial(
     numba.njit,
@@ -79,7 +79,7 @@ def named_address(name: str, address: int) -> Any:
 
     Compiled code that is cached on disk then stays valid in processes with other addresses.
     """
-    name = linked(name, address)
+    name = register_symbol(name, address)
 
     @llvm_intrinsic(lambda: types.uintp())
     def address_of_symbol(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

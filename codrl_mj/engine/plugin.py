@@ -18,7 +18,7 @@ import mujoco
 from numba import types
 
 from codrl_mj.actuators import BUILT_IN, Ideal, family_number, reference
-from codrl_mj.compile_cache import cfunc, external, njit
+from codrl_mj.compile_cache import cfunc, external_function, njit
 from codrl_mj.engine.families import (
     INERTIA,
     MOTION,
@@ -38,7 +38,7 @@ from codrl_mj.engine.families import (
 from codrl_mj.engine.layout import DATA, MODEL
 from codrl_mj.engine.memory import entry_address, f64, internal, named_address
 from codrl_mj.engine.model_access import clip, command, is_disabled, output_inertia, user_address
-from codrl_mj.plugin import FAMILY, NAME, complain, library, registered
+from codrl_mj.plugin import FAMILY, NAME, library, log_warning, registered_plugins
 
 PLUGIN_HEADER_SIZE = USER_HEADER_SIZE + 1
 """Length of the `user` data's header in this backend: `user_header` and the actuator's arm [m]."""
@@ -137,7 +137,7 @@ _get_config.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
 _get_config.restype = ctypes.c_void_p
 
 
-_get_config_compiled = external(
+_get_config_compiled = external_function(
     "mj_plugin_configuration", _get_config, types.uintp(types.uintp, types.int32, types.uintp)
 )
 """`_get_config` for compiled code."""
@@ -253,7 +253,7 @@ def compiled_entries() -> dict[str, Any]:
         for entry in range(MODEL.plugin_statenum(model)[instance]):
             f64(state)[entry] = 0.0
 
-    init_instance = external(
+    init_instance = external_function(
         "codrl_mj_judge", _INIT_INSTANCE, types.int32(types.uintp, types.int32)
     )
 
@@ -272,7 +272,7 @@ def start(model: int, data: int, instance: int) -> int:
     It replaces the plugin's Python functions by the compiled ones, which MuJoCo calls from then on.
     """
     del data
-    structure = registered()[NAME][1]
+    structure = registered_plugins()[NAME][1]
     for name, function in compiled_entries().items():
         setattr(structure, name, function.address)
     return _init_instance(model, instance)
@@ -309,7 +309,7 @@ def _init_instance(model: int, instance: int) -> int:
             raise ValueError(REASONS[fault])
     except Exception as error:
         # MuJoCo calls this from C, where an exception cannot be raised.
-        complain(f"plugin instance {instance}: {error}")
+        log_warning(f"plugin instance {instance}: {error}")
         return -1
     return 0
 

@@ -27,7 +27,7 @@ from codrl_mj.engine.families import (
 )
 from codrl_mj.engine.model_access import shaft_inertia
 from codrl_mj.engine.plugin import EXTRA_STATES, PLUGIN_HEADER_SIZE, REASONS
-from codrl_mj.plugin import FAMILY, NAME, registered
+from codrl_mj.plugin import FAMILY, NAME, registered_plugins
 
 
 def motors(model: mujoco.MjModel) -> dict[int, ActuatorModel]:
@@ -50,7 +50,7 @@ def motors(model: mujoco.MjModel) -> dict[int, ActuatorModel]:
             its activations, which are the motor's state.
     """
     actuators = {}
-    slot = registered()[NAME][0]
+    slot = registered_plugins()[NAME][0]
     for index in range(model.nactuator):
         user, instance = model.actuator_user[index], model.actuator_plugin[index]
         has_plugin = instance >= 0 and model.plugin[instance] == slot

@@ -1,4 +1,4 @@
-"""Thin shells that turn a task and its physics into the environments that agents know; imported on first use."""
+"""Gymnasium environments of tasks and their physics; the classes are imported on first use."""
 
 import importlib
 from typing import Any
@@ -13,7 +13,7 @@ __all__ = ["ActuatedEnv", "ActuatedVectorEnv", "SerialVectorEnv"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on first use: `codrl_mj.envs.config` needs nothing heavy."""
+    """Import a public name on first use, so that `codrl_mj.envs.config` loads nothing heavy."""
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module 'codrl_mj.envs' has no attribute {name!r}")

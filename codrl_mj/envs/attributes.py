@@ -1,9 +1,10 @@
-"""Attributes of environments, as Gymnasium's have them: `env.unwrapped.gravity = 3.7`.
+"""Gymnasium's attributes of environments, for example `env.unwrapped.gravity = 3.7`.
 
-`Task.attributes` says where each of them lives; on the analytic physics numbers of the model are
-those of Gymnasium's own environment. One that is written takes effect at once; state and motor stay
-as they are. What is written outlasts resets, and is not in a `snapshot`. What the task's compiled
-functions contain can be read only; writing the value that an attribute has is allowed everywhere.
+`Task.attributes` maps each name to the quantity that it reads and writes; on the analytic physics,
+numbers of the model are those of Gymnasium's own environment. A written attribute takes effect at
+once; the state and the motor stay as they are. Written values outlast resets and are not part of a
+`snapshot`. Values that the task's compiled functions contain are read-only; writing the value that
+an attribute already has is always allowed.
 """
 
 import dataclasses
@@ -22,44 +23,56 @@ from codrl_mj.tasks import Task
 from codrl_mj.tasks.attributes import Attribute, Derived, Fixed, ModelNumber, Setting
 
 
-def shared(attribute: Attribute) -> bool:
-    """Whether it is the set-up's: the environments of a vector share it."""
+def is_shared(attribute: Attribute) -> bool:
+    """Return True if all environments of a vector share the attribute's value."""
     return isinstance(attribute, Fixed | Setting)
 
 
 def read(name: str, setup: ResolvedEnv, model: Any) -> Any:
-    """The value of an attribute of an environment, whose simulation has this `mjModel`; without one, the physics."""
+    """Return an attribute's value.
+
+    Args:
+        name: the attribute.
+        setup: the environment's resolved configuration.
+        model: the `mjModel` of its simulation; the `Physics` if it has no MuJoCo model.
+    """
     attribute = setup.task.attributes[name]
     if isinstance(attribute, Fixed):
         return attribute.value
     if isinstance(attribute, Derived):
-        return attribute.of(*(read(each, setup, model) for each in attribute.names))
+        return attribute.of(*(read(source, setup, model) for source in attribute.names))
     if isinstance(attribute, Setting):
         value = getattr(
-            setup.plant if attribute is Setting.INTEGRATOR else setup.task, attribute.value
+            setup.simulation if attribute is Setting.INTEGRATOR else setup.task, attribute.value
         )
         return list(value) if attribute is Setting.FORCES else value
     if not isinstance(model, mujoco.MjModel):
-        return getattr(_gymnasiums(model), name)
-    return attribute.scale * float(_place(attribute, model)[0]) ** (-1 if attribute.inverse else 1)
+        return getattr(_gymnasium_env(model), name)
+    return attribute.scale * float(_number_view(attribute, model)[0]) ** (
+        -1 if attribute.inverse else 1
+    )
 
 
-def written(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
-    """Write an attribute; to be followed by `mj_setConst`.
+def write(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
+    """Write an attribute; `mj_setConst` must be called afterwards.
 
     Returns:
-        The set-up to go on with.
+        The resolved configuration with the new value.
     """
     present, attribute = read(name, setup, model), setup.task.attributes[name]
     if np.array_equal(value, present):
         return setup
-    try:  # the messages are the remedy, or what the value must be
+    # The functions below raise only the remedy, or the values that are allowed; the attribute's
+    # name and value are put in front of it at the end.
+    try:
         if isinstance(attribute, Fixed):
             raise AttributeError(attribute.remedy)
         if isinstance(attribute, Derived):
             raise AttributeError(f"write {' and '.join(attribute.names)} first")
         if attribute is Setting.INTEGRATOR:
-            known = " or ".join(f"integrator={name!r}" for name in setup.task.integrators)
+            known = " or ".join(
+                f"integrator={integrator!r}" for integrator in setup.task.integrators
+            )
             raise AttributeError(f"it is compiled into the step: make an environment with {known}")
         if setup.randomization.distributions:
             raise AttributeError(
@@ -70,17 +83,17 @@ def written(name: str, value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEn
             return setup
         if attribute is Setting.STEP:
             return _write_step(value, setup, model)
-        return _write_forces(value, setup, model, each=attribute is Setting.FORCES)
+        return _write_forces(value, setup, model, per_action=attribute is Setting.FORCES)
     except ValueError as error:
         raise ValueError(f"{name} = {value!r}: {error}") from None
     except AttributeError as error:
         raise AttributeError(
-            f"{name} = {value!r}: it can only be {present!r} here; {error}"
+            f"{name} = {value!r}: must be {present!r} in this environment; {error}"
         ) from None
 
 
-def checked_states(states: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Mechanical states as float64."""
+def validate_states(states: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return mechanical states as float64; raise if their shape is wrong or one is not finite."""
     try:
         array = np.array(states, dtype=np.float64)
     except (TypeError, ValueError):
@@ -90,26 +103,29 @@ def checked_states(states: Any, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def _place(attribute: ModelNumber, model: Any) -> np.ndarray:
-    """The number where it is, live, shape (1,)."""
+def _number_view(attribute: ModelNumber, model: Any) -> np.ndarray:
+    """Return a live view of the attribute's number in the model, shape (1,)."""
     array, row = field_of(model, attribute.field), 0
     if attribute.owner:
+        # MuJoCo's field names begin with the kind of object (`body_mass`), and the model has an
+        # accessor of that name (`model.body(name)`).
         row = getattr(model, attribute.field.partition("_")[0])(attribute.owner).id
     rows = array.reshape(len(array) if attribute.owner else 1, -1)
     return rows[row, attribute.entry : attribute.entry + 1]
 
 
-def _gymnasiums(physics: Any) -> Any:
-    """The Gymnasium environment that a physics without a MuJoCo model drives."""
+def _gymnasium_env(physics: Any) -> Any:
+    """Return the Gymnasium environment behind a physics without a MuJoCo model."""
     if not isinstance(physics, AnalyticPhysics) or not hasattr(physics.reference_env, "env"):
         raise AttributeError(
-            f"{type(physics).__name__} has no MuJoCo model or data, and no environment of"
-            " Gymnasium's, whose number it is; use physics='mujoco'"
+            f"{type(physics).__name__} has no MuJoCo model or data, and no Gymnasium environment"
+            " that holds this number; use physics='mujoco'"
         )
     return physics.reference_env.env
 
 
-def _number(value: Any, positive: bool) -> float:
+def _finite_number(value: Any, positive: bool) -> float:
+    """Return a value as float; raise if it is not finite, or not > 0 if `positive`."""
     if (
         isinstance(value, numbers.Real | np.ndarray)
         and np.size(value) == 1  # type: ignore[arg-type]
@@ -122,43 +138,49 @@ def _number(value: Any, positive: bool) -> float:
 
 
 def _write_number(
-    name: str, attribute: ModelNumber, value: Any, setup: ResolvedEnv, model: Any
+    attribute_name: str, attribute: ModelNumber, value: Any, setup: ResolvedEnv, model: Any
 ) -> None:
+    """Write a number of the model, and the quantities that vary with it."""
     power, varies = -1 if attribute.inverse else 1, attribute.varies
-    number = _number(value, positive=bool(varies))
+    number = _finite_number(value, positive=bool(varies))
     if not isinstance(model, mujoco.MjModel):
-        setattr(env := _gymnasiums(model), name, number)
-        for other, follows in setup.task.attributes.items():
-            if (
-                isinstance(follows, Derived) and name in follows.names
-            ):  # attributes of their own in Gymnasium
-                setattr(env, other, read(other, setup, model))
+        setattr(env := _gymnasium_env(model), attribute_name, number)
+        for dependent_name, dependent in setup.task.attributes.items():
+            # Gymnasium stores dependent attributes separately, and does not update them itself.
+            if isinstance(dependent, Derived) and attribute_name in dependent.names:
+                setattr(env, dependent_name, read(dependent_name, setup, model))
         return
     if varies:
-        factors = np.full((1, len(varies)), (number / read(name, setup, model)) ** power)
+        factors = np.full((1, len(varies)), (number / read(attribute_name, setup, model)) ** power)
         fields = Variation(model, varies).fields(factors, shown=True)
-        only = attribute.only or fields
-        write_fields(model, {name: rows for name, rows in fields.items() if name in only})
-    _place(attribute, model)[0] = (number / attribute.scale) ** power
+        shown_fields = attribute.only or fields
+        write_fields(
+            model,
+            {
+                attribute_name: rows
+                for attribute_name, rows in fields.items()
+                if attribute_name in shown_fields
+            },
+        )
+    _number_view(attribute, model)[0] = (number / attribute.scale) ** power
 
 
-def _write_forces(value: Any, setup: ResolvedEnv, model: Any, each: bool) -> ResolvedEnv:
-    """The forces of the actions, each or the largest of them."""
+def _write_forces(value: Any, setup: ResolvedEnv, model: Any, per_action: bool) -> ResolvedEnv:
+    """Write the force of each action, or the largest force, to which the others are scaled."""
     task = setup.task
     if setup.config.action != "force" or setup.config.disturbances != OFF or len(task.motors) > 1:
         raise AttributeError(
-            "the forces are known to the current loop's table, to the drive's disturbances or to"
-            " several motors: make an environment of one motor with action='force' and no"
-            " disturbances"
+            "the current loop's table, the drive's disturbances and several motors depend on the"
+            " forces: make an environment of one motor with action='force' and no disturbances"
         )
     table = task.forces
-    if each:
+    if per_action:
         if np.shape(value) != (len(table or ()),):
             raise ValueError(f"must be {len(table or ())} numbers, one for each action")
-        table = tuple(_number(force, positive=False) for force in value)
+        table = tuple(_finite_number(force, positive=False) for force in value)
         value = max(map(abs, table))
-    largest = _number(value, positive=True)
-    if table is not None and not each:
+    largest = _finite_number(value, positive=True)
+    if table is not None and not per_action:
         table = tuple(largest * (force / task.max_force) for force in table)
     if isinstance(model, mujoco.MjModel):
         model.actuator(task.motors[0]).ctrlrange[:] *= largest / task.max_force
@@ -168,21 +190,25 @@ def _write_forces(value: Any, setup: ResolvedEnv, model: Any, each: bool) -> Res
 
 
 def _write_step(value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
-    duration = _number(value, positive=True)
-    if setup.plant.motors_added or setup.config.disturbances != OFF:
+    """Write the duration of an environment step [s]; the number of inner steps stays."""
+    duration = _finite_number(value, positive=True)
+    if setup.simulation.motors_added or setup.config.disturbances != OFF:
         raise AttributeError(
             "motor and disturbances were checked for this step: make an environment without them"
         )
     if isinstance(model, mujoco.MjModel):
         model.opt.timestep = duration / setup.inner_steps
     else:
-        _gymnasiums(model)
+        _gymnasium_env(model)
         model.timestep = duration / setup.inner_steps
     return dataclasses.replace(setup, task=dataclasses.replace(setup.task, step_duration=duration))
 
 
-class _Access:
-    """One name, on the environments' class: unlike `__getattr__` it leaves all other names as fast as they are."""
+class _AttributeDescriptor:
+    """Descriptor of one attribute on the environments' class.
+
+    Unlike `__getattr__`, it does not slow down the access to any other attribute.
+    """
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -201,27 +227,28 @@ class _Access:
 
     def __set__(self, env: Any, value: Any) -> None:
         attribute = env.task.attributes.get(self._name)
-        if attribute is None:  # another task's
+        # A descriptor is on the class of all environments; the attribute may be another task's.
+        if attribute is None:
             vars(env)[self._name] = value
         else:
             env._write_attribute(self._name, value)
 
 
 class GymnasiumAttributes:
-    """Gives an environment the attributes of its task."""
+    """Mixin that gives an environment the attributes of its task."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore, in this or another process."""
+        """Restore the environment, in this or another process."""
         self.__dict__.update(state)
         self._offer_attributes(self.task)  # type: ignore[attr-defined]
 
     def _offer_attributes(self, task: Task) -> None:
-        """Make the names of a task's attributes known to the class; called when an environment has been made."""
+        """Add descriptors of a task's attributes to the class; call it at the end of `__init__`."""
         for name in task.attributes:
-            if isinstance(vars(GymnasiumAttributes).get(name), _Access):
+            if isinstance(vars(GymnasiumAttributes).get(name), _AttributeDescriptor):
                 continue
             if name in vars(self) or hasattr(type(self), name):
                 raise ValueError(
                     f"attributes of task {task.name!r}: environments have a {name!r} of their own"
                 )
-            setattr(GymnasiumAttributes, name, _Access(name))
+            setattr(GymnasiumAttributes, name, _AttributeDescriptor(name))

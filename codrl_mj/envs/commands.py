@@ -1,4 +1,4 @@
-"""What an agent's actions stand for: forces, or what its actuators take besides, such as currents and voltages."""
+"""Commands: conversion from agents' actions to forces, currents, voltages and motions of motors."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -20,13 +20,15 @@ POSITIONS = ("rad", "m")
 """Units of commands that are positions."""
 
 
-def command_of(actuator: ActuatorModel, name: str, whose: str = "") -> Command:
-    """What an action means to an actuator, that of a pattern `whose`; a force is one of the actuator as it is."""
+def command_of(actuator: ActuatorModel, name: str, pattern: str = "") -> Command:
+    """Return an action's meaning for an actuator; messages name its motors by `pattern`."""
     if name == "force":
         return Command("N or N*m", actuator, actuator.arm_radius, None, {})
     known = actuator.commands()
     if name not in known:
-        kind = f"{actuator.family or type(actuator).__name__} actuator{whose and f' of {whose!r}'}"
+        kind = (
+            f"{actuator.family or type(actuator).__name__} actuator{pattern and f' of {pattern!r}'}"
+        )
         if isinstance(actuator, Ideal) and name in ("current", "voltage"):
             raise ValueError(
                 f"action = {name!r}: the {kind} has no {name} to command; choose another actuator"
@@ -43,7 +45,7 @@ def command_of(actuator: ActuatorModel, name: str, whose: str = "") -> Command:
 
 
 def _servo_remedy(actuator: ActuatorModel, name: str) -> str:
-    """Return how to ask a motor for a position or a velocity; empty if the actuator or the action is another."""
+    """Return how to make a motor take this command; empty for other actuators and commands."""
     if name not in ("position", "velocity") or not isinstance(actuator, Drive):
         return ""
     changes = {} if isinstance(actuator, Servo) else {"family": "servo"}
@@ -54,7 +56,7 @@ def _servo_remedy(actuator: ActuatorModel, name: str) -> str:
 
 
 class TaskCommands:
-    """The way from an action to the forces that the physics is asked for."""
+    """Conversion from a task's actions to the forces that are requested from the physics."""
 
     def __init__(
         self,
@@ -63,31 +65,38 @@ class TaskCommands:
         name: str,
         levels: Sequence[float] | None,
     ) -> None:
-        """Resolve a command by its name; `levels` are for discrete tasks and other commands than `force`."""
+        """Resolve a command by its name.
+
+        Args:
+            task: the task.
+            actuators: its actuators.
+            name: `force`, or another command of the actuators.
+            levels: choices of a discrete task, for commands other than `force`.
+        """
         if name == "force" and actuators[0].MOTION:
             raise ValueError(
-                f"action = 'force': a {type(actuators[0]).__name__} is not asked for forces; must"
+                f"action = 'force': a {type(actuators[0]).__name__} does not take forces; must"
                 f" be one of {', '.join(actuators[0].commands())}"
             )
         if name == "force" and levels is not None:
             raise ValueError(f"levels = {levels!r}: only for action='current' and action='voltage'")
         chosen = [command_of(actuator, name) for actuator in actuators]
         wrapped = [
-            task.state_names[at]
-            for at in task.wrapped
+            task.state_names[index]
+            for index in task.wrapped
             if actuators[0].MOTION and name == "position"
         ]
         if wrapped:
             raise ValueError(
                 f"action = 'position': {task.name} wraps {', '.join(wrapped)}, and a position that"
-                " jumps by a turn cannot be held; use a velocity servo, or another actuator"
+                " jumps by one turn cannot be held; use a velocity servo, or another actuator"
             )
         self.simulated = tuple(command.actuator for command in chosen)
-        """What is simulated, one for each motor: the actuator, or what a command leaves of it."""
-        self.tracks = self.simulated[0].tracks
-        """Whether a force is asked for; otherwise what is delivered counts as desired."""
+        """Actuator to simulate for each motor; a command may bypass a part of it."""
+        self.is_torque_controlled = self.simulated[0].tracks
+        """True if the command is a torque. If False, `desired_force` equals the delivered force."""
         self.fixed = chosen[0].fixed
-        """Fields of the actuator that cannot be drawn -> why."""
+        """Fields of the actuator that cannot be randomized -> reason."""
         scales = np.array(
             [command.torque_per_unit / command.actuator.arm_radius for command in chosen]
         )
@@ -96,59 +105,68 @@ class TaskCommands:
             raise ValueError(f"action = {name!r}: needs a finite controller.max_voltage, it is inf")
         self.holds = np.where([command.unit in POSITIONS for command in chosen], scales, 0.0)
         """As `codrl_mj.physics.SimulationConfig.holds`."""
-        each = zip(limits, scales, task.max_forces, strict=True)
+        motors = zip(limits, scales, task.max_forces, strict=True)
         self.max_forces = np.array(
-            [most if limit is None else limit * scale for limit, scale, most in each]
+            [max_force if limit is None else limit * scale for limit, scale, max_force in motors]
         )
         """Largest forces [N] or torques [N*m] that the physics is asked for, shape (n,)."""
-        most = self.max_forces / scales  # in float64: a float32 bound of the space may lie beyond
+        # Actions are clipped in float64, because rounding may put float32 bounds beyond the limit.
+        max_commands = self.max_forces / scales
         self._box = (
-            (float(most[0]), float(scales[0]), 1) if len(most) == 1 else (most, scales, len(most))
+            (float(max_commands[0]), float(scales[0]), 1)
+            if len(max_commands) == 1
+            else (max_commands, scales, len(max_commands))
         )
-        """The largest command of a box's action, the force [N or N*m] of a command of one, and the number of motors."""
+        """Largest command of a box action, force [N or N*m] per unit command, number of motors."""
         self.action_space: spaces.Space[Any] = task.action_space
-        """The agent's actions: the task's, or a table's indices, or a box of commands."""
+        """Action space of the agent: the task's, indices of a table, or a box of commands."""
         self.action_forces = (
             None if task.forces is None else np.array(task.forces, dtype=np.float64)
         )
-        """Forces [N or N*m] of the discrete actions, in order, shape (k,) or (k, n); None where the space is a box."""
+        """Forces [N or N*m] of the discrete actions, shape (k,) or (k, n); None for a box."""
         if name != "force" and isinstance(self.action_space, spaces.Box):
             if levels is not None:
                 raise ValueError(
                     f"levels = {levels!r}: only for tasks with discrete actions; {task.name}'s are"
                     " continuous"
                 )
-            bounds = most.astype(np.float32)
+            bounds = max_commands.astype(np.float32)
             self.action_space = spaces.Box(-bounds, bounds, dtype=np.float32)
         elif name != "force":
-            table = _table(task, name, levels, chosen)
+            table = _discrete_levels(task, name, levels, chosen)
             self.action_space, self.action_forces = spaces.Discrete(len(table)), table * scales[0]
 
     def force(self, action: Any) -> Any:
-        """The force [N] or torque [N*m] that the physics is to ask the actuator for; with several motors an array (n,).
+        """Return the force [N] or torque [N*m] of an action; an array (n,) for several motors.
 
-        An action of a box saturates.
+        Box actions beyond their bounds saturate.
         """
         forces = self.action_forces
         if forces is not None:
-            plain = type(action) is int or type(action) is np.int64  # spares them the slower test
-            if not (0 <= action < len(forces) if plain else self.action_space.contains(action)):
+            # `contains` of a space takes longer than the whole conversion of a plain integer.
+            is_integer = type(action) is int or type(action) is np.int64
+            if not (
+                0 <= action < len(forces) if is_integer else self.action_space.contains(action)
+            ):
                 raise ValueError(f"action = {action!r}: not in {self.action_space}")
             return forces.item(int(action)) if forces.ndim == 1 else forces[int(action)]
-        limit, scale, count = self._box
-        alone = count == 1 and type(action) is np.ndarray and action.shape == (1,)
+        max_command, scale, count = self._box
+        # The common case, one motor and an action within its bounds, needs no array operation.
+        is_single = count == 1 and type(action) is np.ndarray and action.shape == (1,)
         if (
-            alone and type(command := action.item()) is float and -limit <= command <= limit
-        ):  # quickly
+            is_single
+            and type(command := action.item()) is float
+            and -max_command <= command <= max_command
+        ):
             return command * scale
         array = np.asarray(action)
         if array.shape != (count,) or array.dtype.kind != "f" or np.isnan(array).any():
             raise ValueError(f"action = {action!r}: not in {self.action_space}")
-        forces = np.clip(array.astype(np.float64), -limit, limit) * scale
+        forces = np.clip(array.astype(np.float64), -max_command, max_command) * scale
         return float(forces[0]) if count == 1 else forces
 
     def forces(self, actions: Any) -> np.ndarray:
-        """What `force` does, for a batch (N, ...): forces (N,), or with several motors (N, n), float64."""
+        """Return the forces of a batch of actions (N, ...), shape (N,), or (N, n) for n motors."""
         space, array = self.action_space, np.asarray(actions)
         discrete = isinstance(space, spaces.Discrete)
         kinds = "iu" if discrete else "f"
@@ -159,7 +177,7 @@ class TaskCommands:
         ):
             raise ValueError(
                 f"actions of shape {array.shape} and type {array.dtype}: must be a batch of"
-                f" elements of {space}, with one row an environment"
+                f" elements of {space}, with one row per environment"
             )
         wrong = (
             (array < 0) | (array >= space.n)
@@ -176,10 +194,10 @@ class TaskCommands:
         return np.clip(commands.astype(np.float64), -limit, limit) * scale
 
 
-def _table(
+def _discrete_levels(
     task: Task, name: str, levels: Sequence[float] | None, commands: Sequence[Command]
 ) -> np.ndarray:
-    """The levels of a command that a task's discrete actions choose from, shape (k,), checked."""
+    """Return the levels that a task's discrete actions choose from, shape (k,), checked."""
     if len(commands) > 1:
         raise ValueError(
             f"action = {name!r}: {task.name} has several motors and discrete actions: use 'force'"
@@ -189,7 +207,7 @@ def _table(
     if limit is None:
         limit = float(task.max_forces[0]) * command.actuator.arm_radius / command.torque_per_unit
     try:
-        table = np.array([] if levels is None else levels, dtype=np.float64)  # a copy
+        table = np.array([] if levels is None else levels, dtype=np.float64)
     except (TypeError, ValueError):
         table = np.array([np.nan])
     if table.ndim != 1 or len(table) < 2 or not (np.abs(table) <= limit).all():
@@ -202,11 +220,11 @@ def _table(
 
 
 class ControlCommands:
-    """From actions to the controls of anybody's model: units and limits of commands, and disturbances on their way.
+    """Conversion from actions to the controls of any model, with units, limits and disturbances.
 
-    Actions that are not of our motors are as they were. Disturbances act once an environment step,
-    which has the place of the integration step; of a plain motor on its force [N or N*m] before the
-    gear, of others on the control itself.
+    Actions of actuators without our motors pass unchanged. Disturbances act once per environment
+    step, in place of the integration step: on a plain motor's force [N or N*m] before the gear, and
+    on the control itself of other actuators.
     """
 
     def __init__(
@@ -217,19 +235,28 @@ class ControlCommands:
         disturbances: Disturbances,
         step_duration: float | None,
     ) -> None:
-        """Let the motors' controls, the model's `actuator_ctrlrange`, reach as far as their commands do.
+        """Set `actuator_ctrlrange` of the motors to the limits of their commands.
 
-        `actions` has the environment's own, `motors` what one means to an actuator, by its index:
-        None where it is the environment's own. An environment step takes `step_duration` [s], if
-        that is known.
+        Args:
+            data: the simulation; its model is changed.
+            actions: the environment's original action space.
+            motors: actuator index -> command; None if the action stays the environment's own.
+            disturbances: disturbances of the commands and the joints.
+            step_duration: duration of an environment step [s]; None if unknown.
         """
         self.action_space, model, indices = actions, data.model, list(motors)
         self._scales: np.ndarray | None = None
         self._disturber, self._dofs = Disturber(OFF, 1.0, np.zeros(0), 1), list[int]()
-        meant = {index: command for index, command in motors.items() if command is not None}
-        remedies = {"action": "use action='force', its own"} if meant else {}
+        commands_by_index = {
+            index: command for index, command in motors.items() if command is not None
+        }
+        remedies = (
+            {"action": "use action='force', the environment's own actions"}
+            if commands_by_index
+            else {}
+        )
         remedies |= (
-            {} if disturbances == OFF else {"disturbances": "they are what can be disturbed"}
+            {} if disturbances == OFF else {"disturbances": "only such controls can be disturbed"}
         )
         for name, remedy in remedies.items():
             if not isinstance(actions, spaces.Box) or actions.shape != (model.nu,):
@@ -237,41 +264,47 @@ class ControlCommands:
                     f"{name}: the environment's actions are {actions}, not the {model.nu} controls"
                     f" of its model; {remedy}"
                 )
-        if meant:
-            self._command(model, meant)
+        if commands_by_index:
+            self._command(model, commands_by_index)
         if disturbances == OFF:
             return
         if step_duration is None:
             raise ValueError(
-                "disturbances: the environment has no dt, the duration of its steps [s]; give"
+                "disturbances: the environment has no `dt`, the duration of its steps [s]; give"
                 " it one"
             )
         check_delay(disturbances, step_duration, None)
         self._data, self._pulses = data, disturbances.random
-        every = [one for index in indices for one in actuators_sharing_motor(model, index)]
-        self._controls = places = model.actuator_ctrladr[every]
-        limited = model.actuator_ctrllimited[places].astype(bool)
-        largest = np.where(limited, np.abs(model.actuator_ctrlrange[places]).max(axis=1), np.inf)
-        self._gains = np.array([_plain_gain(model, index) or 1.0 for index in every])
-        self._disturber = Disturber(disturbances, step_duration, largest * np.abs(self._gains), 1)
-        present = motors_of(model)
+        actuator_indices = [
+            actuator for index in indices for actuator in actuators_sharing_motor(model, index)
+        ]
+        self._controls = controls = model.actuator_ctrladr[actuator_indices]
+        limited = model.actuator_ctrllimited[controls].astype(bool)
+        max_controls = np.where(
+            limited, np.abs(model.actuator_ctrlrange[controls]).max(axis=1), np.inf
+        )
+        self._gains = np.array([_plain_gain(model, index) or 1.0 for index in actuator_indices])
+        self._disturber = Disturber(
+            disturbances, step_duration, max_controls * np.abs(self._gains), 1
+        )
+        actuators = motors_of(model)
         holds = [
-            _hold(model, one, present[index])
+            _hold(model, actuator, actuators[index])
             for index in indices
-            for one in actuators_sharing_motor(model, index)
+            for actuator in actuators_sharing_motor(model, index)
         ]
         self._holds = np.array(holds).reshape(-1, 2).T
-        self._outputs = model.actuator_outadr[every]
-        # loads are on joints, one for each motor; commands, one for each of its actuators
+        self._outputs = model.actuator_outadr[actuator_indices]
+        # Loads act on joints, one per motor; commands exist for each actuator that shares a motor.
         self._dofs = [_dof(model, index) for index in indices] if self._pulses else []
-        self._loaded = [every.index(index) for index in indices]
+        self._loaded = [actuator_indices.index(index) for index in indices]
 
-    def _command(self, model: mujoco.MjModel, meant: Mapping[int, Command]) -> None:
-        """Take units and limits of commands."""
+    def _command(self, model: mujoco.MjModel, commands_by_index: Mapping[int, Command]) -> None:
+        """Apply the units and limits of commands to the action space and to the model."""
         space: Any = self.action_space
         self._scales = np.ones(model.nu)
         low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-        for index, command in meant.items():
+        for index, command in commands_by_index.items():
             control, gain = model.actuator_ctrladr[index], _plain_gain(model, index)
             name, arm = (
                 model.actuator(index).name or f"actuator {index}",
@@ -279,8 +312,8 @@ class ControlCommands:
             )
             if gain is None:
                 raise ValueError(
-                    f"{name}: is no plain motor of its own, whose force is its control times a"
-                    " gain: use action='force', the environment's own"
+                    f"{name}: is not a plain motor, whose force is its control times a gain: use"
+                    " action='force', the environment's own actions"
                 )
             torque, limit = command.torque_per_unit, command.limit
             self._scales[control] = scale = (
@@ -291,16 +324,17 @@ class ControlCommands:
             if limit is None or not np.isfinite(limit):
                 raise ValueError(
                     f"{name}: a command [{command.unit}] needs a limit, and neither the motor nor"
-                    " the environment's control has one: give the motor's controller one"
+                    " the environment's control has one: give the motor's controller a limit"
                 )
-            reach = limit * abs(scale * gain)
+            max_control = limit * abs(scale * gain)
             if model.actuator_forcelimited[index] and not command.actuator.MOTION:
-                least = np.abs(model.actuator_forcerange[index]).min()
-                if reach > least * (1.0 + 1e-6):
+                min_force = np.abs(model.actuator_forcerange[index]).min()
+                # The tolerance admits ranges that were rounded when they were written to XML.
+                if max_control > min_force * (1.0 + 1e-6):
                     raise ValueError(
-                        f"{name}: forcerange = {least:g}: would cut commands of up to {limit:g}"
-                        f" {command.unit}, which stand for {reach:g} there: take the range out of"
-                        " the model, or use action='force'"
+                        f"{name}: forcerange = {min_force:g}: would cut commands of up to {limit:g}"
+                        f" {command.unit}, which are {max_control:g} in the model: remove the range"
+                        " from the model, or use action='force'"
                     )
             low[control], high[control] = -limit, limit
             model.actuator_ctrllimited[control] = True
@@ -311,28 +345,28 @@ class ControlCommands:
 
     @property
     def memory(self) -> dict[str, np.ndarray]:
-        """The commands on their way and the pulses to come, a live array, if there are disturbances."""
+        """Live array of delayed commands and scheduled pulses; no entry without disturbances."""
         return {"disturbances": self._disturber.memory} if self._disturber.on else {}
 
     def begin(self, key: float) -> None:
-        """Forget everything at the start of an episode with this key of random numbers."""
+        """Reset at the start of an episode that has this key of random numbers."""
         if self._disturber.on:
-            self._disturber.reset(np.zeros(1, dtype=int), key, self._held())
+            self._disturber.reset(np.zeros(1, dtype=int), key, self._holding_commands())
             self._data.qfrc_applied[self._dofs] = 0.0
 
-    def _held(self) -> Any:
-        """Return the commands on their way that hold the motors where they are: 0 unless they are positions."""
+    def _holding_commands(self) -> Any:
+        """Return the commands that hold the motors in place: 0 unless commands are positions."""
         slopes, offsets = self._holds * self._gains
         if not slopes.any():
             return 0.0
-        present = copy.copy(
-            self._data
-        )  # not every environment has brought its lengths up to date at a reset
-        mujoco.mj_fwdPosition(present.model, present)
-        return slopes * present.actuator_length[self._outputs] + offsets
+        # Not every environment updates the actuators' lengths at a reset. The copy leaves the
+        # environment's own data as it is.
+        data = copy.copy(self._data)
+        mujoco.mj_fwdPosition(data.model, data)
+        return slopes * data.actuator_length[self._outputs] + offsets
 
     def controls(self, action: Any) -> Any:
-        """The environment's own action for one of `action_space`, as it arrives in a step; loads go to the joints."""
+        """Return the environment's action after scaling and disturbances; apply loads to joints."""
         if (self._scales is not None or self._disturber.on) and np.shape(
             action
         ) != self.action_space.shape:
@@ -343,18 +377,20 @@ class ControlCommands:
             action = np.asarray(action, dtype=np.float64) * self._scales
         if not self._disturber.on:
             return action
-        arrived = np.array(action, dtype=np.float64)
-        wanted = arrived[self._controls] * self._gains
-        commands, loads = (each[0] for each in self._disturber.disturbed(wanted[np.newaxis]))
-        arrived[self._controls] = commands / self._gains
+        delayed_action = np.array(action, dtype=np.float64)
+        commanded_forces = delayed_action[self._controls] * self._gains
+        commands, loads = (
+            array[0] for array in self._disturber.disturbed(commanded_forces[np.newaxis])
+        )
+        delayed_action[self._controls] = commands / self._gains
         if self._pulses:
             self._data.qfrc_applied[self._dofs] = 0.0
             np.add.at(self._data.qfrc_applied, self._dofs, loads[self._loaded])
-        return arrived
+        return delayed_action
 
 
 def _dof(model: mujoco.MjModel, index: int) -> int:
-    """The degree of freedom that a motor drives; refused where it drives no joint."""
+    """Return the degree of freedom that a motor drives; raise if it drives no joint."""
     if mujoco.mjtTrn(model.actuator_trntype[index]) not in ON_JOINT:
         raise ValueError(
             f"disturbances.pulse_force: {model.actuator(index).name or f'actuator {index}'} drives"
@@ -365,19 +401,22 @@ def _dof(model: mujoco.MjModel, index: int) -> int:
 
 
 def _hold(model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> tuple[float, float]:
-    """Return the slope over its length, and the offset, of a control that holds an actuator; zeros if it is a force."""
+    """Return slope and offset over the length of the control that holds an actuator in place.
+
+    Both are 0 if the control is a force.
+    """
     if actuator.MOTION:
-        asked = next(iter(actuator.commands().values()))
-        return float(asked.unit in POSITIONS), 0.0
+        command = next(iter(actuator.commands().values()))
+        return float(command.unit in POSITIONS), 0.0
     gain, (offset, slope) = (
         float(model.actuator_gainprm[index, 0]),
         model.actuator_biasprm[index, :2].tolist(),
     )
-    fixed = model.actuator_gaintype[index] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0.0
-    integrates = model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_INTEGRATOR
+    is_fixed_gain = model.actuator_gaintype[index] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0.0
+    is_integrator = model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_INTEGRATOR
     if (
-        not fixed
-        or integrates
+        not is_fixed_gain
+        or is_integrator
         or model.actuator_biastype[index] != mujoco.mjtBias.mjBIAS_AFFINE
         or slope == 0.0
     ):
@@ -386,16 +425,20 @@ def _hold(model: mujoco.MjModel, index: int, actuator: ActuatorModel) -> tuple[f
 
 
 def _plain_gain(model: mujoco.MjModel, index: int) -> float | None:
-    """The gain of an actuator whose force is gain*control; None where it is more than that."""
+    """Return the gain of an actuator whose force is gain*control; None for all other actuators."""
     kinds = (
         model.actuator_gaintype[index],
         model.actuator_biastype[index],
         model.actuator_dyntype[index],
     )
-    plain = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE)
+    motor_kinds = (
+        mujoco.mjtGain.mjGAIN_FIXED,
+        mujoco.mjtBias.mjBIAS_NONE,
+        mujoco.mjtDyn.mjDYN_NONE,
+    )
     gain = float(model.actuator_gainprm[index, 0])
     return (
         gain
-        if kinds == plain and gain != 0.0 and len(actuators_sharing_motor(model, index)) == 1
+        if kinds == motor_kinds and gain != 0.0 and len(actuators_sharing_motor(model, index)) == 1
         else None
     )

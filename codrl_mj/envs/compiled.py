@@ -1,26 +1,26 @@
-"""A whole environment as compiled functions: one step, one reset, for loops that numba compiles.
+"""An environment's step and reset as compiled functions, for loops that numba compiles.
 
-`ActuatedEnv.step` is one call of `step`; an agent's own compiled loop may call the two directly:
+`ActuatedEnv.step` is one call of `step`; a compiled loop of an agent may call both directly:
 
-    parts = compiled_env(env.unwrapped)  # None where this cannot be
+    parts = compiled_env(env.unwrapped)  # None if the environment cannot be compiled
 
     @njit(nogil=True)
-    def episode(step, reset, forces, generator, low, high, observation, where):
-        reset(generator, low, high, where)
+    def episode(step, reset, forces, generator, low, high, observation, pointers):
+        reset(generator, low, high, pointers)
         total, ended = 0.0, False
         while not ended:
             action = ...  # from observation
-            outcome = step(forces[action], where)
+            outcome = step(forces[action], pointers)
             total, ended = total + outcome[0], outcome[1] or not outcome[2]
         return total
 
-    env.reset(seed=0)  # seeds the generator, and makes sure that our callbacks are installed
+    env.reset(seed=0)  # seeds the generator, and installs the package's callbacks
     episode(parts.step, parts.reset, parts.forces, env.unwrapped.np_random, parts.low, parts.high,
-    parts.observation,
-            parts.where)
+            parts.observation, parts.pointers)
 
-What it does is what `env.unwrapped` would do, bit for bit, and it leaves the environment where it
-ends. The time limit is a wrapper's, and the loop's to keep. The environment must outlive the calls.
+The loop computes the same as `env.unwrapped` would, bit for bit, and leaves the environment in its
+last state. The time limit is a wrapper's: the loop must apply it. The environment must stay alive
+during the calls.
 """
 
 import functools
@@ -43,12 +43,12 @@ from codrl_mj.physics.stepping import OBSERVATION, OPTIONS, Stepping, simulation
 
 
 class VectorStep(NamedTuple):
-    """Environment steps of many environments: what each is given, and what it fills."""
+    """Inputs and outputs of one environment step of many environments."""
 
     forces: np.ndarray
     """Desired [N or N*m], shape (N,) or (N, motors)."""
     stepping: np.ndarray
-    """Rows that earn and may end, shape (N,), bool; the others are about to be reset."""
+    """True for environments that step, shape (N,), bool; the others are reset instead."""
     observations: np.ndarray
     """Shape (N, k), float32."""
     rewards: np.ndarray
@@ -64,55 +64,58 @@ class VectorStep(NamedTuple):
     options: np.ndarray
     """As `ResolvedEnv.options`."""
     signals: np.ndarray
-    """The last row of the trace but for its ends, shape (columns, N, motors)."""
+    """Last row of the trace without force and speed, shape (columns, N, motors)."""
 
 
 class Kernels(NamedTuple):
-    """Compiled functions; `where` is that of `codrl_mj.physics.stepping`."""
+    """Compiled functions; `pointers` is the argument of `codrl_mj.physics.stepping`."""
 
     step: Compiled
-    """(force, where) -> (reward, terminated, fine): takes one environment step under a desired
-    force [N or N*m], or several, an array (n,), and fills the observation. `fine` says whether the
-    simulation is still one of numbers; if not, the environment must be reset. What the actuators
-    did is in the trace.
+    """(force, pointers) -> (reward, terminated, is_finite): one environment step.
+
+    The force [N or N*m] is the desired one; an array (n,) for several motors. The observation is
+    filled. If `is_finite` is False, the simulation diverged and the environment must be reset. The
+    actuators' signals are in the trace.
     """
     reset: Compiled
-    """(generator, low, high, where) -> nothing: starts an episode from a state that the numpy
-    `Generator` draws between `low` and `high` (see `Task.bounds`), and fills the observation.
+    """(generator, low, high, pointers) -> nothing: start of an episode.
+
+    The initial state is drawn by the numpy `Generator` between `low` and `high` (see
+    `Task.bounds`); the observation is filled.
     """
     step_rows: Compiled
-    """`step` for every row, by threads that share them; its arguments are (rows, `VectorStep`)."""
+    """`step` for all rows, by several threads; the arguments are (rows, `VectorStep`)."""
     observe_rows: Compiled
-    """(which (m,), lane, rows, observations (N, k)) -> nothing: observes rows where episodes start."""
+    """(indices (m,), lane, rows, observations (N, k)) -> nothing: observe rows after a reset."""
 
 
 class CompiledEnv(NamedTuple):
-    """An environment for compiled loops; see the module's docstring."""
+    """An environment for compiled loops; see the docstring of the module."""
 
     step: Compiled
     """See `Kernels.step`."""
     reset: Compiled
     """See `Kernels.reset`."""
-    where: int
-    """The last argument of both."""
+    pointers: int
+    """Address of the simulation's table of pointers: the last argument of both functions."""
     observation: np.ndarray
-    """What they fill, shape (k,), float32: live, and the environment's own too."""
+    """Observation, shape (k,), float32, that both functions fill; the environment's own array."""
     trace: np.ndarray
-    """What the actuators did in the last step, shape (motors, columns): live; see `codrl_mj.physics.trace_names`."""
+    """Actuators' signals of the last step, live, shape (motors, columns); see `trace_names`."""
     forces: np.ndarray | None
-    """Forces [N or N*m] of the discrete actions; None where the action space is a box."""
+    """Forces [N or N*m] of the discrete actions; None for a box action space."""
     low: np.ndarray
-    """Lower bounds of the initial draws, without reset options."""
+    """Lower bounds of the initial draws, without reset options, shape (n,)."""
     high: np.ndarray
-    """Upper bounds."""
+    """Upper bounds of the initial draws, without reset options, shape (n,)."""
 
 
 def compiled_env(env: Any) -> CompiledEnv | None:
-    """An environment's compiled parts.
+    """Return an environment's compiled parts.
 
     Returns:
-        None where they would not be the whole of it: on physics that are Python, such as the
-        analytic one, and where actuator or model are drawn at resets, which is Python too.
+        None if a part of the environment runs in Python: a physics without compiled steps, such as
+        the analytic one, or an actuator or model that is randomized at resets.
     """
     setup, physics = env.setup, env.physics
     if physics.stepping is None or setup.randomization.distributions:
@@ -120,22 +123,30 @@ def compiled_env(env: Any) -> CompiledEnv | None:
     kernels, task = compiled_kernels(setup, physics), setup.task
     compiled_function(task.initial_state, task.state_names, "Task.state_names", types.float64[::1])
     low, high = setup.initial_bounds
-    parts = kernels.step, kernels.reset, *bound(setup, physics), physics.trace[-1]
+    parts = kernels.step, kernels.reset, *bind_observation(setup, physics), physics.trace[-1]
     return CompiledEnv(*parts, setup.commands.action_forces, low, high)
 
 
-def bound(setup: ResolvedEnv, physics: Any) -> tuple[int, np.ndarray]:
-    """The address of a simulation whose steps are compiled, and the observation that they fill."""
-    _, seen = physics.bound or (None, np.empty(setup.observation_space.shape or (), np.float32))
-    physics.bound = options, seen = setup.options, seen
-    physics.places[OPTIONS], physics.places[OBSERVATION] = options.ctypes.data, seen.ctypes.data
-    return physics.where, seen
+def bind_observation(setup: ResolvedEnv, physics: Any) -> tuple[int, np.ndarray]:
+    """Connect a simulation to its observation array; return the table's address and the array."""
+    _, observation = physics.bound or (
+        None,
+        np.empty(setup.observation_space.shape or (), np.float32),
+    )
+    # Both arrays must stay alive as long as compiled code may use their addresses, so the physics
+    # holds references to them.
+    physics.bound = options, observation = setup.options, observation
+    physics.places[OPTIONS], physics.places[OBSERVATION] = (
+        options.ctypes.data,
+        observation.ctypes.data,
+    )
+    return physics.where, observation
 
 
 def compiled_kernels(setup: ResolvedEnv, physics: Any) -> Kernels:
-    """The functions for environments of one kind, whose simulation's steps are compiled; compiled once a process."""
+    """Return the functions for environments of one kind; they are compiled once per process."""
     task = setup.task
-    sensors = len(setup.plant.family.OBSERVED) if setup.sensors else 0
+    sensors = len(setup.simulation.family.OBSERVED) if setup.sensors else 0
     single, size = len(task.motors) == 1, len(task.state_names)
     sizes = size, len(setup.observation_names), len(setup.config.options)
     return _kernels(
@@ -151,46 +162,48 @@ def _kernels(
     single: bool,
     sensors: int,
     size: int,
-    seen_size: int,
+    observation_size: int,
     options_size: int,
 ) -> Kernels:
-    advance, start, read, observed = stepping
+    advance, start, read, read_sensors = stepping
     observe, rewarded, ended = outcomes.observe, outcomes.reward, outcomes.terminated
     compiled = njit(nogil=True, error_model="numpy")
     initial_entries = internal(initial_state)
 
     @internal
-    def look(row: np.ndarray, state: np.ndarray, where: int) -> None:
-        observation = numba.carray(f32(i64(where)[OBSERVATION]), seen_size)
-        read(state, where)
+    def observe_row(row: np.ndarray, state: np.ndarray, pointers: int) -> None:
+        observation = numba.carray(f32(i64(pointers)[OBSERVATION]), observation_size)
+        read(state, pointers)
         observe(state, observation)
         if sensors > 0:
-            seen = numba.carray(stack_floats(len(row) * sensors), (len(row), sensors))
-            observed(row, seen, where)
-            first = len(observation) - seen.size
+            sensor_values = numba.carray(stack_floats(len(row) * sensors), (len(row), sensors))
+            read_sensors(row, sensor_values, pointers)
+            first = len(observation) - sensor_values.size
             for motor in range(len(row)):
                 for entry in range(sensors):
-                    observation[first + motor * sensors + entry] = seen[motor, entry]
+                    observation[first + motor * sensors + entry] = sensor_values[motor, entry]
 
     @compiled
-    def step(force: Any, where: int) -> tuple[float, bool, bool]:
+    def step(force: Any, pointers: int) -> tuple[float, bool, bool]:
         before, after = (
             numba.carray(stack_floats(size), size),
             numba.carray(stack_floats(size), size),
         )
-        read(before, where)
-        fine = advance(force, where)
-        trace = simulation_at(where)[4]
+        read(before, pointers)
+        is_finite = advance(force, pointers)
+        trace = simulation_at(pointers)[4]
         last = trace[len(trace) - 1]
-        look(last, after, where)
-        own = numba.carray(f64(i64(where)[OPTIONS] + 8 * FIRST_OPTION), options_size)
-        if single:  # decided where it is compiled: one is a number, several are an array
-            return rewarded(before, last[0, 1], after, own), ended(after), fine
-        return rewarded(before, last[:, 1], after, own), ended(after), fine
+        observe_row(last, after, pointers)
+        options = numba.carray(f64(i64(pointers)[OPTIONS] + 8 * FIRST_OPTION), options_size)
+        # The condition is constant at compilation: one motor's force is a number, several are an
+        # array.
+        if single:
+            return rewarded(before, last[0, 1], after, options), ended(after), is_finite
+        return rewarded(before, last[:, 1], after, options), ended(after), is_finite
 
     @compiled
     def reset(
-        generator: np.random.Generator, low: np.ndarray, high: np.ndarray, where: int
+        generator: np.random.Generator, low: np.ndarray, high: np.ndarray, pointers: int
     ) -> None:
         draws, state = np.empty(len(low)), np.empty(size)
         for entry in range(len(low)):
@@ -198,45 +211,50 @@ def _kernels(
         entries = to_floats(initial_entries(draws))
         for entry in range(size):
             state[entry] = entries[entry]
+        # A number is drawn only if a key is needed: otherwise the next episodes would not start in
+        # the states in which Gymnasium's environment starts them with the same seed.
         key = (
-            generator.random() * LARGEST_KEY if f64(i64(where)[OPTIONS])[NEEDS_KEY] != 0.0 else 0.0
+            generator.random() * LARGEST_KEY
+            if f64(i64(pointers)[OPTIONS])[NEEDS_KEY] != 0.0
+            else 0.0
         )
-        start(state, key, where)
-        look(np.zeros(simulation_at(where)[4].shape[1:]), state, where)
+        start(state, key, pointers)
+        observe_row(np.zeros(simulation_at(pointers)[4].shape[1:]), state, pointers)
 
     @internal
-    def step_some(first: int, end: int, lane: Any, rows: Any, steps: Any) -> int:
-        steps, lane, rows, broken = VectorStep(*steps), Lane(*lane), Rows(*rows), 0
+    def step_range(first: int, end: int, lane: Any, rows: Any, steps: Any) -> int:
+        # The batch passes plain tuples; they become named tuples again to be readable.
+        steps, lane, rows, num_diverged = VectorStep(*steps), Lane(*lane), Rows(*rows), 0
         stepping, observations, signals, elapsed = (
             steps.stepping,
             steps.observations,
             steps.signals,
             steps.elapsed,
         )
-        where, last = lane.places.ctypes.data, lane.trace[len(lane.trace) - 1]
+        pointers, last = lane.places.ctypes.data, lane.trace[len(lane.trace) - 1]
         lane.places[OPTIONS] = steps.options.ctypes.data
         for row in range(first, end):
             load(rows, row, lane)
             lane.places[OBSERVATION] = observations[row].ctypes.data
-            reward, over, fine = step(steps.forces[row], where)
+            reward, terminated, is_finite = step(steps.forces[row], pointers)
             store(rows, row, lane)
             elapsed[row] += 1
             steps.rewards[row] = reward if stepping[row] else 0.0
-            steps.terminated[row] = over and stepping[row]
+            steps.terminated[row] = terminated and stepping[row]
             steps.truncated[row] = elapsed[row] >= steps.limit[0] and stepping[row]
-            broken += not fine
+            num_diverged += not is_finite
             for motor in range(len(last)):
                 for column in range(len(signals)):
                     signals[column, row, motor] = last[motor, 1 + column]
-        return broken
+        return num_diverged
 
     @compiled
-    def observe_rows(which: np.ndarray, lane: Any, rows: Any, observations: np.ndarray) -> None:
+    def observe_rows(indices: np.ndarray, lane: Any, rows: Any, observations: np.ndarray) -> None:
         lane, rows = Lane(*lane), Rows(*rows)
-        nothing, state = np.zeros(lane.trace.shape[1:]), np.empty(size)
-        for row in which:
+        no_signals, state = np.zeros(lane.trace.shape[1:]), np.empty(size)
+        for row in indices:
             load(rows, row, lane)
             lane.places[OBSERVATION] = observations[row].ctypes.data
-            look(nothing, state, lane.places.ctypes.data)
+            observe_row(no_signals, state, lane.places.ctypes.data)
 
-    return Kernels(step, reset, shared(step_some), observe_rows)
+    return Kernels(step, reset, shared(step_range), observe_rows)

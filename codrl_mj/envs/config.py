@@ -1,6 +1,7 @@
-"""An environment's arguments, complete: what every face is built from, run folders store and flags are made of.
+"""Complete configuration of an environment; it builds environments and is stored in run folders.
 
-Light to import: nothing is compiled, and no engine loaded.
+The command line makes its flags from it. The module is light: it compiles nothing and loads no
+engine.
 """
 
 import dataclasses
@@ -13,127 +14,132 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, mapping_of, names_together
 from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve
-from codrl_mj.envs.distributions import Distribution, paths_of
-from codrl_mj.envs.worlds import EnvSource, find_world, options_mapping
+from codrl_mj.envs.distributions import Distribution, parse_randomize
+from codrl_mj.envs.sources import EnvSource, find_source, options_mapping
 from codrl_mj.fields import check_joint_dynamics, check_names
 
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig:
-    """An environment but for its rendering, of whatever world; None leaves the world's default.
+    """Settings of an environment, except rendering. None selects the environment's default.
 
     Raises:
-        ValueError: unknown task, actuator or option, a value out of bounds, or a field that the
-            world does not have. What depends on several fields at once is checked when the
+        ValueError: unknown task, actuator or option, a value out of bounds, or a field that this
+            kind of environment does not have. Conditions on several fields are checked when the
             environment is built.
     """
 
     task: str
-    """Task name, such as `cartpole`; the Gymnasium id of an environment of others, such as
-    `HalfCheetah-v5`, for which `package:ID` imports the package first; or `module:NAME` of a task
-    or a world of one's own.
+    """Task name, such as `cartpole`; the Gymnasium id of a third-party environment, such as
+    `HalfCheetah-v5` (`package:ID` imports the package first); or `module:NAME` of a custom task or
+    env source.
     """
     actuator: Any = "default"
-    """What the force goes through: a name (`default`, the task's own: the paper's where there is
-    one; `ideal`, `paper`, `weak`, `weaker`, `open_loop`, or a family's or a motor's), an
-    `ActuatorModel`, a mapping of its fields (with a `name`, over that actuator's), a file of them,
-    `module:NAME`, or None (ideal). With several motors all get it; or it is a mapping of patterns
-    of their names to such, or of a task a list with one for each. Kept as an `ActuatorModel`, as a
-    tuple of a task's several, or as a mapping of the patterns in an environment of others.
+    """Actuator that transmits the force. A name (`default`, the task's own: the paper's if it has
+    one; `ideal`, `paper`, `weak`, `weaker`, `open_loop`, or the name of a family or a motor), an
+    `ActuatorModel`, a mapping of its fields (`name` selects the actuator that they modify), a file
+    with such a mapping, `module:NAME`, or None (ideal). All motors get the same actuator, or a
+    mapping of name patterns to actuators assigns them; for a task also a list with one for each
+    motor. Stored as an `ActuatorModel`, as a tuple for a task with several motors, or as a mapping
+    of patterns for a third-party environment.
     """
     physics: str = "mujoco"
-    """`mujoco`; `analytic`: Gymnasium's own equations, Furuta's closed form; or one's own, as registered."""
+    """`mujoco`; `analytic` (Gymnasium's equations; Furuta: a closed form); or a registered name."""
     integrator: str | None = None
-    """One of the task's integrators (CartPole: `euler` or `semi-implicit`); the default is Gymnasium's."""
+    """One of the task's integrators (CartPole: `euler`, `semi-implicit`); default: Gymnasium's."""
     inner_steps: int | None = None
-    """Integration steps per environment step; the default is the paper's inner loop with a motor
-    and Gymnasium's one without. Furuta: 10.
+    """Integration steps per environment step. The default is the paper's inner loop with a motor,
+    and Gymnasium's single step without one. Furuta: 10.
     """
     timestep: float | None = None
-    """Instead of inner_steps, the integration step [s], which must divide the environment step."""
+    """Integration step [s], instead of inner_steps; it must divide the environment step."""
     action: str = "force"
-    """What the agent commands: the desired `force` (the paper; in an environment of others its own
-    actions), the reference `current`, or the terminal `voltage` past the controller; or what else
-    the actuator's family takes.
+    """Command of the agent: the desired `force` (as in the paper; in a third-party environment its
+    own actions), the reference `current`, the terminal `voltage` without the controller, or another
+    command of the actuator's family.
     """
     levels: tuple[float, ...] | None = None
-    """Discrete tasks that command a current [A] or a voltage [V]: the levels that the actions choose from."""
+    """Levels of current [A] or voltage [V] that the actions of a discrete task choose from."""
     observe_actuator: bool = False
-    """Whether the agent also observes measured and reference current [A], or what else the motors' sensors say."""
+    """True to also observe measured and reference current [A], or the motors' other sensors."""
     max_episode_steps: int | None = None
-    """Time limit [environment steps], >= 1; the default is the environment's own."""
+    """Time limit [environment steps], >= 1; default: the environment's own."""
     allow_unstable: bool = False
     """Build the environment even if the current loop is unstable."""
     disturbances: Disturbances = OFF
-    """Imperfections of the commands' way, and load pulses; each is off at 0."""
+    """Imperfections of the command path, and load pulses; each is off at 0."""
     joint: Joint = PLAIN
-    """What is added to the actuated joints."""
+    """Damping, friction and armature that are added to the actuated joints."""
     joint_dynamics: str | None = None
-    """In an environment of others, damping, armature and frictionloss that its model has where
-    motors bring the same: `keep` adds both, `replace` takes the model's out, for they are the
-    motors' own; None keeps them and warns.
+    """Treatment of damping, armature and frictionloss in a third-party model whose motors add the
+    same: `keep` adds both, `replace` removes the model's, which then come from the motors alone;
+    None keeps them and warns.
     """
     randomize: tuple[str, ...] | None = None
-    """What to draw at every reset, as FIELD=DISTRIBUTION, such as 'motor.inductance=uniform(0.05,
-    0.2)'; distributions are uniform(LOW, HIGH), loguniform(LOW, HIGH) and choice(VALUE, ...).
-    Fields are the actuator's, in an environment of others with the pattern and a colon before it
-    (leg.*:motor.inductance) those of some; and of the model model.mass.BODY, model.length.BODY,
-    model.gravity and model.damping.JOINT. In Python and in files a mapping of fields to
-    distributions will do as well. What was drawn is in the reset's info, `randomization`.
+    """Fields to draw at every reset, as FIELD=DISTRIBUTION, such as
+    'motor.inductance=uniform(0.05, 0.2)'; distributions are uniform(LOW, HIGH), loguniform(LOW,
+    HIGH) and choice(VALUE, ...). Fields are the actuator's (in a third-party environment, a pattern
+    and a colon in front of the field select motors: leg.*:motor.inductance), or the model's:
+    model.mass.BODY, model.length.BODY, model.gravity and model.damping.JOINT. In Python and in
+    files, a mapping of fields to distributions is also accepted. The drawn values are in the
+    reset's info, `randomization`.
     """
     options: Any = None
-    """The task's own options, a mapping (CartPole: `center_radius`, `sutton_barto_reward`), kept as
-    the task's `NamedTuple`; of an environment of others the keyword arguments that make it, such as
-    frame_skip.
+    """Options of the task, a mapping (CartPole: `center_radius`, `sutton_barto_reward`), stored as
+    the task's `NamedTuple`; for a third-party environment the keyword arguments of its constructor,
+    such as frame_skip.
     """
 
     def __post_init__(self) -> None:
-        """Validate, and turn what files and users write into what it stands for, and numpy's values into Python's."""
-        kept = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)}
-        world = find_world(kept["task"])
-        kept |= {"task": world.reference, "joint": resolve(kept["joint"], PLAIN)}
-        kept["disturbances"] = resolve(kept["disturbances"], OFF)
+        """Validate, and convert values from files and numpy to the types of the fields."""
+        values = {
+            field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)
+        }
+        source = find_source(values["task"])
+        values |= {"task": source.reference, "joint": resolve(values["joint"], PLAIN)}
+        values["disturbances"] = resolve(values["disturbances"], OFF)
         for field in dataclasses.fields(self):
-            if field.name not in world.fields and kept[field.name] != field.default:
+            if field.name not in source.fields and values[field.name] != field.default:
                 raise ValueError(
-                    f"{field.name} = {kept[field.name]!r}: {world.name} has none: leave it out"
+                    f"{field.name} = {values[field.name]!r}: {source.name} has none: leave it out"
                 )
-        kept["actuator"] = world.actuators(kept["actuator"])
-        if isinstance(kept["levels"], list | tuple):
-            kept["levels"] = tuple(map(_plain, kept["levels"]))
-        if kept["randomize"] is not None:
-            kept["randomize"] = tuple(
-                f"{path}={one}" for path, one in paths_of(kept["randomize"]).items()
+        values["actuator"] = source.actuators(values["actuator"])
+        if isinstance(values["levels"], list | tuple):
+            values["levels"] = tuple(map(_plain, values["levels"]))
+        if values["randomize"] is not None:
+            values["randomize"] = tuple(
+                f"{path}={distribution}"
+                for path, distribution in parse_randomize(values["randomize"]).items()
             )
-        kept["options"] = world.options(kept["options"])
+        values["options"] = source.options(values["options"])
         for name in ("observe_actuator", "allow_unstable"):
-            if not isinstance(kept[name], bool):
-                raise ValueError(f"{name} = {kept[name]!r}: must be true or false")
-        check_joint_dynamics(kept["joint_dynamics"])
-        limit = kept["max_episode_steps"]
+            if not isinstance(values[name], bool):
+                raise ValueError(f"{name} = {values[name]!r}: must be true or false")
+        check_joint_dynamics(values["joint_dynamics"])
+        limit = values["max_episode_steps"]
         if limit is not None and (
             isinstance(limit, bool) or not isinstance(limit, int) or limit < 1
         ):
             raise ValueError(f"max_episode_steps = {limit!r}: must be an integer >= 1")
-        vars(self).update(kept)
+        vars(self).update(values)
 
     @classmethod
-    def of(cls, task: str, actuator: Any, arguments: Mapping[str, Any]) -> "EnvConfig":
-        """The configuration that the keyword arguments of a face describe.
+    def from_arguments(cls, task: str, actuator: Any, arguments: Mapping[str, Any]) -> "EnvConfig":
+        """Return the configuration that keyword arguments of an environment's class describe.
 
         Args:
-            task: the world's name.
-            actuator: as for the field.
-            arguments: other fields, and the world's own options, one by one or as `options`; a time
-                limit is the face's own matter.
+            task: name of the task or env source.
+            actuator: value of the field of this name.
+            arguments: other fields and the options, each by its name or as `options`; a time limit
+                is not among them, because the caller handles it.
 
         Raises:
-            UnknownOptionError: neither has a name that is given.
+            UnknownOptionError: a name is neither a field nor an option.
             ValueError: as for the class.
         """
-        # An environment of others may have an argument of its own with the name of a field that
-        # only tasks have.
-        names = {*find_world(task).fields} - {"options", "max_episode_steps"}
+        # A third-party environment may have an argument with the name of a field that only tasks
+        # have; it belongs to the options.
+        names = {*find_source(task).fields} - {"options", "max_episode_steps"}
         fields = {name: value for name, value in arguments.items() if name in names}
         options = {
             name: value for name, value in arguments.items() if name not in (*names, "options")
@@ -145,175 +151,181 @@ class EnvConfig:
             **fields,
         )
 
-    def over(self, arguments: Mapping[str, Any]) -> tuple["EnvConfig", dict[str, Any]]:
-        """Set fields and options, given by keyword, over this configuration's; return it and the other arguments."""
-        world, rest = self.world, dict(arguments)
-        fields = {name: rest.pop(name) for name in world.fields if name in rest}
-        if options := {name: rest.pop(name) for name in world.option_names if name in rest}:
-            given = (
+    def override(self, arguments: Mapping[str, Any]) -> tuple["EnvConfig", dict[str, Any]]:
+        """Return a copy with fields and options replaced, and the arguments that are neither."""
+        source, remaining = self.source, dict(arguments)
+        fields = {name: remaining.pop(name) for name in source.fields if name in remaining}
+        if options := {
+            name: remaining.pop(name) for name in source.option_names if name in remaining
+        }:
+            present_options = (
                 options_mapping(fields["options"])
                 if "options" in fields
-                else world.changed(self.options)
+                else source.changed(self.options)
             )
-            fields["options"] = {**given, **options}
-        return dataclasses.replace(self, **fields), rest
+            fields["options"] = {**present_options, **options}
+        return dataclasses.replace(self, **fields), remaining
 
     @property
-    def world(self) -> EnvSource:
-        """What the environment is of."""
-        return find_world(self.task)
+    def source(self) -> EnvSource:
+        """Source of the environment: a task, a Gymnasium id or a custom `EnvSource`."""
+        return find_source(self.task)
 
     @property
-    def driven(self) -> dict[str, ActuatorModel]:
-        """Motor, or pattern of motors, -> actuator."""
-        return self.world.driven(self.actuator)
+    def actuators_by_name(self) -> dict[str, ActuatorModel]:
+        """Name of a motor, or pattern of names, -> actuator."""
+        return self.source.actuators_by_name(self.actuator)
 
     @property
     def actuators(self) -> tuple[ActuatorModel, ...]:
-        """The actuator of each motor, or pattern of motors."""
-        return tuple(self.driven.values())
+        """Actuator of each motor, or of each pattern of motors."""
+        return tuple(self.actuators_by_name.values())
 
     @property
-    def through(self) -> str:
-        """What to call the actuators."""
-        return names_together(self.actuators, self.world.paper)
+    def actuator_label(self) -> str:
+        """Display name of the actuators."""
+        return names_together(self.actuators, self.source.paper)
 
     @property
     def distributions(self) -> dict[str, Distribution]:
-        """What is drawn at every reset, in this order."""
-        return paths_of(self.randomize)
+        """Path -> distribution of the fields that are drawn at every reset, in this order."""
+        return parse_randomize(self.randomize)
 
     @property
     def time_limit(self) -> int | None:
-        """The longest episode [environment steps]; None for any."""
-        return self.max_episode_steps or self.world.time_limit
+        """Maximum length of an episode [environment steps]; None if there is no limit."""
+        return self.max_episode_steps or self.source.time_limit
 
     @property
     def action_space(self) -> "gymnasium.spaces.Space[Any]":
-        """The world's own actions; commands have others of the same kind."""
-        return self.world.action_space(self)
+        """Action space without motors; the space with other commands has the same kind."""
+        return self.source.action_space(self)
 
     @property
     def code(self) -> set[str | Path]:
-        """Modules, by name, and files that decide on what it does: the world's and those of the actuators' families."""
-        return {type(one).__module__ for one in self.actuators} | self.world.code(self.options)
+        """Names of modules, and paths of files, with the code of the environment and actuators."""
+        return {type(actuator).__module__ for actuator in self.actuators} | self.source.code(
+            self.options
+        )
 
     @property
     def policy_fields(self) -> dict[str, Any]:
-        """The fields that say what a policy commands and observes: it can do nothing else once it is trained."""
+        """Fields that a policy depends on: what it commands and observes cannot change later."""
         return {name: getattr(self, name) for name in ("action", "levels", "observe_actuator")}
 
     def as_arguments(self) -> dict[str, Any]:
-        """The keyword arguments for `gymnasium.make` with a task's id, without those that are None or off."""
-        names = [name for name in self.world.fields if name not in ("task", "options")]
+        """Return keyword arguments for `gymnasium.make`, without those that are None or off."""
+        names = [name for name in self.source.fields if name not in ("task", "options")]
         arguments = {name: getattr(self, name) for name in names} | {
             "randomize": self.distributions or None
         }
-        given = {
+        set_arguments = {
             name: value
             for name, value in arguments.items()
             if value is not None and value not in (OFF, PLAIN)
         }
-        return given | self.world.changed(self.options)
+        return set_arguments | self.source.changed(self.options)
 
     def make(self, **view: Any) -> "gymnasium.Env[Any, Any]":
-        """The environment.
+        """Build the environment.
 
         Args:
-            **view: `render_mode`, and what else it takes for its rendering; of a task `width`,
-                `height`, `camera` and `pretty`, as for `codrl_mj.envs.ActuatedEnv`. Or fields and
-                options to set otherwise.
+            **view: `render_mode` and other rendering settings; for a task `width`, `height`,
+                `camera` and `pretty`, as for `codrl_mj.envs.ActuatedEnv`. Fields and options given
+                here replace those of the configuration.
 
         Raises:
-            ValueError: fields do not go with each other, or with the model.
+            ValueError: fields contradict each other, or do not fit the model.
         """
-        config, view = self.over(view)
-        made = config.world.make(config, **view)
-        if not isinstance(made, gymnasium.Env):
-            raise ValueError(
-                f"{config.task}: its `make` returned {made!r}: must be a gymnasium.Env"
-            )
-        return made
+        config, view = self.override(view)
+        env = config.source.make(config, **view)
+        if not isinstance(env, gymnasium.Env):
+            raise ValueError(f"{config.task}: its `make` returned {env!r}: must be a gymnasium.Env")
+        return env
 
     def make_vec(self, num_envs: int = 1, **arguments: Any) -> Any:
-        """Build N environments as one of Gymnasium's vectors; arguments and errors as for `codrl_mj.make_vec`."""
-        # A list is no value of the field: it has an actuator for each environment.
-        each = {
+        """Build N environments as a Gymnasium vector environment; see `codrl_mj.make_vec`."""
+        # A list is not a value of the field: it holds an actuator for each environment.
+        actuators_per_env = {
             name: arguments.pop(name)
             for name in ("actuator",)
             if isinstance(arguments.get(name), list | tuple)
         }
-        config, rest = self.over(arguments)
-        return config.world.vector(config, num_envs, **each, **rest)
+        config, remaining = self.override(arguments)
+        return config.source.vector(config, num_envs, **actuators_per_env, **remaining)
 
     def as_mapping(self) -> dict[str, Any]:
-        """The configuration as JSON-serialisable values; `from_mapping` reads it."""
-        # names of runs are hashes of this, and of those that do not have the field have to stay
-        recent = {"joint_dynamics"} if self.joint_dynamics is None else {*()}
+        """Return the configuration as JSON-serializable values; `from_mapping` reads it."""
+        # Names of runs are hashes of this mapping. A field that was added later is left out at its
+        # default, so that the names of existing runs stay valid.
+        omitted = {"joint_dynamics"} if self.joint_dynamics is None else {*()}
         return {
             **{
-                one.name: getattr(self, one.name)
-                for one in dataclasses.fields(self)
-                if one.name not in recent
+                field.name: getattr(self, field.name)
+                for field in dataclasses.fields(self)
+                if field.name not in omitted
             },
             "actuator": _described(self.actuator),
             "disturbances": dataclasses.asdict(self.disturbances),
             "joint": dataclasses.asdict(self.joint),
-            "options": self.world.changed(self.options),
+            "options": self.source.changed(self.options),
         }
 
     @classmethod
     def from_mapping(cls, mapping: Any, base: "EnvConfig | None" = None) -> "EnvConfig":
-        """The configuration that a mapping describes: `as_mapping`'s, or any part of it.
+        """Return the configuration that a mapping describes: all fields, or some of them.
 
         Args:
-            mapping: the fields; a task's own options may stand among them.
-            base: what is not given is this one's; disturbances, joint and options by their fields.
-                Of a base of another world, the actuator and whatever else has a default of the
-                world's are the world's.
+            mapping: the fields; options of a task may be listed among them.
+            base: configuration with the values of missing fields; disturbances, joint and options
+                are merged field by field. If it has another env source, the actuator and all fields
+                whose default depends on the source are reset.
 
         Raises:
-            ValueError: a key is unknown (the nearest known one is suggested), or a value out of
+            ValueError: a key is unknown (the message suggests the nearest), or a value is out of
                 bounds.
         """
         if not isinstance(mapping, Mapping):
             raise ValueError(f"env = {mapping!r}: must be a mapping of the environment's arguments")
-        given = dict(mapping) if base is None else {"task": base.task, **mapping}
-        if "task" not in given:
+        fields = dict(mapping) if base is None else {"task": base.task, **mapping}
+        if "task" not in fields:
             raise ValueError("it has no task")
-        world = find_world(given["task"])
-        own = world.option_names
+        source = find_source(fields["task"])
+        option_names = source.option_names
         check_names(
-            given, [*(field.name for field in dataclasses.fields(cls)), *own], "key", "env."
+            fields,
+            [*(field.name for field in dataclasses.fields(cls)), *option_names],
+            "key",
+            "env.",
         )
-        if options := {name: given.pop(name) for name in own if name in given}:
-            given["options"] = {**(given.get("options") or {}), **options}
+        if options := {name: fields.pop(name) for name in option_names if name in fields}:
+            fields["options"] = {**(fields.get("options") or {}), **options}
         if base is None:
-            return cls(**given)
-        if world.reference != base.task:
+            return cls(**fields)
+        if source.reference != base.task:
             defaults: dict[str, Any] = {
                 field.name: None for field in dataclasses.fields(cls) if field.default is None
             }
-            defaults |= {"task": given["task"], "actuator": world.default_actuator}
+            defaults |= {"task": fields["task"], "actuator": source.default_actuator}
             base = dataclasses.replace(base, **defaults)
-        there = base.as_mapping()
+        base_values = base.as_mapping()
         for name in ("disturbances", "joint", "options"):
-            if isinstance(given.get(name), Mapping):
-                given[name] = {**there[name], **given[name]}
-        return dataclasses.replace(base, **given)
+            if isinstance(fields.get(name), Mapping):
+                fields[name] = {**base_values[name], **fields[name]}
+        return dataclasses.replace(base, **fields)
 
 
 def _described(actuator: Any) -> Any:
-    """Actuators, as a configuration keeps them, as JSON has them."""
+    """Return actuators in JSON's types."""
     if isinstance(actuator, Mapping):
-        return {pattern: mapping_of(one) for pattern, one in actuator.items()}
+        return {pattern: mapping_of(each_actuator) for pattern, each_actuator in actuator.items()}
     return (
-        [mapping_of(one) for one in actuator]
+        [mapping_of(each_actuator) for each_actuator in actuator]
         if isinstance(actuator, tuple)
         else mapping_of(actuator)
     )
 
 
 def _plain(value: Any) -> Any:
-    """A number or an array of numpy's as Python's own number or list."""
+    """Return numpy's numbers and arrays as Python's numbers and lists."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value

@@ -1,9 +1,9 @@
-"""What can be drawn, and from what: a mapping of paths to distributions, in the order in which they are drawn.
+"""Distributions of randomized fields: a mapping of paths to distributions, in the order of drawing.
 
-A path is `[PATTERN:]FIELD` of actuators (without a pattern, of all) or `model.FIELD`. A
-distribution is a pure function of draws in [0, 1): a draw gives the same value wherever it is made.
-`str` writes it as `parse` reads it, exactly: `uniform(0.05, 0.2)`, `loguniform(0.1, 10.0)`,
-`choice(1, 2)`.
+A path is `[PATTERN:]FIELD` for actuators (all of them if there is no pattern) or `model.FIELD`. A
+distribution is a pure function of draws in [0, 1): the same draw always gives the same value.
+`str` writes a distribution exactly as `parse` reads it: `uniform(0.05, 0.2)`, `loguniform(0.1,
+10.0)`, `choice(1, 2)`.
 """
 
 import dataclasses
@@ -18,77 +18,78 @@ import numpy as np
 from codrl_mj.fields import check_pattern, did_you_mean
 
 MODEL = "model."
-"""What paths of the model's fields begin with."""
+"""Prefix of paths to the model's fields."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Range:
-    """Numbers from `low` to `high`."""
+    """Range of numbers from `low` to `high`."""
 
     low: float
     """Smallest value, in the field's unit."""
     high: float
     """Largest value, >= low."""
 
-    _LEAST: ClassVar[float | None] = None
-    """Bounds are larger."""
+    _LOWER_BOUND: ClassVar[float | None] = None
+    """Exclusive lower bound of `low` and `high`; None if there is none."""
 
     def __post_init__(self) -> None:
         """Validate, and store the bounds as floats."""
-        kind, least = type(self).__name__, self._LEAST
+        kind, lower_bound = type(self).__name__, self._LOWER_BOUND
         for field in ("low", "high"):
             value = getattr(self, field)
-            fine = (
+            is_valid = (
                 isinstance(value, numbers.Real)
                 and not isinstance(value, bool)
                 and math.isfinite(value)
             )
-            if not fine or (least is not None and not value > least):
-                bound = "" if least is None else f" > {least:g}"
+            if not is_valid or (lower_bound is not None and not value > lower_bound):
+                bound = "" if lower_bound is None else f" > {lower_bound:g}"
                 raise ValueError(f"{kind}.{field} = {value!r}: must be a finite number{bound}")
             object.__setattr__(self, field, float(value))
         if not self.low <= self.high:
             raise ValueError(f"{kind}.high = {self.high:g}: must be >= low = {self.low:g}")
 
     def __str__(self) -> str:
-        """As `parse` reads it."""
+        """Return the distribution as text that `parse` reads."""
         return f"{type(self).__name__.lower()}({self.low!r}, {self.high!r})"
 
     @property
     def extremes(self) -> tuple[float, ...]:
-        """Values whose being allowed means that all are."""
+        """Values to check: if a field allows these, it allows all values of the distribution."""
         return self.low, self.high
 
 
 @dataclasses.dataclass(frozen=True)
 class Uniform(_Range):
-    """Every number from `low` to `high` alike.
+    """Uniform distribution of numbers from `low` to `high`.
 
     Raises:
         ValueError: a bound is not a finite number, or high < low.
     """
 
     def transform(self, draws: np.ndarray) -> np.ndarray:
-        """The values low + (high - low) u.
+        """Return the values low + (high - low) u.
 
         Args:
             draws: numbers u in [0, 1), shape (m,), contiguous.
         """
+        # Rounding of the sum could exceed `high` by one unit in the last place.
         return np.minimum(self.low + (self.high - self.low) * draws, self.high)
 
 
 @dataclasses.dataclass(frozen=True)
 class LogUniform(_Range):
-    """Every ratio alike: the logarithm is uniform from that of `low` to that of `high`.
+    """Log-uniform distribution: the logarithm is uniform from log(low) to log(high).
 
     Raises:
         ValueError: a bound is not a finite number > 0, or high < low.
     """
 
-    _LEAST = 0.0
+    _LOWER_BOUND = 0.0
 
     def transform(self, draws: np.ndarray) -> np.ndarray:
-        """The values exp(log(low) + (log(high) - log(low)) u), within the bounds.
+        """Return the values exp(log(low) + (log(high) - log(low)) u), within the bounds.
 
         Args:
             draws: numbers u in [0, 1), shape (m,), contiguous.
@@ -99,39 +100,44 @@ class LogUniform(_Range):
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """One of some values, each as likely as another.
+    """Discrete uniform distribution over a list of values.
 
     Raises:
         ValueError: no values, or one that is not a number.
     """
 
     values: Sequence[float]
-    """The values, in the field's unit; named twice, one is twice as likely."""
+    """The values, in the field's unit; a value that is listed twice is twice as likely."""
 
     def __post_init__(self) -> None:
         """Validate."""
-        given = self.values
+        values = self.values
         if (
-            not isinstance(given, Sequence | np.ndarray)
-            or isinstance(given, str)
-            or len(given) == 0
+            not isinstance(values, Sequence | np.ndarray)
+            or isinstance(values, str)
+            or len(values) == 0
         ):
             raise ValueError(
-                f"Choice.values = {given!r}: must be a sequence of one or more numbers"
+                f"Choice.values = {values!r}: must be a sequence of one or more numbers"
             )
-        for value in given:
+        for value in values:
             if not isinstance(value, numbers.Real | np.bool_) or math.isnan(value):
-                raise ValueError(f"Choice.values = {given!r}: {value!r} must be a number")
-        plain = (value.item() if isinstance(value, np.generic) else value for value in given)
-        kept = (one if isinstance(one, bool | int) else float(one) for one in plain)
-        object.__setattr__(self, "values", tuple(kept))
+                raise ValueError(f"Choice.values = {values!r}: {value!r} must be a number")
+        python_values = (
+            value.item() if isinstance(value, np.generic) else value for value in values
+        )
+        # Integers stay integers, because fields may be counts; a float would be refused there.
+        numbers_as_floats = (
+            number if isinstance(number, bool | int) else float(number) for number in python_values
+        )
+        object.__setattr__(self, "values", tuple(numbers_as_floats))
 
     def __str__(self) -> str:
-        """As `parse` reads it."""
+        """Return the distribution as text that `parse` reads."""
         return f"choice({', '.join(map(repr, self.values))})"
 
     def transform(self, draws: np.ndarray) -> np.ndarray:
-        """The values at floor(n u), as floats.
+        """Return the values at the indices floor(n u), as floats.
 
         Args:
             draws: numbers u in [0, 1), shape (m,).
@@ -141,12 +147,12 @@ class Choice:
 
     @property
     def extremes(self) -> tuple[float, ...]:
-        """Values whose being allowed means that all are."""
+        """Values to check: if a field allows these, it allows all values of the distribution."""
         return tuple(self.values)
 
 
 Distribution = Uniform | LogUniform | Choice
-"""What a field can be drawn from."""
+"""Distributions that a field can be drawn from."""
 
 _FORMS = {
     "uniform": "uniform(LOW, HIGH)",
@@ -156,23 +162,27 @@ _FORMS = {
 
 
 def parse(text: str) -> Distribution:
-    """Read a distribution as `str` writes it; nothing is evaluated.
+    """Read a distribution as `str` writes it; the text is never evaluated as code.
 
     Args:
         text: `uniform(LOW, HIGH)`, `loguniform(LOW, HIGH)` or `choice(VALUE, ...)`. A value is a
             number, `inf`, `True` or `False`; one without point and exponent is an integer.
     """
     match = re.fullmatch(r"\s*(\w+)\s*\(([^()]*)\)\s*", text) if isinstance(text, str) else None
-    *others, last = _FORMS.values()
-    expected = f"{', '.join(others)} or {last}"
+    *other_forms, last_form = _FORMS.values()
+    expected = f"{', '.join(other_forms)} or {last_form}"
     if match is None:
         raise ValueError(f"{text!r} is no distribution: must be {expected}")
-    kind, inside = match.groups()
+    kind, arguments = match.groups()
     if kind not in _FORMS:
         raise ValueError(
             f"{text!r} is no distribution: {did_you_mean(kind, _FORMS)}it must be {expected}"
         )
-    values = [_number(text, word.strip()) for word in inside.split(",")] if inside.strip() else []
+    values = (
+        [_parse_number(text, word.strip()) for word in arguments.split(",")]
+        if arguments.strip()
+        else []
+    )
     if len(values) != 2 and kind != "choice":
         raise ValueError(f"{text!r} has {len(values)} values: must be {_FORMS[kind]}")
     try:
@@ -183,7 +193,8 @@ def parse(text: str) -> Distribution:
         raise ValueError(f"{text!r}: {error}") from None
 
 
-def _number(text: str, word: str) -> bool | int | float:
+def _parse_number(text: str, word: str) -> bool | int | float:
+    """Return the value of one argument in a distribution's text."""
     if word in ("True", "False"):
         return word == "True"
     try:
@@ -193,18 +204,18 @@ def _number(text: str, word: str) -> bool | int | float:
 
 
 def split_path(path: str) -> tuple[str, str]:
-    """Pattern and field of a path; the pattern is empty where there is none."""
+    """Split a path into its pattern, which may be empty, and its field."""
     pattern, _, field = ("", "", path) if path.startswith(MODEL) else path.rpartition(":")
     return pattern, field
 
 
-def paths_of(randomize: Any) -> dict[str, Distribution]:
-    """Path -> distribution, in the order in which they are drawn.
+def parse_randomize(randomize: Any) -> dict[str, Distribution]:
+    """Return path -> distribution, in the order of drawing.
 
     Args:
-        randomize: a mapping of paths to distributions or their text, of patterns to such mappings,
-            or a sequence of 'PATH=DISTRIBUTION'; a path is FIELD, PATTERN:FIELD or model.FIELD.
-            None is for nothing.
+        randomize: a mapping of paths to distributions or their text; or a mapping of patterns to
+            such mappings; or a sequence of 'PATH=DISTRIBUTION'; or None, which randomizes nothing.
+            A path is FIELD, PATTERN:FIELD or model.FIELD.
     """
     if randomize is None:
         return {}
@@ -217,36 +228,38 @@ def paths_of(randomize: Any) -> dict[str, Distribution]:
             f"randomize = {randomize!r}: must be one or more of FIELD=DISTRIBUTION, or a mapping of"
             " fields to these"
         )
-    found: dict[str, Distribution] = {}
-    for path, one in _flat(randomize) if isinstance(randomize, Mapping) else map(_split, randomize):
-        if path in found:
+    distributions: dict[str, Distribution] = {}
+    for path, value in (
+        _flatten(randomize) if isinstance(randomize, Mapping) else map(_split_item, randomize)
+    ):
+        if path in distributions:
             raise ValueError(f"randomize: {path} is named twice: give it one distribution")
         pattern, field = split_path(path)
         try:
             if pattern and field.startswith(MODEL):
                 raise ValueError(f"{field} is the model's, not a motor's: leave {pattern!r} out")
             check_pattern(pattern)
-            found[path] = one if isinstance(one, Distribution) else parse(one)
+            distributions[path] = value if isinstance(value, Distribution) else parse(value)
         except ValueError as error:
             raise ValueError(f"randomize: {path}: {error}") from None
-    return found
+    return distributions
 
 
-def _flat(randomize: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Path and distribution of each, of mappings of patterns the pattern before the field."""
-    for name, one in randomize.items():
+def _flatten(randomize: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield path and distribution, with the pattern in front of the field in nested mappings."""
+    for name, value in randomize.items():
         if (
-            isinstance(one, Mapping)
-            and one
-            and all(isinstance(text, str | Distribution) for text in one.values())
+            isinstance(value, Mapping)
+            and value
+            and all(isinstance(text, str | Distribution) for text in value.values())
         ):
-            yield from ((f"{name}:{field}", text) for field, text in one.items())
+            yield from ((f"{name}:{field}", text) for field, text in value.items())
         else:
-            yield str(name), one
+            yield str(name), value
 
 
-def _split(item: Any) -> tuple[str, str]:
-    """Path and distribution of 'PATH=DISTRIBUTION'; a pattern may hold '=' itself."""
+def _split_item(item: Any) -> tuple[str, str]:
+    """Split 'PATH=DISTRIBUTION' into its two parts; a pattern may itself contain '='."""
     match = re.fullmatch(r"\s*((?:.*:)?[^:=]+?)\s*=(.*)", item) if isinstance(item, str) else None
     if match is None:
         raise ValueError(

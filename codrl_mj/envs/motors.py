@@ -1,4 +1,4 @@
-"""The motors in one simulation of anybody's model: what is asked of them, what is drawn, and what is seen of them."""
+"""The motors in one simulation of any model: their commands, randomization and signals."""
 
 import dataclasses
 import functools
@@ -16,7 +16,7 @@ from codrl_mj.engine.families import USER_HEADER_SIZE, signals_offset
 from codrl_mj.engine.reading import Readout, actuators_sharing_motor, bring_to_rest, motor_slots
 from codrl_mj.engine.specs import match_pattern, matchable_names
 from codrl_mj.envs.commands import ControlCommands, command_of
-from codrl_mj.envs.distributions import paths_of
+from codrl_mj.envs.distributions import parse_randomize
 from codrl_mj.envs.randomization import (
     Randomization,
     RandomizationState,
@@ -26,46 +26,45 @@ from codrl_mj.envs.randomization import (
 from codrl_mj.physics.base import diverged, make_info_reader
 from codrl_mj.physics.variation import without_motors, write_fields
 
-_POSITION = int(
-    mujoco.mjtWarning.mjWARN_BADQPOS
-)  # followed by those of speeds, accelerations and controls
+# MuJoCo's warnings of speeds, accelerations and controls follow that of positions in this order.
+_POSITION = int(mujoco.mjtWarning.mjWARN_BADQPOS)
 
 
 @dataclasses.dataclass(frozen=True)
 class MotorSettings:
-    """What motors an environment of others has, as `codrl_mj.make` takes it."""
+    """Settings of the motors in a third-party environment; the arguments of `codrl_mj.make`."""
 
     actuators: Mapping[str, ActuatorModel]
-    """Pattern -> actuator."""
+    """Pattern of actuators' names -> actuator."""
     action: str = "force"
-    """What actions stand for."""
+    """Command that an action is."""
     observe_actuator: bool = False
-    """Whether observations end with what the motors' sensors say."""
+    """True to append the values of the motors' sensors to observations."""
     randomize: Any = None
-    """What is drawn at every reset."""
+    """Distributions of the fields that are drawn at every reset."""
     disturbances: Disturbances = OFF
-    """Of commands, and load pulses."""
+    """Disturbances of commands, and load pulses."""
     allow_unstable: bool = False
-    """As for `codrl_mj.add_motors`."""
+    """See `codrl_mj.add_motors`."""
     joint_dynamics: str | None = None
-    """Likewise."""
+    """See `codrl_mj.add_motors`."""
 
     @functools.cached_property
     def commands(self) -> dict[str, Command]:
-        """Pattern -> what an action means to its motors."""
+        """Pattern -> command that an action is to its motors."""
         return {
-            pattern: command_of(one, self.action, pattern)
-            for pattern, one in self.actuators.items()
+            pattern: command_of(actuator, self.action, pattern)
+            for pattern, actuator in self.actuators.items()
         }
 
     @property
     def simulated(self) -> dict[str, ActuatorModel]:
-        """Pattern -> what a command leaves of its actuator."""
+        """Pattern -> actuator to simulate; a command may bypass a part of it."""
         return {pattern: command.actuator for pattern, command in self.commands.items()}
 
 
 class ActuatorBank:
-    """The motors in one simulation, of a model that was built with them; every face of others' environments has one."""
+    """The motors in one simulation of a model that was built with them."""
 
     def __init__(
         self,
@@ -74,85 +73,111 @@ class ActuatorBank:
         actions: spaces.Space,
         step_duration: float | None,
     ) -> None:
-        """Find the motors of a simulation, of an environment with these `actions` of its own, and steps so long [s]."""
+        """Find the motors of a simulation.
+
+        Args:
+            data: the simulation.
+            settings: settings of its motors.
+            actions: action space of the environment without motors.
+            step_duration: duration of an environment step [s]; None if unknown.
+        """
         self.data, model = data, data.model
         self.readout = Readout(model)
-        self.present = dict(self.readout.motors)
-        """Those of the present episode, by the index of the actuator in the model."""
+        self.motors = dict(self.readout.motors)
+        """Actuator index in the model -> motor of the present episode."""
         names, forced = matchable_names(model), settings.action == "force"
-        meant = {
-            index: one
-            for pattern, one in settings.commands.items()
+        commands_by_index = {
+            index: command
+            for pattern, command in settings.commands.items()
             for index in match_pattern(pattern, names)
         }
         nominal = {
-            index: meant[index].actuator if index in meant else one
-            for index, one in self.present.items()
+            index: commands_by_index[index].actuator if index in commands_by_index else actuator
+            for index, actuator in self.motors.items()
         }
-        self._slots = list(motor_slots(data, self.present).values())
-        self._warnings = data.warning.number[_POSITION:]  # live
-        asked = {index: None if forced else meant.get(index) for index in self.present}
-        self._commands = ControlCommands(data, actions, asked, settings.disturbances, step_duration)
+        self._slots = list(motor_slots(data, self.motors).values())
+        # A live view: MuJoCo counts its warnings in it.
+        self._warnings = data.warning.number[_POSITION:]
+        motor_commands = {
+            index: None if forced else commands_by_index.get(index) for index in self.motors
+        }
+        self._commands = ControlCommands(
+            data, actions, motor_commands, settings.disturbances, step_duration
+        )
         self.action_space = self._commands.action_space
         self.controls = self._commands.controls
-        """(one of `action_space`) -> the environment's own action, as it arrives."""
-        fixed = [meant[index].fixed if index in meant else {} for index in nominal]
-        distributions, timestep = paths_of(settings.randomize), model.opt.timestep
-        bare = without_motors(model, nominal) if distributions else model
+        """(element of `action_space`) -> the environment's own action, after disturbances."""
+        fixed = [
+            commands_by_index[index].fixed if index in commands_by_index else {}
+            for index in nominal
+        ]
+        distributions, timestep = parse_randomize(settings.randomize), model.opt.timestep
+        bare_model = without_motors(model, nominal) if distributions else model
         randomization = Randomization(
-            distributions, bare, nominal, fixed, timestep, settings.allow_unstable, "the model"
+            distributions,
+            bare_model,
+            nominal,
+            fixed,
+            timestep,
+            settings.allow_unstable,
+            "the model",
         )
         if not settings.allow_unstable:
             check_extremes(randomization, nominal, model)
         self.draws = RandomizationState(
             randomization, [list(nominal.values())], functools.partial(apply_to_simulation, self)
         )
-        drawn = settings.disturbances.random or randomization.random
-        self._random = drawn or any(one.random for one in nominal.values())
-        self.names = motor_names(model, self.present)
-        """What the motors are called."""
-        families: list[Family] = list(map(type, self.present.values()))
+        needs_key = settings.disturbances.random or randomization.random
+        self._random = needs_key or any(actuator.random for actuator in nominal.values())
+        self.names = motor_names(model, self.motors)
+        """Names of the motors, in the model's order."""
+        families: list[Family] = list(map(type, self.motors.values()))
         self.sensors = (
             sensor_names(dict(zip(self.names, families, strict=True)))
             if settings.observe_actuator
             else ()
         )
-        """Names of what `seen` returns, which an observation ends with."""
-        self._parameters = list(map(_parameters, self.present.values()))
+        """Names of the entries of `sensor_values`; empty if they are not observed."""
+        self._parameters = list(map(_parameters, self.motors.values()))
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
-        """Exchange the motors for others of their families; to be followed by a reset."""
-        for index, one in zip(self.present, actuators, strict=True):
-            numbers = (one.arm_radius, *one.numbers)
+        """Exchange the motors for others of their families; a reset must follow."""
+        for index, actuator in zip(self.motors, actuators, strict=True):
+            values = (actuator.arm_radius, *actuator.numbers)
             self.data.model.actuator_user[
-                index, USER_HEADER_SIZE : USER_HEADER_SIZE + len(numbers)
-            ] = numbers
-            self.present[index] = one
+                index, USER_HEADER_SIZE : USER_HEADER_SIZE + len(values)
+            ] = values
+            self.motors[index] = actuator
         self._parameters = list(map(_parameters, actuators))
 
     def set_model(self, fields: Mapping[str, np.ndarray]) -> None:
-        """Change fields of the model, as `Variation.fields` returns them for one simulation, before a reset."""
+        """Write model fields, as `Variation.fields` returns them; a reset must follow."""
         write_fields(self.data.model, fields)
         mujoco.mj_setConst(self.data.model, self.data)
 
     def begin(self, generator: np.random.Generator) -> None:
-        """Bring all to rest after a reset: motors, with keys of their own for noise, and commands on their way."""
-        self.data.warning.number[:] = 0  # not all environments reset all data
-        key = generator.random() * LARGEST_KEY if self._random else 0.0  # a whole number, exactly
-        for at, (slot, motor) in enumerate(zip(self._slots, self.present.values(), strict=True)):
-            bring_to_rest(slot, self.data.time, key + at if motor.random else 0.0)
+        """Bring motors and delayed commands to rest after a reset; draw new keys for noise."""
+        # Not every environment clears the warnings at a reset.
+        self.data.warning.number[:] = 0
+        # The product is exactly an integer: numpy draws multiples of 2**-53, and the largest key
+        # is 2**53.
+        key = generator.random() * LARGEST_KEY if self._random else 0.0
+        for motor_index, (slot, motor) in enumerate(
+            zip(self._slots, self.motors.values(), strict=True)
+        ):
+            bring_to_rest(slot, self.data.time, key + motor_index if motor.random else 0.0)
         self._commands.begin(key)
 
     def signals(self) -> dict[str, Any]:
-        """The motors' signals after the last step, as `info` has them, units as `Readout` has them."""
-        table, alone = self.readout.table(self.data), len(self.present) == 1
-        return make_info_reader(self.readout.names)(table[:, 0].tolist() if alone else table)
+        """Return the motors' signals after the last step, as in `info`; units as in `Readout`."""
+        table, is_single = self.readout.table(self.data), len(self.motors) == 1
+        return make_info_reader(self.readout.names)(table[:, 0].tolist() if is_single else table)
 
-    def seen(self) -> np.ndarray:
-        """What the sensors say now, shape (k,), float64, entries as in `sensors`."""
+    def sensor_values(self) -> np.ndarray:
+        """Return the present values of `sensors`, shape (k,), float64."""
         values: list[float] = []
         for motor, parameters, slot in zip(
-            self.present.values(), self._parameters, self._slots, strict=True
+            self.motors.values(), self._parameters, self._slots, strict=True
         ):
             if motor.OBSERVED:
                 family: Family = type(motor)
@@ -162,71 +187,84 @@ class ActuatorBank:
                 values += motor.observe(parameters, self.data.model.opt.timestep, signals, inputs)
         return np.array(values)
 
-    def check_finite(self, who: str, time: float) -> None:
-        """Raise if the engine met what is no number, or too large a one; it would start anew and go on."""
-        if not np.count_nonzero(self._warnings):  # since the reset; any() takes six times as long
+    def check_finite(self, name: str, time: float) -> None:
+        """Raise if the engine warned of values that are not finite or too large since the reset.
+
+        MuJoCo itself would reset the simulation and continue.
+        """
+        # `any()` takes six times as long on such a short array.
+        if not np.count_nonzero(self._warnings):
             return
         kind, model = _POSITION + int(np.argmax(self._warnings)), self.data.model
-        place = int(self.data.warning.lastinfo[kind])
+        index = int(self.data.warning.lastinfo[kind])
         if kind == mujoco.mjtWarning.mjWARN_BADCTRL:
-            what = f"control {place}"
+            subject = f"control {index}"
         else:
             joint = (
-                np.searchsorted(model.jnt_qposadr, place, "right") - 1
+                np.searchsorted(model.jnt_qposadr, index, "right") - 1
                 if kind == _POSITION
-                else model.dof_jntid[place]
+                else model.dof_jntid[index]
             )
-            of = {_POSITION: "position", _POSITION + 1: "speed"}.get(kind, "acceleration")
-            what = f"the {of} of {model.joint(joint).name or f'joint {joint}'}"
+            quantity = {_POSITION: "position", _POSITION + 1: "speed"}.get(kind, "acceleration")
+            subject = f"the {quantity} of {model.joint(joint).name or f'joint {joint}'}"
         raise diverged(
-            who, time, f"{what} is no number, or too large", f"the model's {model.opt.timestep:g} s"
+            name,
+            time,
+            f"{subject} is not finite, or too large",
+            f"the model's {model.opt.timestep:g} s",
         )
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """What it remembers besides the simulation's state: commands on their way, and draws."""
-        found = {name: memory.copy() for name, memory in self._commands.memory.items()}
-        return found | self.draws.snapshot()
+        """Return the state besides the simulation's: delayed commands, and drawn values."""
+        delayed_commands = {name: memory.copy() for name, memory in self._commands.memory.items()}
+        return delayed_commands | self.draws.snapshot()
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
-        """Bring that back, motors and model too; to be followed by a restoring of the simulation."""
+        """Restore commands, motors and model; the simulation must be restored afterwards."""
         self.draws.restore(snapshot)
         for name, memory in self._commands.memory.items():
             memory[:] = snapshot[name]
 
 
 def motor_names(model: mujoco.MjModel, motors: Iterable[int]) -> tuple[str, ...]:
-    """What motors are called: as their actuators, or else as what these drive; or else by their indices."""
-    every = [own[0] if own else "" for own in matchable_names(model)]
-    own = [
-        name if name and every.count(name) == 1 else str(index) for index, name in enumerate(every)
+    """Return the motors' names: of the actuator or its target, or the index if not unique."""
+    actuator_names = [
+        unique_names[0] if unique_names else "" for unique_names in matchable_names(model)
+    ]
+    unique_names = [
+        name if name and actuator_names.count(name) == 1 else str(index)
+        for index, name in enumerate(actuator_names)
     ]
     return tuple(
-        " & ".join(own[each] for each in actuators_sharing_motor(model, index)) for index in motors
+        " & ".join(unique_names[actuator] for actuator in actuators_sharing_motor(model, index))
+        for index in motors
     )
 
 
 def sensor_names(motors: Mapping[str, Family]) -> tuple[str, ...]:
-    """Names of what the sensors of motors, by theirs, say; a motor without a name needs none. Refused if nothing."""
+    """Return the names of the motors' sensors, with the motor's name in front if it has one.
+
+    Raises:
+        ValueError: the motors have no sensors.
+    """
     sensors = tuple(
         f"{motor}.{name}" if motor else name
-        for motor, one in motors.items()
-        for name in one.OBSERVED
+        for motor, family in motors.items()
+        for name in family.OBSERVED
     )
     if not sensors:
-        kinds = ", ".join(sorted({one.family or one.__name__ for one in motors.values()}))
+        kinds = ", ".join(sorted({family.family or family.__name__ for family in motors.values()}))
         raise ValueError(
-            f"observe_actuator=True: the {kinds} actuator has no current to observe, and nothing"
-            " else; choose another"
+            f"observe_actuator=True: the {kinds} actuator has no current and no other signal to"
+            " observe; choose another actuator"
         )
     return sensors
 
 
-def longer(space: spaces.Space, count: int) -> spaces.Box:
-    """An observation space, which must be of vectors, with some unbounded entries more."""
+def extend_space(space: spaces.Space, count: int) -> spaces.Box:
+    """Return a vector observation space with `count` additional unbounded entries."""
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        raise ValueError(
-            f"observe_actuator=True: observations are {space}, and only to vectors can be appended"
-        )
+        raise ValueError(f"observe_actuator=True: observations are {space}: must be vectors")
     low, high = (
         np.append(bound, np.full(count, value))
         for bound, value in ((space.low, -np.inf), (space.high, np.inf))
@@ -235,5 +273,6 @@ def longer(space: spaces.Space, count: int) -> spaces.Box:
 
 
 def _parameters(motor: ActuatorModel) -> Any:
+    """Return a motor's parameters as the family's named tuple."""
     family: Family = type(motor)
     return parameters_type(family)(*motor.numbers)

@@ -1,4 +1,4 @@
-"""Motors and models drawn at every reset: what is drawn of them, and what present episodes were drawn with."""
+"""Randomization of motors and models at every reset: the distributions, and the drawn values."""
 
 import copy
 import random
@@ -29,15 +29,15 @@ from codrl_mj.fields import did_you_mean
 from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable, write_fields
 
 MAX_CORNERS = 32
-"""Combinations of bounds that are checked: all of five drawn values, and of more so many at random."""
-LIMIT = 1000
-"""Draws of an unstable loop in a row after which a reset gives up."""
+"""Maximum number of combinations of bounds to check: all of five fields, a sample of more."""
+MAX_REDRAWS = 1000
+"""Number of consecutive draws with an unstable loop after which a reset raises."""
 Uniforms = Callable[[np.ndarray, int], np.ndarray]
-"""(simulations (m,), count) -> the next `count` numbers in [0, 1) of each of their generators, shape (m, count)."""
+"""(simulations (m,), count) -> the next `count` draws in [0, 1) of each, shape (m, count)."""
 
 
 class Randomization:
-    """What is drawn at a reset, and what it does to motors and model; never changed once it is made."""
+    """Distributions of a simulation's fields and their effect on motors and model; immutable."""
 
     def __init__(
         self,
@@ -47,13 +47,18 @@ class Randomization:
         fixed: Sequence[Mapping[str, str]],
         timestep: float,
         allow_unstable: bool,
-        whose: str,
+        model_name: str,
     ) -> None:
-        """Check the distributions, drawn in their order, against the fields that they are for.
+        """Check the distributions against the fields that they are for.
 
-        The `model` is without what its `motors`, by the indices of their actuators, add; `fixed`
-        are the fields of each that cannot be drawn, with the reason; motors must be stable at the
-        `timestep` [s] unless `allow_unstable`; messages call the model `whose`.
+        Args:
+            distributions: path -> distribution, in the order of drawing.
+            model: the model without what its motors add to it.
+            motors: actuator index -> motor.
+            fixed: for each motor, fields that cannot be drawn -> reason.
+            timestep: integration step [s] at which drawn motors must be stable.
+            allow_unstable: True to accept unstable motors.
+            model_name: name of the model in messages.
         """
         self.distributions, self.timestep, self.allow_unstable = (
             distributions,
@@ -61,170 +66,202 @@ class Randomization:
             allow_unstable,
         )
         matched, simulated = (
-            _matched(distributions, model, motors, fixed, whose),
+            _match_motors(distributions, model, motors, fixed, model_name),
             list(motors.values()),
         )
-        turned, added = (
+        paths_of_arms, paths_of_additions = (
             [
                 path
-                for path, own in matched.items()
-                if any(_follows(of, simulated[at], path) for at in own)
+                for path, motor_indices in matched.items()
+                if any(
+                    _depends_on(quantity, simulated[motor_index], path)
+                    for motor_index in motor_indices
+                )
             ]
-            for of in (lambda one: one.arm_radius, lambda one: one.additions)
+            for quantity in (
+                lambda actuator: actuator.arm_radius,
+                lambda actuator: actuator.additions,
+            )
         )
-        of_model = [path for path, own in matched.items() if not own]
+        model_only_paths = [path for path, motor_indices in matched.items() if not motor_indices]
         self.types = {
-            path: _kind(type(simulated[own[0]]), path) if own else float
-            for path, own in matched.items()
+            path: _type_of_field(type(simulated[motor_indices[0]]), path)
+            if motor_indices
+            else float
+            for path, motor_indices in matched.items()
         }
-        """Path -> float, int or bool."""
+        """Path -> type of the field: float, int or bool."""
         self.families: list[Family] = list(map(type, simulated))
-        """Of each motor of a simulation."""
+        """Family of each motor of a simulation."""
         self.columns = [
             {
                 column: split_path(path)[1]
-                for column, (path, own) in enumerate(matched.items())
-                if at in own
+                for column, (path, motor_indices) in enumerate(matched.items())
+                if motor_index in motor_indices
             }
-            for at in range(len(simulated))
+            for motor_index in range(len(simulated))
         ]
-        """Of each motor: column of the drawn values -> the field that it is."""
-        self.in_model = (*of_model, *added)
-        """The paths that the model, besides its motors' parameters, depends on."""
+        """For each motor: column of the drawn values -> name of the field."""
+        self.model_paths = (*model_only_paths, *paths_of_additions)
+        """Paths that change the model itself, and not only parameters of its motors."""
         self.variation = (
-            Variation(model, of_model, list(motors), mounting=bool(added))
-            if self.in_model
+            Variation(model, model_only_paths, list(motors), mounting=bool(paths_of_additions))
+            if self.model_paths
             else None
         )
-        """What drawn fields do to the model; None if they do nothing."""
-        self.mounting = bool(turned or added)
-        """Whether motors' arms, or what they add to the model, depend on what is drawn."""
+        """Effect of the drawn fields on the model; None if they have none."""
+        self.changes_mounting = bool(paths_of_arms or paths_of_additions)
+        """True if motors' arms, or what they add to the model, depend on drawn values."""
         self.draws_actuator = any(self.columns)
-        """Whether a field of a motor is drawn, and so its stability must be checked at every draw."""
-        drawn = zip(self.families, self.columns, strict=True)
-        self.random = any({*columns.values()} & {*family.RANDOM} for family, columns in drawn)
-        """Whether motors may need an episode's key of random numbers for what is drawn of them."""
+        """True if a motor's field is drawn, so that each draw must be checked for stability."""
+        drawn_columns = zip(self.families, self.columns, strict=True)
+        self.random = any(
+            {*columns.values()} & {*family.RANDOM} for family, columns in drawn_columns
+        )
+        """True if drawn values may make motors need an episode's key of random numbers."""
 
 
 class RandomizationState:
-    """The drawn values of N simulations, as arrays, and their way into these; a single environment has one.
+    """The drawn values of N simulations, as arrays; a single environment has N = 1.
 
-    Where nothing is drawn, it has nothing to say and nothing to keep.
+    All methods are no-ops if nothing is randomized.
     """
 
     def __init__(
         self,
         randomization: Randomization,
         motors: Sequence[Sequence[ActuatorModel]],
-        put: "Callable[[RandomizationState, np.ndarray], None]",
+        apply_values: "Callable[[RandomizationState, np.ndarray], None]",
     ) -> None:
-        """Begin with nothing drawn for simulations with these nominal motors.
+        """Start without drawn values for simulations with these nominal motors.
 
-        `put` gives some simulations (m,) what they were drawn with, before they are reset or
+        `apply_values` writes the drawn values into some simulations (m,), before they are reset or
         restored.
         """
-        self.randomization, self._put = randomization, put
+        self.randomization, self._apply_values = randomization, apply_values
         self._motors = motors
         self._nominal = [
-            np.array(list(map(field_values, each))) for each in zip(*motors, strict=True)
+            np.array(list(map(field_values, fields))) for fields in zip(*motors, strict=True)
         ]
         """Fields of each motor, shape (N, f), columns as in `field_paths`."""
         self._mounting = mounting_of(motors)
         self._values = np.full((len(motors), len(randomization.distributions)), np.nan)
         self._rejected = np.zeros(len(motors), dtype=np.int64)
 
-    def draw_one(self, generator: np.random.Generator) -> None:
-        """Draw anew for the only simulation."""
+    def draw_single(self, generator: np.random.Generator) -> None:
+        """Draw new values for the only simulation."""
         self.draw(lambda rows, count: generator.random((len(rows), count)), np.zeros(1, dtype=int))
 
     def draw(self, random: Uniforms, rows: np.ndarray) -> None:
-        """Draw anew for the simulations `rows` (m,), which are to be reset afterwards.
+        """Draw new values for the simulations `rows` (m,); they must be reset afterwards.
 
-        Whole sets are redrawn until their motors are stable.
+        A set of values with an unstable motor is drawn again as a whole.
         """
-        drawn = self.randomization
-        if not drawn.distributions:
+        randomization = self.randomization
+        if not randomization.distributions:
             return
         values, rejected = (
-            np.empty((len(rows), len(drawn.distributions))),
+            np.empty((len(rows), len(randomization.distributions))),
             np.zeros(len(rows), dtype=np.int64),
         )
         pending = np.arange(len(rows))
         while len(pending):
-            draws = random(rows[pending], len(drawn.distributions))
-            for column, distribution in enumerate(drawn.distributions.values()):
+            draws = random(rows[pending], len(randomization.distributions))
+            for column, distribution in enumerate(randomization.distributions.values()):
+                # A contiguous copy, because numpy may round strided arrays differently: a draw must
+                # give the same value in any batch.
                 values[pending, column] = distribution.transform(draws[:, column].copy())
-            if drawn.allow_unstable or not drawn.draws_actuator:
+            if randomization.allow_unstable or not randomization.draws_actuator:
                 break
             unstable, fields = (
                 np.zeros(len(pending), dtype=bool),
                 self._fields(rows[pending], values[pending]),
             )
-            for family, columns, each in zip(drawn.families, drawn.columns, fields, strict=True):
+            for family, columns, motor_fields in zip(
+                randomization.families, randomization.columns, fields, strict=True
+            ):
                 if columns:
                     unstable |= ~(
-                        family.instability(numbers_of(family, each), drawn.timestep) < 1.0
+                        family.instability(
+                            parameters_from_fields(family, motor_fields), randomization.timestep
+                        )
+                        < 1.0
                     )
+            # Only simulations whose last set was unstable are drawn again and checked again.
             pending = pending[unstable]
             rejected[pending] += 1
-            if len(pending) and rejected[pending[0]] == LIMIT:
+            if len(pending) and rejected[pending[0]] == MAX_REDRAWS:
                 raise ValueError(
-                    f"randomize: {LIMIT} draws in a row have an unstable current loop at a step of"
-                    f" {drawn.timestep:g} s; the last was"
-                    f" {self._last(rows[pending[:1]], values[pending[:1]])}. Narrow the bounds,"
-                    " shorten the step, or pass allow_unstable=True"
+                    f"randomize: {MAX_REDRAWS} draws in a row have an unstable current loop at a"
+                    f" step of {randomization.timestep:g} s; the last was"
+                    f" {self._describe_last_set(rows[pending[:1]], values[pending[:1]])}. Narrow"
+                    " the bounds, shorten the step, or pass allow_unstable=True"
                 )
         self._values[rows], self._rejected[rows] = values, rejected
-        self._put(self, rows)
+        self._apply_values(self, rows)
 
-    def _last(self, row: np.ndarray, values: np.ndarray) -> str:
-        """What a simulation was drawn with, and what the first refused motor says of itself."""
-        drawn = self.randomization
-        last = str(dict(zip(drawn.distributions, values[0].tolist(), strict=True)))
-        for family, each in zip(drawn.families, self._fields(row, values), strict=True):
+    def _describe_last_set(self, row: np.ndarray, values: np.ndarray) -> str:
+        """Describe a simulation's drawn values, with the error of the first unstable motor."""
+        randomization = self.randomization
+        description = str(dict(zip(randomization.distributions, values[0].tolist(), strict=True)))
+        for family, motor_fields in zip(
+            randomization.families, self._fields(row, values), strict=True
+        ):
             try:
-                family.from_numbers(numbers_of(family, each)[0]).check(drawn.timestep)
+                family.from_numbers(parameters_from_fields(family, motor_fields)[0]).check(
+                    randomization.timestep
+                )
             except ValueError as error:
-                return f"{last}: {error}"
-        return last
+                return f"{description}: {error}"
+        return description
 
     def _fields(self, rows: np.ndarray, values: np.ndarray) -> list[np.ndarray]:
-        """The fields of some simulations' motors, each (m, f), with drawn values (m, k) for theirs; NaN leaves them."""
-        fields, drawn = [each[rows] for each in self._nominal], self.randomization
-        for family, columns, each in zip(drawn.families, drawn.columns, fields, strict=True):
+        """Return the motors' fields (m, f) with drawn values (m, k); NaN leaves a field nominal."""
+        fields, randomization = (
+            [motor_fields[rows] for motor_fields in self._nominal],
+            self.randomization,
+        )
+        for family, columns, motor_fields in zip(
+            randomization.families, randomization.columns, fields, strict=True
+        ):
             for column, field in columns.items():
-                place, new = field_paths(family).index(field), values[:, column]
-                each[:, place] = np.where(np.isnan(new), each[:, place], new)
+                field_index, drawn_values = field_paths(family).index(field), values[:, column]
+                motor_fields[:, field_index] = np.where(
+                    np.isnan(drawn_values), motor_fields[:, field_index], drawn_values
+                )
         return fields
 
     def motors(
         self, row: int = 0, nominal: Sequence[ActuatorModel] | None = None
     ) -> tuple[ActuatorModel, ...]:
-        """What is drawn of a simulation's motors, or of others in their place."""
+        """Return a simulation's motors with drawn values instead of those of `nominal`."""
         nominal, values = self._motors[row] if nominal is None else nominal, self._values[row]
         if not len(values) or np.isnan(values).any():
             return tuple(nominal)
-        changes = (
+        all_changes = (
             {field: float(values[column]) for column, field in columns.items()}
             for columns in self.randomization.columns
         )
-        return tuple(one.replaced(new) for one, new in zip(nominal, changes, strict=True))
+        return tuple(
+            actuator.replaced(changes)
+            for actuator, changes in zip(nominal, all_changes, strict=True)
+        )
 
     def parameters(self, rows: np.ndarray) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-        """Of some simulations' motors: the numbers of each (m, p), arms [m] (m, n), and additions (m, n, 3)."""
+        """Return the motors' parameters, each (m, p), arms [m] (m, n), and additions (m, n, 3)."""
         fields, families = self._fields(rows, self._values[rows]), self.randomization.families
-        arms, additions = (each[rows] for each in self._mounting)
-        if self.randomization.mounting:
-            each = zip(*(one.tolist() for one in fields), strict=True)
+        arms, additions = (array[rows] for array in self._mounting)
+        if self.randomization.changes_mounting:
+            simulations = zip(*(motor_fields.tolist() for motor_fields in fields), strict=True)
             arms, additions = mounting_of(
-                [list(map(from_array, families, values)) for values in each]
+                [list(map(from_array, families, values)) for values in simulations]
             )
-        return list(map(numbers_of, families, fields)), arms, additions
+        return list(map(parameters_from_fields, families, fields)), arms, additions
 
     def model_fields(
         self, rows: np.ndarray, additions: np.ndarray | None = None, shown: bool = False
     ) -> dict[str, np.ndarray]:
-        """The drawn fields of some simulations' models; see `Variation.fields`."""
+        """Return the drawn fields of some simulations' models; see `Variation.fields`."""
         variation = self.randomization.variation
         if variation is None:
             return {}
@@ -234,46 +271,46 @@ class RandomizationState:
         return variation.fields(self._values[np.ix_(rows, columns)], additions, shown)
 
     def report(self, row: int = 0) -> dict[str, Any]:
-        """What `info` says of a simulation's draw: values by field, those of a pattern together; NaN before one."""
-        found: dict[str, Any] = {}
-        for (path, kind), value in zip(
+        """Return a simulation's drawn values for `info`, grouped by pattern; NaN before a reset."""
+        report: dict[str, Any] = {}
+        for (path, field_type), value in zip(
             self.randomization.types.items(), self._values[row], strict=True
         ):
             pattern, field = split_path(path)
-            (found.setdefault(pattern, {}) if pattern else found)[field] = (
-                np.nan if np.isnan(value) else kind(value)
+            (report.setdefault(pattern, {}) if pattern else report)[field] = (
+                np.nan if np.isnan(value) else field_type(value)
             )
-        return found | {"rejected": int(self._rejected[row])} if found else {}
+        return report | {"rejected": int(self._rejected[row])} if report else {}
 
     def infos(self, rows: np.ndarray) -> dict[str, Any]:
-        """The same of a vector environment's simulations, as Gymnasium's vector infos: nested, with masks."""
+        """Return the drawn values as Gymnasium's vector infos: nested, with masks."""
         if not self.randomization.distributions:
             return {}
         mask = np.zeros(len(self._values), dtype=bool)
         mask[rows] = True
         report: dict[str, Any] = {}
-        for name, column in self.present().items():
-            kind = self.randomization.types.get(name, int)
-            report[name] = np.zeros(len(mask), dtype=kind)
+        for name, column in self.drawn_values().items():
+            value_type = self.randomization.types.get(name, int)
+            report[name] = np.zeros(len(mask), dtype=value_type)
             report[name][rows] = column[rows]
             report[f"_{name}"] = mask.copy()
         return {"randomization": report, "_randomization": mask}
 
-    def present(self) -> dict[str, np.ndarray]:
-        """The values in use by path, and the number of rejected sets, each of shape (N,); NaN before a reset."""
+    def drawn_values(self) -> dict[str, np.ndarray]:
+        """Return path -> present values, shape (N,), and the number of rejected sets."""
         columns = dict(zip(self.randomization.distributions, self._values.T.copy(), strict=True))
         return columns | {"rejected": self._rejected.copy()} if columns else {}
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """What `restore` needs."""
-        kept = {"drawn": self._values.copy(), "rejected": self._rejected.copy()}
-        return kept if self.randomization.distributions else {}
+        """Return the state that `restore` needs."""
+        state = {"drawn": self._values.copy(), "rejected": self._rejected.copy()}
+        return state if self.randomization.distributions else {}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
-        """Bring back the values, and the simulations to them; to be followed by a restoring of the simulations."""
+        """Restore the values and apply them; the simulations must be restored afterwards."""
         if self.randomization.distributions:
             self._values[:], self._rejected[:] = snapshot["drawn"], snapshot["rejected"]
-            self._put(self, np.arange(len(self._values)))
+            self._apply_values(self, np.arange(len(self._values)))
 
 
 def check_extremes(
@@ -283,60 +320,63 @@ def check_extremes(
     held: bool = False,
     explicit: bool = False,
 ) -> None:
-    """Refuse draws that can make a loop over a position or a speed unstable, by combinations of their bounds.
+    """Raise if draws could make a position or speed loop unstable, at combinations of their bounds.
 
     Args:
-        randomization: what is drawn.
-        motors: the motors as they are, by the indices of their actuators.
-        model: the model with them; it is not changed.
-        held: as for `check_shafts`.
-        explicit: likewise.
+        randomization: the distributions.
+        motors: actuator index -> nominal motor.
+        model: the model with these motors; it is not changed.
+        held: see `check_shafts`.
+        explicit: see `check_shafts`.
 
     Raises:
-        ValueError: with the values that were tried, and a remedy.
+        ValueError: a combination is unstable; the message has the values and a remedy.
     """
     if not randomization.distributions or not any(
-        one.MOTION or type(one) not in BUILT_IN for one in motors.values()
+        actuator.MOTION or type(actuator) not in BUILT_IN for actuator in motors.values()
     ):
         return
-    draws, model = (
+    state, model = (
         RandomizationState(randomization, [list(motors.values())], lambda *_: None),
         copy.copy(model),
     )
     data, bounds = (
         mujoco.MjData(model),
-        [sorted(one.extremes) for one in randomization.distributions.values()],
+        [sorted(distribution.extremes) for distribution in randomization.distributions.values()],
     )
     count = 2 ** len(bounds)
     for corner in (
         range(count) if count <= MAX_CORNERS else random.Random(0).sample(range(count), MAX_CORNERS)
     ):
-        values = [each[-(corner >> column & 1)] for column, each in enumerate(bounds)]
-        draws._values[0] = values
+        # Bit `column` of `corner` selects the first or the last of the field's values: [0] or [-1].
+        values = [extremes[-(corner >> column & 1)] for column, extremes in enumerate(bounds)]
+        state._values[0] = values
         try:
-            present = dict(zip(motors, draws.motors(), strict=True))
-            for index, one in present.items():
-                one.check(randomization.timestep)
-                if model.actuator_plugin[index] < 0:  # the callback's arm is in the gear
-                    model.actuator_gear[model.actuator_outadr[index], 0] = 1.0 / one.arm_radius
+            actuators = dict(zip(motors, state.motors(), strict=True))
+            for index, actuator in actuators.items():
+                actuator.check(randomization.timestep)
+                # In a model with the control callback, the gear contains the arm.
+                if model.actuator_plugin[index] < 0:
+                    model.actuator_gear[model.actuator_outadr[index], 0] = 1.0 / actuator.arm_radius
         except ValueError:
-            continue  # Such a set is drawn again.
-        write_fields(model, draws.model_fields(np.zeros(1, dtype=int)))
+            # A reset draws such a set again.
+            continue
+        write_fields(model, state.model_fields(np.zeros(1, dtype=int)))
         mujoco.mj_setConst(model, data)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                check_shafts(model, held=held, actuators=present, explicit=explicit)
+                check_shafts(model, held=held, actuators=actuators, explicit=explicit)
         except UnstableError as error:
-            drawn = ", ".join(
+            drawn_values = ", ".join(
                 f"{path} = {value:g}"
                 for path, value in zip(randomization.types, values, strict=True)
             )
-            raise ValueError(f"randomize: {drawn}: {error}; or narrow the bounds") from None
+            raise ValueError(f"randomize: {drawn_values}: {error}; or narrow the bounds") from None
 
 
 def apply_to_simulation(simulation: Any, draws: RandomizationState, rows: np.ndarray) -> None:
-    """Give the only simulation, of a `Physics` or of `ActuatorBank`, what was drawn."""
+    """Write the drawn values into the only simulation of a `Physics` or an `ActuatorBank`."""
     if draws.randomization.draws_actuator:
         simulation.set_actuators(draws.motors())
     if draws.randomization.variation is not None:
@@ -344,98 +384,106 @@ def apply_to_simulation(simulation: Any, draws: RandomizationState, rows: np.nda
 
 
 def apply_to_batch(physics: Any, draws: RandomizationState, rows: np.ndarray) -> None:
-    """Give simulations of a `MujocoBatchPhysics`, whose motors are of one family, what they were drawn with."""
-    numbers, arms, additions = draws.parameters(rows)
+    """Write the drawn values into a `MujocoBatchPhysics`, whose motors are of one family."""
+    parameters, arms, additions = draws.parameters(rows)
     if draws.randomization.draws_actuator:
-        physics.set_parameters(rows, np.stack(numbers, axis=1), arms)
+        physics.set_parameters(rows, np.stack(parameters, axis=1), arms)
     if draws.randomization.variation is not None:
         physics.set_model(rows, draws.model_fields(rows, additions))
 
 
-def numbers_of(family: Family, fields: np.ndarray) -> np.ndarray:
-    """The numbers, shape (m, p), of motors with the given fields (m, f)."""
+def parameters_from_fields(family: Family, fields: np.ndarray) -> np.ndarray:
+    """Return the parameters (m, p) of motors with the given fields (m, f)."""
     paths = field_paths(family)
     return fields[:, [paths.index(path) for path in parameter_paths(family).values()]]
 
 
-def _matched(
+def _match_motors(
     distributions: Mapping[str, Distribution],
     model: mujoco.MjModel,
     motors: Mapping[int, ActuatorModel],
     fixed: Sequence[Mapping[str, str]],
-    whose: str,
+    model_name: str,
 ) -> dict[str, list[int]]:
-    """Path -> which of the motors, in their order, it is drawn of, checked; none if it is the model's."""
-    indices, simulated, varied = (
+    """Return path -> indices of its motors, checked; no indices for a field of the model."""
+    indices, actuators, model_fields = (
         list(motors),
         list(motors.values()),
         variable(model) if distributions else (),
     )
-    names, rubbing = (
+    names, allows_friction = (
         matchable_names(model),
         [mounts_of(model, index)[2] is not None for index in motors],
     )
-    called = [
-        [name for one in actuators_sharing_motor(model, index) for name in names[one]]
+    actuator_names = [
+        [name for actuator in actuators_sharing_motor(model, index) for name in names[actuator]]
         for index in indices
     ]
     matched: dict[str, list[int]] = {}
     for path, distribution in distributions.items():
         pattern, field = split_path(path)
         try:
-            every = list(range(len(indices)))
-            own = (
+            all_motors = list(range(len(indices)))
+            motor_indices = (
                 []
                 if field.startswith(MODEL)
-                else match_pattern(pattern, called)
+                else match_pattern(pattern, actuator_names)
                 if pattern
-                else every
+                else all_motors
             )
-            _check_known(field, [simulated[at] for at in own], varied, whose)
+            _check_known(
+                field,
+                [actuators[motor] for motor in motor_indices],
+                model_fields,
+                model_name,
+            )
             if any(
-                split_path(other)[1] == field and {*own} & {*those}
-                for other, those in matched.items()
+                split_path(other_path)[1] == field and {*motor_indices} & {*other_indices}
+                for other_path, other_indices in matched.items()
             ):
                 raise ValueError("it is drawn by another pattern, too")
-            if not own:
-                _check_factor(field, distribution)
-            for at in own:
-                _check(field, distribution, simulated[at], fixed[at])
-                if not rubbing[at] and _follows(
-                    lambda one: one.additions.friction, simulated[at], field
+            if not motor_indices:
+                _check_model_factor(field, distribution)
+            for motor in motor_indices:
+                _check_motor_field(field, distribution, actuators[motor], fixed[motor])
+                if not allows_friction[motor] and _depends_on(
+                    lambda actuator: actuator.additions.friction, actuators[motor], field
                 ):
                     raise ValueError(
-                        f"{model.actuator(indices[at]).name or f'actuator {indices[at]}'} drives"
-                        " neither a joint nor a tendon, which the friction that is drawn for its"
-                        " motor would need; draw other fields"
+                        f"{model.actuator(indices[motor]).name or f'actuator {indices[motor]}'}"
+                        " drives neither a joint nor a tendon, so its motor cannot have the"
+                        " friction that is drawn; draw other fields"
                     )
         except ValueError as error:
             label = f"[{pattern!r}]" * bool(pattern) + f"[{field!r}]"
             raise ValueError(f"randomize{label} = {distribution}: {error}") from None
-        matched[path] = own
+        matched[path] = motor_indices
     return matched
 
 
 def _check_known(
-    field: str, motors: Sequence[ActuatorModel], varied: Sequence[str], whose: str
+    field: str, motors: Sequence[ActuatorModel], model_fields: Sequence[str], model_name: str
 ) -> None:
-    """Refuse a name that is no field of all these motors, nor of the model."""
+    """Raise if all these motors and the model have no field of this name."""
     families: list[Family] = [
-        DCMotorActuator if isinstance(one, Ideal) else type(one) for one in motors
+        DCMotorActuator if isinstance(actuator, Ideal) else type(actuator) for actuator in motors
     ]
-    of_each = [field_paths(family) for family in families]
+    paths_of_families = [field_paths(family) for family in families]
     known = [
-        path for path in (of_each[0] if of_each else ()) if all(path in paths for paths in of_each)
+        path
+        for path in (paths_of_families[0] if paths_of_families else ())
+        if all(path in paths for paths in paths_of_families)
     ]
-    known += varied
+    known += model_fields
     if field not in known:
         raise ValueError(
-            f"unknown field {field!r}: {did_you_mean(field, known)}{whose} has {', '.join(known)}"
+            f"unknown field {field!r}: {did_you_mean(field, known)}{model_name} has"
+            f" {', '.join(known)}"
         )
 
 
-def _check_factor(field: str, distribution: Distribution) -> None:
-    """Refuse what the model cannot be multiplied by, or have added to it."""
+def _check_model_factor(field: str, distribution: Distribution) -> None:
+    """Raise if a distribution has values that the model's field must not have."""
     low, kind = min(distribution.extremes), field.split(".")[1]
     allowed_zero = kind in ("gravity", "damping")
     if (
@@ -448,48 +496,52 @@ def _check_factor(field: str, distribution: Distribution) -> None:
         )
 
 
-def _check(
+def _check_motor_field(
     field: str, distribution: Distribution, motor: ActuatorModel, fixed: Mapping[str, str]
 ) -> None:
-    """Refuse what cannot be drawn of a motor."""
+    """Raise if a motor's field cannot be drawn from a distribution."""
     if isinstance(motor, Ideal):
         raise ValueError(
             "the ideal actuator has no motor and no controller to draw; choose another actuator"
         )
     if field in fixed:
         raise ValueError(f"{fixed[field]}; draw it with action='force'")
-    kind, words = _kind(type(motor), field), choices_of(type(motor), field)
-    if words:
+    field_type, choices = _type_of_field(type(motor), field), choices_of(type(motor), field)
+    if choices:
         if not isinstance(distribution, Choice) or any(
-            value not in range(len(words)) for value in distribution.values
+            value not in range(len(choices)) for value in distribution.values
         ):
-            numbered = ", ".join(f"{place} for {word}" for place, word in enumerate(words))
+            numbered = ", ".join(f"{index} for {word}" for index, word in enumerate(choices))
             raise ValueError(f"{field} is a word: draw it from a Choice of {numbered}")
-    elif kind is not float:
+    elif field_type is not float:
         if not isinstance(distribution, Choice) or any(
-            type(value) is not kind for value in distribution.values
+            type(value) is not field_type for value in distribution.values
         ):
-            raise ValueError(f"{field} must be drawn from a Choice of {kind.__name__} values")
+            raise ValueError(f"{field} must be drawn from a Choice of {field_type.__name__} values")
     elif any(isinstance(value, bool) for value in distribution.extremes):
         raise ValueError(f"{field} must be a number")
     for value in distribution.extremes:
-        motor.replaced({field: value})  # the field's own bounds
+        # Building the actuator checks the bounds of the field itself.
+        motor.replaced({field: value})
 
 
-def _kind(family: Family, path: str) -> type:
-    """What a field of a family holds: float, int or bool."""
+def _type_of_field(family: Family, path: str) -> type:
+    """Return the type of a family's field: float, int or bool."""
     value: Any = family()
     for part in split_path(path)[1].split("."):
         value = getattr(value, part, None)
     return type(value) if isinstance(value, int) else float
 
 
-def _follows(of: Callable[[ActuatorModel], Any], motor: ActuatorModel, path: str) -> bool:
-    """Whether something of a motor depends on a field: at the motor's values, or where no other field is 0."""
+def _depends_on(quantity: Callable[[ActuatorModel], Any], motor: ActuatorModel, path: str) -> bool:
+    """Return True if a quantity of a motor depends on a field.
+
+    A product with a factor of 0 hides the dependence, so it is also tried with all fields at 2.
+    """
     family: Family = type(motor)
     fields, field = field_paths(family), split_path(path)[1]
     for values in (field_values(motor), (2.0,) * len(fields)):
-        other = [value + (name == field) for name, value in zip(fields, values, strict=True)]
-        if of(from_array(family, values)) != of(from_array(family, other)):
+        changed = [value + (name == field) for name, value in zip(fields, values, strict=True)]
+        if quantity(from_array(family, values)) != quantity(from_array(family, changed)):
             return True
     return False

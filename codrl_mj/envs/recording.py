@@ -1,4 +1,4 @@
-"""Looks at each integration step of anybody's environment: its `recorder`, as our own environments are theirs."""
+"""Recording of every integration step in third-party environments: their `recorder`."""
 
 from typing import Any
 
@@ -6,25 +6,32 @@ import mujoco
 import numpy as np
 
 from codrl_mj.envs.motors import ActuatorBank
-from codrl_mj.envs.setup import alone
+from codrl_mj.envs.setup import unwrap_single
 
 
 class SubstepRecorder:
-    """Sees each integration step of an environment that calls `mujoco.mj_step`; of others the end of their steps.
+    """Records every integration step of an environment that calls `mujoco.mj_step`.
 
-    What it has is what an `ActuatedEnv` has by the same names, states and speeds being the model's.
+    In other environments it records the end of each environment step. Its attributes are named as
+    in `ActuatedEnv`; states and speeds are those of the model.
     """
 
     def __init__(
         self, motors: ActuatorBank, command: str, step_duration: float | None = None
     ) -> None:
-        """Look at their simulation, in which the agent gives a command; steps take that long [s], if it is known."""
+        """Attach to the simulation of the motors.
+
+        Args:
+            motors: the motors.
+            command: the agent's command.
+            step_duration: duration of an environment step [s]; None if unknown.
+        """
         self._motors, self._data, model = motors, motors.data, motors.data.model
         self._rows: list[np.ndarray] = []
-        self._outputs = model.actuator_outadr[list(motors.present)]
+        self._outputs = model.actuator_outadr[list(motors.motors)]
         self._moments = np.empty((model.nout, model.nv))
         self.step_duration = float(step_duration or model.opt.timestep)
-        """Duration of the last environment step [s]; before the first the environment's `dt`, or else the model's."""
+        """Duration of the last environment step [s]; initially `dt`, or the model's time step."""
         self.signal_names, self.trace_names = (
             tuple(motors.signals()),
             (*motors.readout.names, "speed"),
@@ -33,8 +40,8 @@ class SubstepRecorder:
 
     @property
     def actuator(self) -> Any:
-        """What the present episode runs on; with several motors a tuple of them."""
-        return alone(tuple(self._motors.present.values()))
+        """Actuator of the present episode; for several motors a tuple."""
+        return unwrap_single(tuple(self._motors.motors.values()))
 
     @property
     def state(self) -> np.ndarray:
@@ -43,12 +50,13 @@ class SubstepRecorder:
 
     @property
     def trace(self) -> np.ndarray:
-        """What the motors did in each integration step of the last step, shape (n, motors, columns)."""
+        """Signals after each integration step of the last step, shape (n, motors, columns)."""
         return np.array(self._rows)
 
     @property
     def speeds(self) -> np.ndarray:
-        """Speeds of the shafts [m/s or rad/s]; the engine's own are those at the beginning of a step."""
+        """Speeds of the shafts [m/s or rad/s], shape (motors,)."""
+        # MuJoCo's `actuator_velocity` is from the beginning of the integration step.
         data = self._data
         mujoco.mju_sparse2dense(
             self._moments,
@@ -60,34 +68,40 @@ class SubstepRecorder:
         return self._moments[self._outputs] @ data.qvel
 
     def step(self, env: Any, action: Any) -> Any:
-        """Take a step of the environment, and record what it does in it; not in two threads at once."""
-        self._rows, plain, second_half, began = [], mujoco.mj_step, mujoco.mj_step2, self._data.time
+        """Take an environment step and record its integration steps; not thread-safe."""
+        self._rows, original_step, original_step2, start_time = (
+            [],
+            mujoco.mj_step,
+            mujoco.mj_step2,
+            self._data.time,
+        )
 
-        def each(model: mujoco.MjModel, data: mujoco.MjData, nstep: int = 1) -> None:
+        def recording_step(model: mujoco.MjModel, data: mujoco.MjData, nstep: int = 1) -> None:
             if data is not self._data:
-                plain(model, data, nstep)
+                original_step(model, data, nstep)
                 return
             for _ in range(nstep):
-                plain(model, data)
-                self._row()
+                original_step(model, data)
+                self._append_row()
 
-        def halves(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-            second_half(model, data)
+        def recording_step2(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+            original_step2(model, data)
             if data is self._data:
-                self._row()
+                self._append_row()
 
-        # dm_control's physics takes the first of its integration steps by mj_step2 and mj_step1.
-        mujoco.mj_step, mujoco.mj_step2 = each, halves  # type: ignore[assignment]
+        # dm_control's physics takes the first integration step of each environment step as mj_step2
+        # and mj_step1, so recording mj_step alone would miss it.
+        mujoco.mj_step, mujoco.mj_step2 = recording_step, recording_step2  # type: ignore[assignment]
         try:
             outcome = env.step(action)
         finally:
-            mujoco.mj_step, mujoco.mj_step2 = plain, second_half
+            mujoco.mj_step, mujoco.mj_step2 = original_step, original_step2
         if self._rows:
             self.step_duration = len(self._rows) * float(self._data.model.opt.timestep)
         else:
-            self.step_duration = float(self._data.time - began)
-            self._row()
+            self.step_duration = float(self._data.time - start_time)
+            self._append_row()
         return outcome
 
-    def _row(self) -> None:
+    def _append_row(self) -> None:
         self._rows.append(np.column_stack([*self._motors.readout.table(self._data), self.speeds]))

@@ -1,4 +1,4 @@
-"""The vector environments as Stable-Baselines3 knows them."""
+"""Vector environments with the interface of Stable-Baselines3."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -17,57 +17,68 @@ from codrl_mj.physics import Signals
 
 
 class ActuatedVecEnv(VecEnv):
-    """N environments as one Stable-Baselines3 `VecEnv`; batched in MuJoCo, without a Python object for each.
+    """N environments as one Stable-Baselines3 `VecEnv`, stepped as a batch for tasks on MuJoCo.
 
-    Infos are empty but for the environments whose episode ended: `terminal_observation`,
+    An environment's info is empty until its episode ends; then it has `terminal_observation`,
     `TimeLimit.truncated` and `episode` (return, length and time, as Stable-Baselines3's `Monitor`
-    has them). What the actuators did in the last step is in `signals`, as arrays.
+    records them). The actuators' signals of the last step are in `signals`, as arrays.
     """
 
     def __init__(self, env: ActuatedVectorEnv | SerialVectorEnv) -> None:
-        """Wrap a vector environment in `SAME_STEP` mode; refused, and closed, if agents' networks do not take it."""
-        seen, acts, wrong = env.single_observation_space, env.single_action_space, ""
-        if not isinstance(seen, spaces.Box) or len(seen.shape) != 1:
-            wrong = (
-                f"observations are {seen}: must be a vector, which our agents' networks take:"
-                " flatten them with a wrapper of Gymnasium's (FlattenObservation), and register"
-                " that environment"
+        """Wrap a vector environment in `SAME_STEP` mode.
+
+        Raises:
+            ValueError: the agents' networks cannot use its observations or actions; it is closed.
+        """
+        observation_space, action_space, problem = (
+            env.single_observation_space,
+            env.single_action_space,
+            "",
+        )
+        if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
+            problem = (
+                f"observations are {observation_space}: must be a vector, which the agents'"
+                " networks take: flatten them with a wrapper of Gymnasium's (FlattenObservation),"
+                " and register that environment"
             )
-        elif not isinstance(acts, spaces.Box | spaces.Discrete) or getattr(acts, "start", 0) != 0:
-            wrong = (
-                f"actions are {acts}: must be a vector (Box), or a choice (Discrete) that counts"
-                " from 0"
+        elif (
+            not isinstance(action_space, spaces.Box | spaces.Discrete)
+            or getattr(action_space, "start", 0) != 0
+        ):
+            problem = (
+                f"actions are {action_space}: must be a vector (Box), or a choice (Discrete) that"
+                " counts from 0"
             )
         elif env.autoreset_mode != AutoresetMode.SAME_STEP:
-            wrong = (
-                f"autoreset_mode = {env.autoreset_mode.value!r}: must be 'SameStep', as"
-                " Stable-Baselines3 has it"
+            problem = (
+                f"autoreset_mode = {env.autoreset_mode.value!r}: must be 'SameStep', the mode of"
+                " Stable-Baselines3"
             )
-        if wrong:
+        if problem:
             env.close()
-            raise ValueError(wrong)
+            raise ValueError(problem)
         self.env = env
         self.arm_radii: np.ndarray = env.arm_radii
-        """Of the motors of an environment [m], or 1 where a joint is driven directly; shape (motors,)."""
+        """Arms of the motors [m]; 1 for a joint that is driven directly; shape (motors,)."""
         self._actions: np.ndarray | None = None
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, dtype=np.int64)
         self._start = time.time()
-        super().__init__(env.num_envs, seen, acts)
+        super().__init__(env.num_envs, observation_space, action_space)
 
     def reset(self) -> np.ndarray:
-        """Start an episode in every environment, with the seeds and options given since the last reset."""
+        """Start an episode in every environment, with the seeds and options set before."""
         options = self._options[0]
-        if any(one != options for one in self._options):
+        if any(environment_options != options for environment_options in self._options):
             raise ValueError(
                 f"set_options: {self._options}: the environments share them: give one mapping"
             )
         observations, _ = self.env.reset(seed=self._seeds, options=options or None)
-        drawn = self.env.randomization
+        drawn_values = self.env.randomization
         self.reset_infos: list[dict[str, Any]] = [
             (
-                {"randomization": {name: values[row] for name, values in drawn.items()}}
-                if drawn
+                {"randomization": {name: values[row] for name, values in drawn_values.items()}}
+                if drawn_values
                 else {}
             )
             for row in range(self.num_envs)
@@ -79,20 +90,20 @@ class ActuatedVecEnv(VecEnv):
 
     @property
     def signals(self) -> Signals | None:
-        """The actuators' signals of the last step, each an array of shape (N,); None before the first."""
+        """Actuators' signals of the last step, shape (N,) or (N, motors); None before it."""
         return self.env.signals
 
     @property
     def randomization(self) -> dict[str, np.ndarray]:
-        """What the present episodes were drawn with, each an array of shape (N,); empty if nothing is randomised."""
+        """Drawn values of the present episodes, arrays (N,); empty if nothing is randomized."""
         return self.env.randomization
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions of the next step."""
+        """Store the actions of the next step."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:  # type: ignore[override]
-        """Step every environment; those whose episode ends start another at once."""
+        """Step every environment; an environment whose episode ends is reset at once."""
         assert self._actions is not None, "step_async comes first"
         observations, rewards, terminated, truncated, infos = self.env.step(self._actions)
         self._returns += rewards
@@ -107,7 +118,7 @@ class ActuatedVecEnv(VecEnv):
         return observations, rewards.astype(np.float32), ended, outcomes
 
     def _outcome(self, row: int, observation: np.ndarray, truncated: bool) -> dict[str, Any]:
-        """The info of an environment whose episode ended."""
+        """Return the info of an environment whose episode ended."""
         return {
             "terminal_observation": observation,
             "TimeLimit.truncated": truncated,
@@ -121,18 +132,22 @@ class ActuatedVecEnv(VecEnv):
     def conclude(
         self, observation: np.ndarray, total: float, length: int, truncated: bool, signals: Signals
     ) -> tuple[np.ndarray, list[dict[str, Any]]]:
-        """Take the episode of the only environment as run elsewhere, with its last observation (k,) and sum of rewards.
+        """End the episode of the only environment as it was run by compiled code; reset it.
 
-        Its `length` steps have `signals` (length,) each; `truncated` by the time limit, not the
-        task. The next begins.
+        Args:
+            observation: its last observation, shape (k,).
+            total: sum of its rewards.
+            length: number of its steps.
+            truncated: True if the time limit ended it, and not the task.
+            signals: signals of its steps, arrays (length,).
 
         Returns:
             Observations and infos, as the last step would have returned them.
         """
         if self.num_envs != 1:
             raise ValueError(
-                f"num_envs = {self.num_envs}: an episode can be concluded only where it is the"
-                " only one"
+                f"num_envs = {self.num_envs}: an episode can only be concluded if it is the only"
+                " one"
             )
         self._returns[0], self._lengths[0] = total, length
         outcome = self._outcome(0, observation, truncated)
@@ -142,32 +157,34 @@ class ActuatedVecEnv(VecEnv):
         return observations, [outcome]
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on, as plain arrays: environments, episodes' records, pending seeds.
+        """Return the complete state as arrays: environments, episodes' records, pending seeds.
 
-        The wall-clock time in `episode` goes on from where the environment was made.
+        The wall-clock time in `episode` is not part of it.
         """
         return self.env.snapshot() | self._records()
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> np.ndarray | None:
-        """Continue from what `snapshot` returned, bit for bit, in environments made with the same arguments.
+        """Continue from a snapshot, bit for bit, in environments made with the same arguments.
 
         Returns:
-            None; or the first observations (N, k), where the environments could only start an
-            episode anew.
+            None; or the first observations (N, k), if the environments could only start a new
+            episode.
         """
-        own = self._records()
-        check_snapshot(snapshot, self.env.snapshot() | own)
-        begun = self.env.restore(
-            {name: values for name, values in snapshot.items() if name not in own}
+        records = self._records()
+        check_snapshot(snapshot, self.env.snapshot() | records)
+        first_observations = self.env.restore(
+            {name: values for name, values in snapshot.items() if name not in records}
         )
         self._returns[:], self._lengths[:] = snapshot["returns"], snapshot["lengths"]
         self._seeds = [None if seed < 0 else seed for seed in snapshot["seeds"].tolist()]
         self._actions = None
-        if begun is not None:
+        if first_observations is not None:
             self._returns[:], self._lengths[:] = 0.0, 0
-        return begun
+        return first_observations
 
     def _records(self) -> dict[str, np.ndarray]:
+        """Return the entries of a snapshot that this class adds to the environments'."""
+        # Arrays have no None: a seed of -1 is one that was not set.
         seeds = np.array([-1 if seed is None else seed for seed in self._seeds], dtype=np.int64)
         return {"returns": self._returns.copy(), "lengths": self._lengths.copy(), "seeds": seeds}
 
@@ -176,16 +193,16 @@ class ActuatedVecEnv(VecEnv):
         self.env.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """An image of the first environment; nothing of the others."""
+        """Return an image of the first environment, and None for the others."""
         return [self.env.image(), *[None] * (self.num_envs - 1)]
 
     def render(self, mode: str | None = None) -> np.ndarray | None:
-        """An image of the first environment."""
+        """Return an image of the first environment."""
         del mode
         return self.env.image()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The attribute of the vector environment, once for each environment asked for, or else their own."""
+        """Return an attribute for each of the environments; a vector's is shared by all."""
         shared = isinstance(self.env, SerialVectorEnv) and hasattr(self.env, attr_name)
         values = (
             [getattr(self.env, attr_name)] * self.num_envs
@@ -195,7 +212,7 @@ class ActuatedVecEnv(VecEnv):
         return [values[index] for index in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the vector environment, which all share, or else that of each environment."""
+        """Set an attribute of the vector environment, or that of every single environment."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError(
                 f"set_attr({attr_name!r}): the environments share it; it can only be set for all of"
@@ -203,19 +220,19 @@ class ActuatedVecEnv(VecEnv):
             )
         owners: list[Any] = [self.env]
         if isinstance(self.env, SerialVectorEnv) and not hasattr(self.env, attr_name):
-            owners = [one.unwrapped for one in self.env.envs]
+            owners = [env.unwrapped for env in self.env.envs]
         for owner in owners:
             setattr(owner, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the vector environment once; its result stands for each of the environments asked for."""
+        """Call a method of the vector environment once; repeat its result for each environment."""
         result = getattr(self.env, method_name)(*method_args, **method_kwargs)
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Whether the environments record episodes, as `Monitor` does; no other wrapper is there."""
+        """Return True for `Monitor`, whose work this class does; there are no other wrappers."""
         from stable_baselines3.common.monitor import Monitor
 
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
@@ -224,30 +241,30 @@ class ActuatedVecEnv(VecEnv):
 def make_sb3_vec_env(
     env_id: Any, num_envs: int = 64, actuator: Any = None, **arguments: Any
 ) -> ActuatedVecEnv:
-    """Many environments as one Stable-Baselines3 `VecEnv`.
+    """Create a Stable-Baselines3 `VecEnv` of many environments.
 
     Args:
-        env_id: a Gymnasium id, such as `codrl_mj/Pendulum-v0`, or whatever else `EnvConfig.task`
-            takes; an environment's whole configuration; or a function that makes an environment
-            with motors, such as `functools.partial(codrl_mj.make, "Hopper-v5", {".*": "lag"})`.
-        num_envs: how many, >= 1.
-        actuator: as for `codrl_mj.make_vec`. A function's environments have their motors already:
-            leave it out.
-        **arguments: as for `codrl_mj.envs.ActuatedVectorEnv`; the time limit is Gymnasium's unless
-            given. Whatever is no task of ours on `mujoco` is stepped one by one: a
+        env_id: a Gymnasium id, such as `codrl_mj/Pendulum-v0`, or another value of
+            `EnvConfig.task`; an `EnvConfig`; or a function that makes an environment with motors,
+            such as `functools.partial(codrl_mj.make, "Hopper-v5", {".*": "lag"})`.
+        num_envs: number of environments, >= 1.
+        actuator: as for `codrl_mj.make_vec`. Not allowed with a function, whose environments have
+            their motors already.
+        **arguments: as for `codrl_mj.envs.ActuatedVectorEnv`; the default time limit is
+            Gymnasium's. Tasks on `mujoco` are stepped as a batch, all others one by one in a
             `SerialVectorEnv`.
 
     Raises:
-        ValueError: unknown id, or an argument out of bounds; more than memory holds; observations
-            are no vector, or actions neither a vector nor a choice.
+        ValueError: unknown id, or an argument out of bounds; too little memory; or observations or
+            actions that agents cannot use.
     """
-    given = {} if actuator is None else {"actuator": actuator}
+    actuator_argument = {} if actuator is None else {"actuator": actuator}
     if callable(env_id):
-        if given:
+        if actuator_argument:
             raise ValueError(
                 f"actuator = {actuator!r}: the function makes environments that have their motors:"
-                " leave it out, and give functools.partial(codrl_mj.make, ENV, ACTUATOR)"
+                " leave it out, and pass functools.partial(codrl_mj.make, ENV, ACTUATOR)"
             )
         return ActuatedVecEnv(SerialVectorEnv(num_envs, env_id, **arguments))
     config = EnvConfig(env_id) if isinstance(env_id, str) else env_id
-    return ActuatedVecEnv(config.make_vec(num_envs, **given, **arguments))
+    return ActuatedVecEnv(config.make_vec(num_envs, **actuator_argument, **arguments))

@@ -1,4 +1,4 @@
-"""Single environments stepped one by one as one: a `VectorEnv` for whatever cannot be batched."""
+"""Single environments that are stepped one by one: a `VectorEnv` for all that cannot be batched."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 
-from codrl_mj.envs.setup import one_for_each
+from codrl_mj.envs.setup import is_per_environment
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.envs.snapshots import check_snapshot, elapsed_steps, set_elapsed_steps
 from codrl_mj.envs.vector import check_counts
@@ -16,14 +16,15 @@ from codrl_mj.physics import Signals
 
 Array = np.ndarray
 _BOOKKEEPING = ("elapsed", "observations", "ended")
-"""Entries of a snapshot that are not the environments' own."""
+"""Entries of a snapshot that belong to the vector, and not to its environments."""
 
 
 class SerialVectorEnv(SyncVectorEnv[Array, Array]):
-    """Gymnasium's `SyncVectorEnv`, by default in `SAME_STEP` mode, with what Stable-Baselines3's face needs.
+    """Gymnasium's `SyncVectorEnv`, with the attributes that `ActuatedVecEnv` needs.
 
-    Of each it asks for `motors`, `signal_names`, `randomization`, `snapshot` and `restore`, as an
-    `ActuatedEnv` and what `codrl_mj.make` makes have them.
+    The default mode is `SAME_STEP`. Each environment must have `motors`, `signal_names`,
+    `randomization`, `snapshot` and `restore`, as an `ActuatedEnv` and the environments of
+    `codrl_mj.make` have.
     """
 
     def __init__(
@@ -39,16 +40,16 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         """Build the environments.
 
         Args:
-            num_envs: how many, >= 1.
-            task: the task's name; or a function that makes an environment which has its actuators,
-                a picklable one for processes.
-            actuator: as for `ActuatedEnv`; or a sequence of N actuators, one for each environment.
+            num_envs: number of environments, >= 1.
+            task: the task's name; or a function that makes an environment with its actuators, which
+                must be picklable if processes are used.
+            actuator: as for `ActuatedEnv`; or a sequence with one actuator for each environment.
             max_episode_steps: time limit of each environment [steps]; None for none.
-            autoreset_mode: when an environment whose episode ended is reset, as for
+            autoreset_mode: time of the reset of an environment whose episode ended, as for
                 `ActuatedVectorEnv`.
-            num_threads: 0 or 1: there is one thread.
-            **arguments: the other arguments of `ActuatedEnv`, `physics` among them; or the
-                function's.
+            num_threads: 0 or 1; there is only one thread.
+            **arguments: the other arguments of `ActuatedEnv`, such as `physics`; or those of the
+                function.
 
         Raises:
             ValueError: an argument is unknown or out of bounds, or a current loop is unstable; the
@@ -58,30 +59,31 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
         check_counts(num_envs, max_episode_steps, 20_000 if isinstance(task, str) else 200_000)
         if num_threads not in (0, 1):
             raise ValueError(
-                f"num_threads = {num_threads!r}: must be 0 or 1 here: these environments are"
-                " stepped one by one, only tasks on physics='mujoco' as a batch: leave it out"
+                f"num_threads = {num_threads!r}: must be 0 or 1: these environments are stepped one"
+                " by one; only tasks on physics='mujoco' are stepped as a batch: leave it out"
             )
         make: Any = task
-        each = [{} if actuator == "default" else {"actuator": actuator}] * num_envs
+        actuator_arguments = [{} if actuator == "default" else {"actuator": actuator}] * num_envs
         if isinstance(task, str):
             make = functools.partial(ActuatedEnv, task)
-            if one_for_each(actuator, task):
-                each = [{"actuator": one} for one in actuator]
-        if len(each) != num_envs:
+            if is_per_environment(actuator, task):
+                actuator_arguments = [{"actuator": env_actuator} for env_actuator in actuator]
+        if len(actuator_arguments) != num_envs:
             raise ValueError(
-                f"actuator: {len(each)} actuators for {num_envs} environments: there must be one"
-                " for each"
+                f"actuator: got {len(actuator_arguments)} actuators for {num_envs} environments;"
+                " give one for each environment"
             )
-        makers = [
-            functools.partial(_limited, max_episode_steps, make, {**arguments, **one})
-            for one in each
+        env_functions = [
+            functools.partial(_make_env, max_episode_steps, make, {**arguments, **argument})
+            for argument in actuator_arguments
         ]
-        super().__init__(makers, autoreset_mode=AutoresetMode(autoreset_mode))
-        self.signals: Signals | None = (
-            None  # of the last step, each an array of shape (N,) or (N, motors)
-        )
+        super().__init__(env_functions, autoreset_mode=AutoresetMode(autoreset_mode))
+        # Signals of the last step, each an array of shape (N,) or (N, motors).
+        self.signals: Signals | None = None
         self._signal_names = self.get_attr("signal_names")[0]
-        self.arm_radii = np.array([one.arm_radius for one in self.get_attr("motors")[0].values()])
+        self.arm_radii = np.array(
+            [motor.arm_radius for motor in self.get_attr("motors")[0].values()]
+        )
 
     @property
     def task(self) -> Any:
@@ -90,93 +92,113 @@ class SerialVectorEnv(SyncVectorEnv[Array, Array]):
 
     @property
     def randomization(self) -> dict[str, Array]:
-        """What the present episodes were drawn with, fields of several motors as PATTERN:FIELD: each of shape (N,).
+        """Drawn values of the present episodes: path -> array (N,), and the number `rejected`.
 
-        Also how many sets were `rejected`; empty if nothing is drawn.
+        A field that is drawn for some motors has the path PATTERN:FIELD. Empty without draws.
         """
-        drawn = []
-        for one in self.get_attr("randomization"):
+        values_of_envs = []
+        for env_values in self.get_attr("randomization"):
             nested = {
-                name: each if isinstance(each, Mapping) else {"": each}
-                for name, each in one.items()
+                name: field_values if isinstance(field_values, Mapping) else {"": field_values}
+                for name, field_values in env_values.items()
             }
-            drawn.append(
+            values_of_envs.append(
                 {
-                    f"{of}:{name}".rstrip(":"): value
-                    for of, each in nested.items()
-                    for name, value in each.items()
+                    f"{pattern}:{name}".rstrip(":"): value
+                    for pattern, field_values in nested.items()
+                    for name, value in field_values.items()
                 }
             )
-        kinds = {name: np.int64 if name == "rejected" else np.float64 for name in drawn[0]}
-        return {name: np.array([one[name] for one in drawn], kind) for name, kind in kinds.items()}
+        dtypes = {
+            name: np.int64 if name == "rejected" else np.float64 for name in values_of_envs[0]
+        }
+        return {
+            name: np.array([env_values[name] for env_values in values_of_envs], dtype)
+            for name, dtype in dtypes.items()
+        }
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Advance every environment by one step; those whose episode ends start another at once."""
+        """Advance every environment by one step; one whose episode ends is reset at once."""
         observations, rewards, terminated, truncated, infos = super().step(actions)
         ended = terminated | truncated
-        last = infos.get("final_info", infos)  # of those that ended
-        others = last if ended.all() else infos
-        # In NEXT_STEP mode a step may have reset all of them, and tells nothing of motors.
+        # The last infos of episodes that ended are in `final_info`, those of other episodes in the
+        # infos themselves. In NEXT_STEP mode a step may only reset, and return no signals.
+        final_infos = infos.get("final_info", infos)
+        other_infos = final_infos if ended.all() else infos
         self.signals = {
             name: np.where(
-                ended.reshape(-1, *[1] * (last[name].ndim - 1)), last[name], others[name]
+                ended.reshape(-1, *[1] * (final_infos[name].ndim - 1)),
+                final_infos[name],
+                other_infos[name],
             )
             for name in self._signal_names
-            if name in others
+            if name in other_infos
         }
         return observations, rewards, terminated, truncated, infos
 
     def image(self, row: int = 0) -> Array | None:
-        """One environment as an image, shape (height, width, 3), uint8; None if there is no render mode."""
+        """Return an image of one environment, (height, width, 3), uint8; None if not rendered."""
         image: Any = self.envs[row].render()
         return image
 
     def snapshot(self) -> dict[str, Array]:
-        """Everything that the future depends on, as plain arrays: the environments' own, and their bookkeeping."""
-        each = self.call("snapshot")
+        """Return the complete state as arrays: of the environments, and of the vector itself."""
+        snapshots = self.call("snapshot")
         same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
         return {
             **({} if same_step else {"ended": self._autoreset_envs.copy()}),
-            **{name: np.stack([one[name] for one in each]) for name in each[0]},
+            **{
+                name: np.stack([env_snapshot[name] for env_snapshot in snapshots])
+                for name in snapshots[0]
+            },
             "elapsed": np.stack([elapsed_steps(env) for env in self.envs]),
             "observations": self._observations.copy(),
         }
 
     def restore(self, snapshot: Mapping[str, Array]) -> Array | None:
-        """Continue from what `snapshot` returned, bit for bit, in environments made with the same arguments.
+        """Continue from a snapshot, bit for bit, in environments made with the same arguments.
 
         Returns:
-            None; or the first observations (N, k), where the environments could only start an
-            episode anew.
+            None; or the first observations (N, k), if the environments could only start a new
+            episode.
 
         Raises:
             ValueError: the snapshot is of another number of environments, another task or other
                 arguments.
         """
-        if self._env_obs[0] is None:  # Gymnasium's wrappers insist on a reset
+        # Gymnasium's wrappers refuse to be used before a first reset.
+        if self._env_obs[0] is None:
             self.reset()
         check_snapshot(snapshot, self.snapshot())
-        own = {name: values for name, values in snapshot.items() if name not in _BOOKKEEPING}
-        begun = [
-            env.get_wrapper_attr("restore")({name: values[row] for name, values in own.items()})
+        env_entries = {
+            name: values for name, values in snapshot.items() if name not in _BOOKKEEPING
+        }
+        first_observations = [
+            env.get_wrapper_attr("restore")(
+                {name: values[row] for name, values in env_entries.items()}
+            )
             for row, env in enumerate(self.envs)
         ]
-        self.signals = None  # of a step that was not this one's past
+        # The signals belong to a step that is not in the restored episode's past.
+        self.signals = None
         self._autoreset_envs[:] = snapshot.get("ended", False)
-        if begun[0] is not None:
-            self._keep(np.stack(begun))
+        if first_observations[0] is not None:
+            self._set_observations(np.stack(first_observations))
             return self._observations.copy()
         for env, elapsed in zip(self.envs, snapshot["elapsed"], strict=True):
             set_elapsed_steps(env, elapsed)
-        self._keep(snapshot["observations"])
+        self._set_observations(snapshot["observations"])
         return None
 
-    def _keep(self, observations: Array) -> None:
+    def _set_observations(self, observations: Array) -> None:
+        """Write the observations into both attributes in which `SyncVectorEnv` stores them."""
         self._observations[:] = observations
         self._env_obs = list(observations.copy())
 
 
-def _limited(limit: int | None, make: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-    """One environment, with a time limit [steps] if one is given."""
+def _make_env(
+    max_episode_steps: int | None, make: Callable[..., Any], arguments: Mapping[str, Any]
+) -> Any:
+    """Make one environment, with a time limit [steps] if there is one."""
     env = make(**arguments)
-    return env if limit is None else TimeLimit(env, int(limit))
+    return env if max_episode_steps is None else TimeLimit(env, int(max_episode_steps))

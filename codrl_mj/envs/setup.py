@@ -1,4 +1,4 @@
-"""A task made ready: all that follows from an environment's configuration, in one place. Shared by every face."""
+"""Everything derived from an `EnvConfig`; shared by all environment classes."""
 
 import dataclasses
 import functools
@@ -14,7 +14,7 @@ from codrl_mj.disturbances import check_delay
 from codrl_mj.engine.reading import check_shafts
 from codrl_mj.envs.commands import TaskCommands
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.motors import longer, sensor_names
+from codrl_mj.envs.motors import extend_space, sensor_names
 from codrl_mj.envs.randomization import Randomization, check_extremes
 from codrl_mj.physics import PHYSICS, Physics, Signals, SimulationConfig, trace_names
 from codrl_mj.physics.base import make_info_reader
@@ -25,108 +25,117 @@ from codrl_mj.tasks import Task, find_task
 from codrl_mj.user_code import look_up
 
 NEEDS_KEY, FIRST_OPTION = 0, 1
-"""In `ResolvedEnv.options`: whether an episode needs a key, and the first of the task's options."""
+"""Indices in `ResolvedEnv.options`: if an episode needs a key, and the task's first option."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ResolvedEnv:
-    """An environment of a task as its configuration says; made by `build`.
+    """Environment of a task with its resolved configuration; `build` makes it.
 
-    It holds nothing twice: what follows from the fields is computed where it is first asked for.
-    With another task, of which attributes were written, all of it is that task's.
+    Derived quantities are computed from the fields on first use. `dataclasses.replace` with another
+    task, for example with written attributes, therefore updates all of them.
     """
 
     config: EnvConfig
-    """What was asked for."""
+    """Configuration that the user gave."""
     task: Task
-    """The task."""
+    """Task with its present attributes."""
     inner_steps: int
     """Integration steps per environment step."""
 
     @classmethod
     def build(cls, config: EnvConfig) -> "ResolvedEnv":
-        """The set-up of a configuration, checked for what its fields do not show one by one."""
+        """Resolve a configuration; raise if its fields contradict each other."""
         task = find_task(config.task)
-        made = cls(
+        setup = cls(
             config,
             task,
             task.num_inner_steps(config.actuators[0], config.inner_steps, config.timestep),
         )
-        made._check()
-        return made
+        setup._check()
+        return setup
 
     def _check(self) -> None:
-        """Refuse what does not go together: with each other, with the step, with what the motors move."""
-        plant, unstable = self.plant, self.config.allow_unstable
+        """Raise if fields contradict each other, the step, or the mechanics that motors move."""
+        simulation, allow_unstable = self.simulation, self.config.allow_unstable
         check_delay(self.config.disturbances, self.task.step_duration, self.config.time_limit)
-        _ = self.sensors  # which are refused where there is nothing to observe
-        if not self.randomization.draws_actuator:  # else every draw is checked
-            for one in plant.actuators:
-                one.check_at(plant.timestep, unstable)
-        if any(one.closes_loops for one in plant.actuators):
-            model, held, explicit = (
-                task_model(plant),
+        # The property raises if there is nothing to observe.
+        _ = self.sensors
+        # A randomized actuator is checked at every draw instead.
+        if not self.randomization.draws_actuator:
+            for actuator in simulation.actuators:
+                actuator.check_at(simulation.timestep, allow_unstable)
+        if any(actuator.closes_loops for actuator in simulation.actuators):
+            model, is_analytic, is_explicit = (
+                task_model(simulation),
                 self.config.physics == "analytic",
-                plant.integrator == "euler",
+                simulation.integrator == "euler",
             )
             motors = {
-                model.actuator(name).id: one
-                for name, one in zip(self.task.motors, plant.actuators, strict=True)
+                model.actuator(name).id: actuator
+                for name, actuator in zip(self.task.motors, simulation.actuators, strict=True)
             }
-            check_shafts(model, unstable, held, motors, explicit)
-            if not unstable:
-                check_extremes(self.randomization, motors, model, held, explicit)
+            check_shafts(model, allow_unstable, is_analytic, motors, is_explicit)
+            if not allow_unstable:
+                check_extremes(self.randomization, motors, model, is_analytic, is_explicit)
 
     @functools.cached_property
     def commands(self) -> TaskCommands:
-        """What actions stand for."""
+        """Conversion from actions to forces."""
         return TaskCommands(
             self.task, self.config.actuators, self.config.action, self.config.levels
         )
 
     @functools.cached_property
-    def plant(self) -> SimulationConfig:
-        """What is simulated."""
+    def simulation(self) -> SimulationConfig:
+        """Settings of the simulation."""
         integrator, commands = self.task.integrator(self.config.integrator), self.commands
-        between = commands.max_forces, self.config.disturbances, self.config.joint, commands.holds
+        forces_and_disturbances = (
+            commands.max_forces,
+            self.config.disturbances,
+            self.config.joint,
+            commands.holds,
+        )
         return SimulationConfig(
-            self.task, commands.simulated, self.inner_steps, integrator, *between
+            self.task, commands.simulated, self.inner_steps, integrator, *forces_and_disturbances
         )
 
     @functools.cached_property
     def randomization(self) -> Randomization:
-        """What is drawn at every reset."""
-        plant, config = self.plant, self.config
-        bare = bare_model(self.task.name, config.joint)
+        """Distributions of the fields that are drawn at every reset."""
+        simulation, config = self.simulation, self.config
+        model = bare_model(self.task.name, config.joint)
         motors = {
-            bare.actuator(name).id: one
-            for name, one in zip(self.task.motors, plant.actuators, strict=True)
+            model.actuator(name).id: actuator
+            for name, actuator in zip(self.task.motors, simulation.actuators, strict=True)
         }
         fixed = [self.commands.fixed] * len(motors)
         return Randomization(
             config.distributions,
-            bare,
+            model,
             motors,
             fixed,
-            plant.timestep,
+            simulation.timestep,
             config.allow_unstable,
             self.task.name,
         )
 
-    # -- simulations -----------------------------------------------------------------------------------------
+    # -- simulations ---------------------------------------------------------------------
 
     def simulate(self) -> Physics:
-        """A new simulation."""
-        physics = self.config.physics
-        made: Physics = look_up(physics, PHYSICS, "physics", anybodys=False)(self.plant)
-        if made.scene is None and self.randomization.variation is not None:
-            names = ", ".join(self.randomization.in_model)
+        """Create a simulation."""
+        physics_name = self.config.physics
+        physics: Physics = look_up(physics_name, PHYSICS, "physics", allow_user_code=False)(
+            self.simulation
+        )
+        if physics.scene is None and self.randomization.variation is not None:
+            names = ", ".join(self.randomization.model_paths)
             raise ValueError(
-                f"physics = {physics!r}: cannot draw {names}: Gymnasium's environments share no"
-                " names for masses, lengths and gravity, and have no damping, friction and rotors;"
-                " use physics='mujoco'"
+                f"physics = {physics_name!r}: cannot draw {names}: Gymnasium's environments have no"
+                " common names for masses, lengths and gravity, and no damping, friction and"
+                " rotors; use physics='mujoco'"
             )
-        return made
+        return physics
 
     @functools.cached_property
     def initial_bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -135,47 +144,46 @@ class ResolvedEnv:
 
     @functools.cached_property
     def options(self) -> np.ndarray:
-        """What compiled code reads: whether episodes need keys, and the task's options."""
+        """Values that compiled code reads: if episodes need keys, and the task's options."""
         return np.array([self.random, *self.config.options], dtype=np.float64)
 
     @functools.cached_property
     def random(self) -> bool:
-        """Whether an episode's disturbances or sensors need a key."""
-        drawn = self.config.disturbances.random or self.randomization.random
-        return drawn or any(one.random for one in self.plant.actuators)
+        """True if an episode's disturbances or sensors need a key of random numbers."""
+        needs_key = self.config.disturbances.random or self.randomization.random
+        return needs_key or any(actuator.random for actuator in self.simulation.actuators)
 
     def keys(self, random: Callable[[int], np.ndarray]) -> np.ndarray:
-        """Keys of the random numbers of m episodes' disturbances and sensors, shape (m,); one 0 where none is needed.
+        """Return keys for the random numbers of m episodes, shape (m,); a single 0 if not needed.
 
-        They come of `random`: (count) -> numbers uniform in [0, 1), shape (m, count).
+        Disturbances and sensors use the keys. `random` is (count) -> draws in [0, 1), (m, count).
         """
         if not self.random:
             return np.zeros(1)
-        return (
-            random(1)[:, 0] * LARGEST_KEY
-        )  # a multiple of 2**-53 times 2**53: a whole number, exactly
+        # The product is exactly an integer: draws are multiples of 2**-53, the factor is 2**53.
+        return random(1)[:, 0] * LARGEST_KEY
 
-    # -- what the agent gets of them -------------------------------------------------------------------------
+    # -- observations and rewards of the agent --------------------------------------------
 
     @functools.cached_property
     def sensors(self) -> tuple[str, ...]:
-        """Names of what the actuators' sensors add to an observation; none if they are not observed."""
+        """Names of the sensor values that observations end with; empty if they are not observed."""
         names = self.task.motors if len(self.task.motors) > 1 else ("",)
         return (
-            sensor_names(dict.fromkeys(names, self.plant.family))
+            sensor_names(dict.fromkeys(names, self.simulation.family))
             if self.config.observe_actuator
             else ()
         )
 
     @property
     def observation_space(self) -> spaces.Box:
-        """The task's observation space, with unbounded entries for the sensors."""
+        """Observation space of the task, with unbounded entries for the sensors."""
         space = self.task.observation_space
-        return longer(space, len(self.sensors)) if self.sensors else space
+        return extend_space(space, len(self.sensors)) if self.sensors else space
 
     @property
     def observation_names(self) -> tuple[str, ...]:
-        """Names of the observation's entries."""
+        """Names of the observation's entries, in order."""
         return (*self.task.observation_names, *self.sensors)
 
     @functools.cached_property
@@ -184,7 +192,7 @@ class ResolvedEnv:
         return compiled_outcomes(self.task), np.array(self.config.options, dtype=np.float64)
 
     def observation(self, physics: Physics, row: np.ndarray | None = None) -> np.ndarray:
-        """What the agent sees of a simulation, shape (k,), float32, after the last `row` of its trace, if any."""
+        """Return a simulation's observation (k,), float32; `row` is the last row of its trace."""
         size = len(self.task.observation_names)
         observation = np.empty(size + len(self.sensors), np.float32)
         self._outcomes[0].observe(np.ascontiguousarray(physics.state), observation)
@@ -194,7 +202,7 @@ class ResolvedEnv:
         return observation
 
     def outcome(self, before: np.ndarray, force: Any, after: np.ndarray) -> tuple[float, bool]:
-        """The reward of a step from one state to another under a force [N or N*m], or several; whether that ends it."""
+        """Return reward and termination of a step between two states under forces [N or N*m]."""
         outcomes, options = self._outcomes
         before, after = np.ascontiguousarray(before), np.ascontiguousarray(after)
         forces = np.ascontiguousarray(force, dtype=np.float64).reshape(-1)
@@ -202,67 +210,70 @@ class ResolvedEnv:
         return float(reward), bool(outcomes.terminated(after))
 
     @functools.cached_property
-    def _named(self) -> Callable[[Any], Signals]:
-        return make_info_reader(trace_names(self.plant.family)[:-1])
+    def _read_info(self) -> Callable[[Any], Signals]:
+        """Reader of the trace's columns by their names."""
+        return make_info_reader(trace_names(self.simulation.family)[:-1])
 
     def __getstate__(self) -> dict[str, Any]:
-        return {
-            name: value for name, value in self.__dict__.items() if name != "_named"
-        }  # which nothing pickles
+        # The reader is a local closure and cannot be pickled; it is rebuilt on demand.
+        return {name: value for name, value in self.__dict__.items() if name != "_read_info"}
 
     def signals(self, columns: Sequence[Any] | np.ndarray, desired: Any) -> Signals:
-        """A trace's columns, numbers or arrays, as signals: the force [N or N*m] that the agent `desired` is theirs.
+        """Name a trace's columns, numbers or arrays, and add the `desired` force [N or N*m].
 
-        Where an actuator tracks no force, what was delivered counts as desired.
+        If the actuator does not follow a force command, `desired_force` is the delivered force.
         """
-        signals = self._named(columns)
-        signals["desired_force"] = desired if self.commands.tracks else signals["actual_force"]
+        signals = self._read_info(columns)
+        signals["desired_force"] = (
+            desired if self.commands.is_torque_controlled else signals["actual_force"]
+        )
         return signals
 
 
-def alone(several: Sequence[Any]) -> Any:
-    """The only one of several, or all of them as a tuple."""
-    return several[0] if len(several) == 1 else tuple(several)
+def unwrap_single(values: Sequence[Any]) -> Any:
+    """Return the only element of a sequence, or the whole sequence as a tuple."""
+    return values[0] if len(values) == 1 else tuple(values)
 
 
-def one_for_each(actuator: Any, task: str) -> bool:
-    """Whether it is a sequence of what each environment gets, and not what all get: such as one for each motor."""
-    listed = isinstance(actuator, Sequence) and not isinstance(actuator, str)
-    return listed and (
-        len(find_task(task).motors) == 1 or all(isinstance(one, list | tuple) for one in actuator)
+def is_per_environment(actuator: Any, task: str) -> bool:
+    """Return True if `actuator` lists one for each environment, and not one for each motor."""
+    is_listed = isinstance(actuator, Sequence) and not isinstance(actuator, str)
+    return is_listed and (
+        len(find_task(task).motors) == 1
+        or all(isinstance(env_actuator, list | tuple) for env_actuator in actuator)
     )
 
 
 def set_up_many(
     num_envs: int, task: str, actuator: Any, arguments: Mapping[str, Any]
 ) -> tuple[ResolvedEnv, list[tuple[ActuatorModel, ...]]]:
-    """The set-up that many environments share, and the actuators to simulate, a tuple for each environment."""
-    if not one_for_each(actuator, task):
-        setup = ResolvedEnv.build(EnvConfig.of(task, actuator, arguments))
+    """Return the configuration that many environments share, and the actuators of each of them."""
+    if not is_per_environment(actuator, task):
+        setup = ResolvedEnv.build(EnvConfig.from_arguments(task, actuator, arguments))
         return setup, [setup.commands.simulated] * num_envs
     if len(actuator) != num_envs:
         raise ValueError(
-            f"actuator: {len(actuator)} actuators for {num_envs} environments: there must be one"
-            " for each"
+            f"actuator: got {len(actuator)} actuators for {num_envs} environments; give one for"
+            " each environment"
         )
     if arguments.get("action", "force") != "force":
         raise ValueError(
-            f"action = {arguments['action']!r}: with an actuator for each environment only 'force'"
+            f"action = {arguments['action']!r}: must be 'force' with one actuator per environment"
         )
     setups: dict[Any, ResolvedEnv] = {}
-    every: list[tuple[ActuatorModel, ...]] = []
-    for index, one in enumerate(actuator):
+    actuators: list[tuple[ActuatorModel, ...]] = []
+    for index, env_actuator in enumerate(actuator):
         try:
-            config = EnvConfig.of(task, one, arguments)
-            every.append(config.actuators)
-            if every[-1] not in setups:
-                setups[every[-1]] = ResolvedEnv.build(config)
+            config = EnvConfig.from_arguments(task, env_actuator, arguments)
+            actuators.append(config.actuators)
+            if actuators[-1] not in setups:
+                setups[actuators[-1]] = ResolvedEnv.build(config)
         except ValueError as error:
             raise ValueError(f"actuator[{index}]: {error}") from None
-        if isinstance(every[-1][0], Ideal):
+        if isinstance(actuators[-1][0], Ideal):
             raise ValueError(
-                f"actuator[{index}] = {one!r}: must be an Actuator; the ideal one cannot be among"
-                " others"
+                f"actuator[{index}] = {env_actuator!r}: must be an Actuator; the ideal one cannot"
+                " be combined with others"
             )
-    check_same_family([each[0] for each in setups])
-    return setups[every[0]], every
+    check_same_family([family_members[0] for family_members in setups])
+    return setups[actuators[0]], actuators

@@ -1,4 +1,4 @@
-"""One environment, as Gymnasium knows it."""
+"""A single task environment with the interface of Gymnasium."""
 
 import functools
 from collections.abc import Mapping
@@ -8,12 +8,12 @@ import gymnasium
 import numpy as np
 
 from codrl_mj.actuators import IDEAL
-from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, written
-from codrl_mj.envs.compiled import bound, compiled_kernels
+from codrl_mj.envs.attributes import GymnasiumAttributes, read, validate_states, write
+from codrl_mj.envs.compiled import bind_observation, compiled_kernels
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.randomization import RandomizationState, apply_to_simulation
-from codrl_mj.envs.setup import ResolvedEnv, alone
-from codrl_mj.envs.snapshots import check_snapshot, encode_name, generator_of
+from codrl_mj.envs.setup import ResolvedEnv, unwrap_single
+from codrl_mj.envs.snapshots import check_snapshot, encode_name, generator_from_words
 from codrl_mj.physics import MujocoPhysics, SimulationConfig, signal_names, trace_names
 from codrl_mj.physics.offscreen import OffscreenRenderer, Window, check_view
 from codrl_mj.physics.streams import words_of
@@ -23,18 +23,20 @@ from codrl_mj.tasks import Task
 class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
     """A classic-control task whose actions go through an actuator.
 
-    Observation, action, reward, start and end are Gymnasium's for the task; what differs is the
-    force: the action chooses the desired one, the actuator delivers the actual one. With
-    `actuator="ideal"` they are equal and the environment is a drop-in for Gymnasium's.
+    Observation, action, reward, initial states and termination are those of Gymnasium's task. The
+    difference is the force: the action selects the desired force, and the actuator delivers the
+    actual force. With `actuator="ideal"` both are equal, and the environment replaces Gymnasium's.
 
     Every step's `info` has `desired_force`, `actual_force` [N or N*m], the signals of the
-    actuator's family and `saturated` (bool), each at the end of the step: of a current loop
-    `current`, `reference_current` [A] and `voltage` [V], which are 0 where the actuator is ideal; a
-    drive also says which limit it met (`codrl_mj.actuators.drive`). Where the agent commands the
-    voltage, what is delivered is what is desired. Of several motors each is an array (n,).
+    actuator's family and `saturated` (bool), each at the end of the step. A current loop has the
+    signals `current`, `reference_current` [A] and `voltage` [V], which are 0 for an ideal actuator;
+    a drive also reports which limit it reached (`codrl_mj.actuators.drive`). If the agent commands
+    the voltage, `desired_force` equals the delivered force. With several motors each signal is an
+    array (n,).
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium has it
+    # Class attribute, as in Gymnasium; an instance replaces it and never changes it.
+    metadata: dict[str, Any] = {  # noqa: RUF012
         "render_modes": ["human", "rgb_array"],
         "render_fps": 50,
     }
@@ -55,19 +57,19 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
         Args:
             task: the task's name, such as `cartpole`.
-            actuator: what the force goes through, as `EnvConfig.actuator` says.
-            physics: `mujoco`, `analytic` (Gymnasium's own equations, or a closed form), or one's
-                own.
+            actuator: actuator that transmits the force, as for `EnvConfig.actuator`.
+            physics: `mujoco`, `analytic` (Gymnasium's equations, or a closed form), or a registered
+                name.
             render_mode: None; `rgb_array`: `render` returns images; `human`: pygame shows every
-                step in a window. Others, of which `gymnasium.make` warns, are refused when they are
-                rendered.
+                step in a window. Other modes, of which `gymnasium.make` warns, are refused at
+                rendering.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model: `fixed` or `close`.
-            pretty: shadows, reflections and multisampling.
+            pretty: True to render shadows, reflections and multisampling.
             **arguments: the other fields of `codrl_mj.envs.config.EnvConfig`: `integrator`,
                 `inner_steps`, `timestep`, `allow_unstable`, `action`, `levels`, `observe_actuator`,
-                `disturbances`, `joint`, `randomize`; and the task's own options (CartPole:
+                `disturbances`, `joint`, `randomize`; and options of the task (CartPole:
                 `center_radius`, `sutton_barto_reward`).
 
         Raises:
@@ -75,12 +77,12 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
                 the message names it.
             CallbackInUseError: another library's MuJoCo callback is installed.
         """
-        config = EnvConfig.of(task, actuator, {"physics": physics, **arguments})
+        config = EnvConfig.from_arguments(task, actuator, {"physics": physics, **arguments})
         self.setup = ResolvedEnv.build(config)
         self.physics = self.setup.simulate()
-        into = functools.partial(apply_to_simulation, self.physics)
+        apply_values = functools.partial(apply_to_simulation, self.physics)
         self._draws = RandomizationState(
-            self.setup.randomization, [self.setup.plant.actuators], into
+            self.setup.randomization, [self.setup.simulation.actuators], apply_values
         )
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.setup.task.render_fps}
@@ -94,12 +96,12 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self.observation_space = self.setup.observation_space
         self.observation_names, self.motor_names = self.setup.observation_names, self.task.motors
         self.command = config.action
-        """What the agent commands."""
+        """Name of the agent's command."""
         self.signal_names, self.trace_names = (
-            signal_names(family := self.setup.plant.family),
+            signal_names(family := self.setup.simulation.family),
             trace_names(family),
         )
-        """Of the actuators' signals in `info`; of the columns of `trace`."""
+        """Names of the actuators' signals in `info`, and of the columns of `trace`."""
         self._compiled: tuple[Any, ...] | None = None
         self._offer_attributes(self.task)
 
@@ -110,17 +112,17 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     @property
     def actuator(self) -> Any:
-        """The actuator, of the present episode where it is drawn; with several motors a tuple of them."""
-        return alone(self._draws.motors(0, self.setup.config.actuators))
+        """Actuator of the present episode; for several motors a tuple."""
+        return unwrap_single(self._draws.motors(0, self.setup.config.actuators))
 
     @property
     def motors(self) -> dict[int, Any]:
-        """The actuators of the present episode, by the number of the task's motor."""
+        """Motor index of the task -> actuator of the present episode."""
         return dict(enumerate(self._draws.motors(0, self.setup.config.actuators)))
 
     @property
     def model(self) -> Any:
-        """The `mujoco.MjModel` (MuJoCo physics only); one `mj_step` of it is one integration step."""
+        """The `mujoco.MjModel` (MuJoCo physics only); one `mj_step` is one integration step."""
         return self._engine()[0]
 
     @property
@@ -130,35 +132,35 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     @property
     def state(self) -> np.ndarray:
-        """The mechanical state, shape (n,), float64, in Gymnasium's order; set, it moves there, the motor as it is."""
+        """Mechanical state, shape (n,), float64, in Gymnasium's order; writing keeps the motor."""
         return self.physics.state.copy()
 
     @state.setter
     def state(self, state: Any) -> None:
-        self.physics.state = checked_states(state, self.physics.state.shape)
+        self.physics.state = validate_states(state, self.physics.state.shape)
 
     @property
     def recorder(self) -> "ActuatedEnv":
-        """What reads the environment between its steps: itself."""
+        """Reader of the environment's state between its steps: the environment itself."""
         return self
 
     @property
     def speeds(self) -> np.ndarray:
-        """Velocities of the joints that the motors drive [m/s or rad/s], shape (motors,)."""
+        """Velocities of the joints that motors drive [m/s or rad/s], shape (motors,)."""
         return self.physics.state[list(self.task.speed_indices)]
 
     @property
     def trace(self) -> np.ndarray:
-        """What the motors did in each integration step of the last step; see `codrl_mj.physics.Physics.trace`."""
+        """Signals of each integration step of the last step; see `codrl_mj.physics.Physics`."""
         return self.physics.trace.copy()
 
     @property
     def step_duration(self) -> float:
-        """[s]."""
+        """Duration of an environment step [s]."""
         return self.task.step_duration
 
     def pose(self) -> None:
-        """Bring the bodies of `data` to the present state: the engine leaves them where its last step began."""
+        """Update the bodies' poses in `data`, which lag one integration step behind."""
         self.physics.show(self.physics.state)
 
     def _engine(self) -> tuple[Any, Any]:
@@ -168,75 +170,80 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
             )
         return self.physics.scene
 
-    def _model(self) -> Any:
-        """What has the numbers of the model, for `read` and `written`."""
+    def _attribute_target(self) -> Any:
+        """Return the object that `read` and `write` of attributes take as the model."""
         return self.physics if self.physics.scene is None else self.physics.scene[0]
 
     def _read_attribute(self, name: str) -> Any:
-        return read(name, self.setup, self._model())
+        return read(name, self.setup, self._attribute_target())
 
     def _write_attribute(self, name: str, value: Any) -> None:
         physics = self.physics
-        kept = physics.snapshot()
-        self.setup, self._compiled = written(name, value, self.setup, self._model()), None
+        snapshot = physics.snapshot()
+        self.setup, self._compiled = write(name, value, self.setup, self._attribute_target()), None
         physics.set_model({})
-        physics.restore(kept)
+        physics.restore(snapshot)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; the motor is at rest.
+        """Start an episode, with the motor at rest.
 
         Args:
-            seed: seed of the initial state; the same seed draws the state that Gymnasium's
-                environment draws.
-            options: Gymnasium's reset options for the task (CartPole: the bounds `low` and `high`).
+            seed: seed of the initial state; it gives the same state as in Gymnasium's environment.
+            options: Gymnasium's reset options for the task (CartPole: bounds `low` and `high`).
         """
         super().reset(seed=seed)
         generator, setup = self.np_random, self.setup
         initial = setup.task.draw_initial_state(generator, options)
-        self._draws.draw_one(generator)
+        self._draws.draw_single(generator)
         self.physics.reset(
             initial, float(setup.keys(lambda count: generator.random((1, count)))[0])
         )
         if self.render_mode == "human":
             self.render()
-        drawn = self.randomization
-        return self.setup.observation(self.physics), {"randomization": drawn} if drawn else {}
+        drawn_values = self.randomization
+        return (
+            self.setup.observation(self.physics),
+            {"randomization": drawn_values} if drawn_values else {},
+        )
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one environment step.
 
         Args:
-            action: an element of the action space; a continuous one may lie outside its bounds,
-                where the desired force saturates.
+            action: an element of the action space; a continuous action outside its bounds
+                saturates.
 
         Raises:
-            ValueError: the action is not in the action space, or not a number.
-            SimulationDivergedError: the simulation left the finite numbers.
+            ValueError: the action is not in the action space, or NaN.
+            SimulationDivergedError: a value of the simulation is not finite.
         """
         if self._compiled is None:
             if self.physics.stepping is None:
-                return self._step_apart(self.setup.commands.force(action))
+                return self._step_in_python(self.setup.commands.force(action))
             self._compiled = self._parts()
-        force_of, step, where, seen, columns, signals = self._compiled
+        force_of, step, pointers, observation, read_columns, name_signals = self._compiled
         force = force_of(action)
-        reward, terminated, fine = step(force, where)
-        if not fine:
+        reward, terminated, is_finite = step(force, pointers)
+        if not is_finite:
             self.physics.check_finite()
         if self.render_mode == "human":
             self.render()
-        return seen.copy(), reward, terminated, False, signals(columns(), force)
+        return observation.copy(), reward, terminated, False, name_signals(read_columns(), force)
 
     def _parts(self) -> tuple[Any, ...]:
-        """What a step takes: from action to force, the compiled step with its arguments, and from trace to signals."""
+        """Return what `step` uses: commands, compiled step, its arguments, and signal readers."""
         setup, row = self.setup, self.physics.trace[-1]
         columns = row[0].tolist if len(row) == 1 else row.T.copy
-        compiled = compiled_kernels(setup, self.physics).step, *bound(setup, self.physics)
+        compiled = (
+            compiled_kernels(setup, self.physics).step,
+            *bind_observation(setup, self.physics),
+        )
         return setup.commands.force, *compiled, columns, setup.signals
 
-    def _step_apart(self, force: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """What the compiled step does, in parts, for a physics that is Python."""
+    def _step_in_python(self, force: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Take a step without the compiled function, for a physics in Python."""
         physics, setup = self.physics, self.setup
         before = physics.state
         physics.step(force)
@@ -249,27 +256,25 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     @property
     def randomization(self) -> dict[str, Any]:
-        """What the present episode was drawn with, as in the reset's info: NaN before it, empty without draws."""
+        """Drawn values of the present episode, as in the reset's info; NaN before a reset."""
         return self._draws.report()
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on, as plain arrays: simulation, motor, generator, what was drawn.
+        """Return the complete state as arrays: simulation, motor, generator, drawn values.
 
-        The generators of the spaces, and what wrappers count, are theirs.
+        Generators of the spaces and counts of wrappers are not included.
         """
-        everything = {
+        state = {
             "task": encode_name(self.task.name),
             "physics": self.physics.snapshot(),
             "generator": words_of(self.np_random),
         }
         if self.physics.memory.size:
-            everything["disturbances"] = self.physics.memory.copy()
-        return everything | {
-            name: np.array(rows[0]) for name, rows in self._draws.snapshot().items()
-        }
+            state["disturbances"] = self.physics.memory.copy()
+        return state | {name: np.array(rows[0]) for name, rows in self._draws.snapshot().items()}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
-        """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
+        """Continue from a snapshot, bit for bit, in an environment made with the same arguments.
 
         Raises:
             ValueError: the snapshot is of another task, or of arguments that need other entries or
@@ -279,16 +284,15 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         self._draws.restore(snapshot)
         self.physics.restore(snapshot["physics"])
         self.physics.memory[:] = snapshot.get("disturbances", 0.0)
-        self.np_random = generator_of(snapshot["generator"])
+        self.np_random = generator_from_words(snapshot["generator"])
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """The present state as an image, shape (height, width, 3), uint8; None in a window or without a render mode.
+        """Render the state as an image (height, width, 3), uint8; None in a window or without mode.
 
         Raises:
             ValueError: unknown render mode.
             DependencyNotInstalled: a window needs pygame.
-            RenderingUnavailableError: no OpenGL context can be made here; the message has the
-                remedy.
+            RenderingUnavailableError: there is no OpenGL context; the message has the remedy.
         """
         if self.render_mode is None:
             gymnasium.logger.warn(
@@ -313,7 +317,7 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
         return None
 
     def _scene(self) -> Any:
-        """What is drawn: the simulation itself, or the task's ideal model where the physics has none."""
+        """Return the physics to render; the task's ideal model if this physics has none."""
         if self.physics.scene is not None:
             return self.physics
         if self._shown is None:
@@ -324,13 +328,13 @@ class ActuatedEnv(GymnasiumAttributes, gymnasium.Env[np.ndarray, Any]):
 
     def close(self) -> None:
         """Free the OpenGL context, and close the window."""
-        for shown in (self._renderer, self._window):
-            if shown is not None:
-                shown.close()
+        for resource in (self._renderer, self._window):
+            if resource is not None:
+                resource.close()
         self._renderer = self._window = self._shown = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the renderer, the window and the compiled step, which a copy makes anew."""
+        """Return all but the renderer, the window and the compiled step; a copy makes new ones."""
         return self.__dict__ | {
             "_renderer": None,
             "_window": None,

@@ -1,4 +1,4 @@
-"""What snapshots of environments are made of: generators, time limits, MuJoCo's state; and whether one fits."""
+"""Parts of environments' snapshots (generators, time limits, MuJoCo's state), and their checks."""
 
 import itertools
 from collections.abc import Mapping
@@ -16,34 +16,35 @@ _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 def time_limits(env: "gymnasium.Env[Any, Any]") -> list[Any]:
-    """The time limits among an environment's wrappers, from the outermost to what has snapshots of its own."""
+    """Return the time-limit wrappers, from the outermost to the first with its own snapshots."""
     limits = []
     while isinstance(env, gymnasium.Wrapper) and not hasattr(type(env), "snapshot"):
-        if "_elapsed_steps" in vars(env):  # TimeLimit, or what rl-zoo3 puts in its place
+        # The attribute identifies Gymnasium's TimeLimit and the class that rl-zoo3 replaces it by.
+        if "_elapsed_steps" in vars(env):
             limits.append(env)
         env = env.env
     return limits
 
 
 def elapsed_steps(env: "gymnasium.Env[Any, Any]") -> np.ndarray:
-    """The steps that the `time_limits` have counted, int64; -1 before the first reset."""
+    """Return the steps that the `time_limits` have counted, int64; -1 before the first reset."""
     counted = [limit._elapsed_steps for limit in time_limits(env)]
     return np.array([-1 if steps is None else steps for steps in counted], dtype=np.int64)
 
 
 def set_elapsed_steps(env: "gymnasium.Env[Any, Any]", elapsed: np.ndarray) -> None:
-    """Let the `time_limits` have counted what `elapsed_steps` returned."""
+    """Write the steps that `elapsed_steps` returned into the `time_limits`."""
     for limit, steps in zip(time_limits(env), elapsed.tolist(), strict=True):
         limit._elapsed_steps = None if steps < 0 else steps
 
 
 def encode_name(name: str) -> np.ndarray:
-    """What an environment is called, as an array."""
+    """Return an environment's name as an array of bytes."""
     return np.frombuffer(name.encode(), dtype=np.uint8).copy()
 
 
-def generator_of(words: np.ndarray) -> np.random.Generator:
-    """A generator that goes on from what `codrl_mj.physics.streams.words_of` returned."""
+def generator_from_words(words: np.ndarray) -> np.random.Generator:
+    """Create a generator with the state that `codrl_mj.physics.streams.words_of` returned."""
     generator, _ = seeding.np_random(0)
     set_words(generator, words)
     return generator
@@ -52,12 +53,12 @@ def generator_of(words: np.ndarray) -> np.random.Generator:
 def check_snapshot(
     snapshot: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray], name: str = ""
 ) -> None:
-    """Refuse a snapshot of other entries, shapes or types than those of the environment's own, `expected`.
+    """Raise if a snapshot's entries, shapes or types differ from those of an expected snapshot.
 
-    The entry of a `name`, if there is one, has the `encode_name` of what it is of.
+    The entry `name`, if it is not empty, must also have the same value, which `encode_name` wrote.
     """
-    for entry in [*expected, *(one for one in snapshot if one not in expected)]:
-        found, wanted = (
+    for entry in [*expected, *(key for key in snapshot if key not in expected)]:
+        present, required = (
             (
                 f"of shape {arrays[entry].shape} and type {arrays[entry].dtype}"
                 if entry in arrays
@@ -65,15 +66,15 @@ def check_snapshot(
             )
             for arrays in (snapshot, expected)
         )
-        if found != wanted:
+        if present != required:
             raise ValueError(
-                f"snapshot[{entry!r}] is {found}: must be {wanted}; it is of another task, other"
-                " arguments or another number of environments"
+                f"snapshot[{entry!r}] is {present}: must be {required}; it is of another task,"
+                " other arguments or another number of environments"
             )
     if name and not np.array_equal(snapshot[name], expected[name]):
-        whose = bytes(expected[name]).decode()
+        expected_name = bytes(expected[name]).decode()
         raise ValueError(
-            f"snapshot[{name!r}] is of {bytes(snapshot[name])!r}: must be of {whose!r}"
+            f"snapshot[{name!r}] is of {bytes(snapshot[name])!r}: must be of {expected_name!r}"
         )
 
 
@@ -84,14 +85,14 @@ _COMPUTED = tuple(
     )
     if getattr(getattr(field.type, "inner_type", None), "name", "") == "mjtNum"
 )
-"""The arrays of numbers in `MjData` whose sizes do not depend on contacts; in MuJoCo's order they come first."""
+"""Arrays of numbers in `MjData` whose sizes do not depend on contacts: MuJoCo lists them first."""
 
 
 def state_of(data: mujoco.MjData) -> dict[str, np.ndarray]:
-    """MuJoCo's state vector (`mjSTATE_INTEGRATION`), motors included, and what was computed from it, by name.
+    """Return MuJoCo's state vector (`mjSTATE_INTEGRATION`) and the arrays computed from it.
 
-    A step leaves poses and forces where its last integration step began, and environments take
-    observations and rewards from them: the state alone would not continue bit for bit.
+    A step leaves poses and forces at the beginning of its last integration step, and environments
+    compute observations and rewards from them: the state alone would not continue bit for bit.
     """
     state = np.empty(mujoco.mj_stateSize(data.model, _STATE))
     mujoco.mj_getState(data.model, data, state, _STATE)
@@ -102,7 +103,7 @@ def state_of(data: mujoco.MjData) -> dict[str, np.ndarray]:
 
 
 def set_state_of(data: mujoco.MjData, state: np.ndarray, computed: np.ndarray) -> None:
-    """Continue from what `state_of` returned, of the same model."""
+    """Restore what `state_of` returned, in a simulation of the same model."""
     mujoco.mj_setState(data.model, data, state, _STATE)
     start = 0
     for name in _COMPUTED:

@@ -1,4 +1,4 @@
-"""Thousands of environments as one, stepped together by compiled code: Gymnasium's `VectorEnv`."""
+"""Thousands of environments that compiled code steps together: Gymnasium's `VectorEnv`."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from codrl_mj.envs.attributes import GymnasiumAttributes, checked_states, read, shared, written
+from codrl_mj.envs.attributes import GymnasiumAttributes, is_shared, read, validate_states, write
 from codrl_mj.envs.compiled import Kernels, VectorStep, compiled_kernels
 from codrl_mj.envs.randomization import RandomizationState, apply_to_batch
 from codrl_mj.envs.setup import set_up_many
@@ -26,17 +26,18 @@ Array = np.ndarray
 
 
 class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
-    """N environments that step together, each bit for bit an `ActuatedEnv` with a time limit.
+    """N environments that step together, each bit for bit like an `ActuatedEnv` with a time limit.
 
-    Made by `gymnasium.make_vec(id, num_envs=N, vectorization_mode="vector_entry_point")`. No Python
-    runs for a single environment: states, motors, generators and bookkeeping are arrays.
+    `gymnasium.make_vec(id, num_envs=N, vectorization_mode="vector_entry_point")` makes one. No
+    Python code runs per environment: states, motors, generators and bookkeeping are arrays.
 
-    Infos are arrays of shape (N,) with Gymnasium's masks (`_current` says which rows have a
-    `current`). After a step in `SAME_STEP` mode, `final_obs` and `final_info` hold what the
-    episodes that ended saw last.
+    Infos are arrays of shape (N,) with Gymnasium's masks (`_current` is True in rows that have a
+    `current`). After a step in `SAME_STEP` mode, `final_obs` and `final_info` hold the last
+    observations and infos of the episodes that ended.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium has it
+    # Class attribute, as in Gymnasium; an instance replaces it and never changes it.
+    metadata: dict[str, Any] = {  # noqa: RUF012
         "render_modes": ["rgb_array", "rgb_array_list"],
         "render_fps": 50,
     }
@@ -60,23 +61,24 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         """Build the environments.
 
         Args:
-            num_envs: how many, >= 1.
+            num_envs: number of environments, >= 1.
             task: the task's name.
-            actuator: as for `ActuatedEnv`; or a sequence of N of these (with several motors, of
-                tuples of them), one for each environment: all of one family, and not ideal.
+            actuator: as for `ActuatedEnv`; or a sequence of N actuators (tuples of them for several
+                motors), one for each environment: all of one family, and not ideal.
             max_episode_steps: time limit of each environment [steps]; None for none.
-            autoreset_mode: when an environment whose episode ended is reset: in the `NEXT_STEP`, in
-                the `SAME_STEP`, or by the caller (`DISABLED`), with `reset(options={"reset_mask":
-                ...})`.
+            autoreset_mode: time of the reset of an environment whose episode ended: in the
+                `NEXT_STEP`, in the `SAME_STEP`, or by the caller (`DISABLED`), with
+                `reset(options={"reset_mask": ...})`.
             num_threads: threads of the engine; 0 uses every CPU. Results do not depend on it.
             physics: `mujoco`; the analytic physics steps one Gymnasium environment at a time and
                 cannot be batched.
-            render_mode: None or `rgb_array`: `render` then draws every environment, `image` one of
-                them. So it does in `rgb_array_list`, as Gymnasium's vector wrappers expect.
+            render_mode: None; or `rgb_array`: `render` returns an image of every environment,
+                `image` that of one; or `rgb_array_list`, the same, as Gymnasium's vector wrappers
+                expect.
             width: width of rendered images [px].
             height: height of rendered images [px].
             camera: a camera of the model.
-            pretty: shadows, reflections and multisampling.
+            pretty: True to render shadows, reflections and multisampling.
             **arguments: the other arguments of `ActuatedEnv`.
 
         Raises:
@@ -103,7 +105,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             raise ValueError(f"render_mode = {render_mode!r}: must be one of None, {modes}")
         self.num_envs = int(num_envs)
         self.setup, actuators = set_up_many(self.num_envs, task, actuator, arguments)
-        self.physics = MujocoBatchPhysics(self.setup.plant, actuators, int(num_threads))
+        self.physics = MujocoBatchPhysics(self.setup.simulation, actuators, int(num_threads))
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             **self.metadata,
@@ -116,8 +118,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self.single_observation_space = self.setup.observation_space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.arm_radii = np.array([one.arm_radius for one in self.setup.config.actuators])
-        """Of the motors of an environment [m], shape (motors,)."""
+        self.arm_radii = np.array([motor.arm_radius for motor in self.setup.config.actuators])
+        """Arms of the motors of an environment [m], shape (motors,)."""
         self._streams = Streams(self.num_envs)
         self._draws = RandomizationState(
             self.setup.randomization, actuators, functools.partial(apply_to_batch, self.physics)
@@ -125,13 +127,15 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)
         self._observations: Array = np.zeros(self.observation_space.shape or (), dtype=np.float32)
-        self.signals: Signals | None = None  # of the last step, each an array of shape (N,)
+        # Signals of the last step, each an array of shape (N,).
+        self.signals: Signals | None = None
         self._view = {"width": width, "height": height, "camera": camera, "pretty": pretty}
         if render_mode is not None:
             check_view(self.physics.model, width, height, camera)
         self._renderer: OffscreenRenderer | None = None
         self._kernels: tuple[Kernels, VectorStep] | None = None
-        self.looks: dict[str, Array] = {}  # fields of the models, where attributes were written
+        # Model fields of each environment, after attributes were written; rendering uses them.
+        self.model_fields: dict[str, Array] = {}
         self._offer_attributes(self.task)
 
     @property
@@ -141,43 +145,44 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
 
     @property
     def state(self) -> Array:
-        """Mechanical states, shape (N, n), float64, in Gymnasium's order; set, it moves there, motors as they are."""
+        """Mechanical states, shape (N, n), float64, as in Gymnasium; writing keeps the motors."""
         return self.physics.state
 
     @state.setter
     def state(self, states: Any) -> None:
-        self.physics.state = checked_states(states, self.physics.state.shape)
+        self.physics.state = validate_states(states, self.physics.state.shape)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute, once for each environment, as Gymnasium's `SyncVectorEnv` has it."""
+        """Return an attribute for each environment, as Gymnasium's `SyncVectorEnv` does."""
         value = getattr(self, name)
-        each = isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,)
+        is_array_of_envs = isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,)
         return (
             tuple(value.tolist() if value.ndim == 1 else value)
-            if each
+            if is_array_of_envs
             else (value,) * self.num_envs
         )
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute of all environments: a list or tuple has a value for each of them."""
+        """Set an attribute of all environments; a list or tuple has one value for each."""
         setattr(self, name, np.array(values) if isinstance(values, list | tuple) else values)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """An attribute once for each environment; or a method, which is called once for all of them."""
+        """Return an attribute for each environment; call a method once for all of them."""
         value = getattr(self, name)
         return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
 
     def _read_attribute(self, name: str) -> Any:
-        """One value where the environments share it, else shape (N,)."""
-        if shared(self.task.attributes[name]):
+        """Return one value if the environments share it, otherwise an array (N,)."""
+        if is_shared(self.task.attributes[name]):
             return read(name, self.setup, self.physics.model)
         return np.array([read(name, self.setup, model) for model in self.physics.models()])
 
     def _write_attribute(self, name: str, value: Any) -> None:
-        if shared(self.task.attributes[name]):
+        """Write one value for all environments, or an array (N,) with one for each."""
+        if is_shared(self.task.attributes[name]):
             if not np.array_equal(value, present := self._read_attribute(name)):
                 raise AttributeError(
-                    f"{name} = {value!r}: the environments share it, as {present!r}; use"
+                    f"{name} = {value!r}: the environments share the value {present!r}; use"
                     " vectorization_mode='sync'"
                 )
             return
@@ -187,30 +192,33 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 " environment"
             )
         fields = {field: self.physics.field(field).copy() for field in VARIED}
-        looks = {
+        visual_fields = {
             field: np.array([field_of(self.physics.model, field)] * self.num_envs)
             for field in SHOWN
         }
-        looks |= {field: rows.copy() for field, rows in self.looks.items() if field in SHOWN}
-        numbers = np.broadcast_to(value, self.num_envs).tolist()
-        for row, (model, number) in enumerate(zip(self.physics.models(), numbers, strict=True)):
-            write_fields(model, looks, row)
-            written(name, number, self.setup, model)
-            for field, rows in (fields | looks).items():
+        visual_fields |= {
+            field: rows.copy() for field, rows in self.model_fields.items() if field in SHOWN
+        }
+        values = np.broadcast_to(value, self.num_envs).tolist()
+        for row, (model, env_value) in enumerate(zip(self.physics.models(), values, strict=True)):
+            write_fields(model, visual_fields, row)
+            write(name, env_value, self.setup, model)
+            for field, rows in (fields | visual_fields).items():
                 rows[row] = field_of(model, field)
-        kept = self.physics.snapshot()
+        # Writing the fields resets the simulations' derived quantities; the states are restored.
+        snapshot = self.physics.snapshot()
         self.physics.set_model(np.arange(self.num_envs), fields)
-        self.physics.restore(kept)
-        self.looks = fields | looks
+        self.physics.restore(snapshot)
+        self.model_fields = fields | visual_fields
 
     @property
     def randomization(self) -> dict[str, Array]:
-        """What the present episodes were drawn with: shape (N,) for every field, and how many sets were `rejected`."""
-        return self._draws.present()
+        """Drawn values of the present episodes, path -> array (N,), and the number `rejected`."""
+        return self._draws.drawn_values()
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
-        """The environments' generators."""
+        """Generators of the environments."""
         return tuple(self._streams.generators)
 
     def reset(  # type: ignore[override]
@@ -219,16 +227,16 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Array, dict[str, Any]]:
-        """Start episodes, in every environment or in those of `options["reset_mask"]`.
+        """Start episodes in all environments, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: of the first environment, the others counting up from it; or one for each (None
-                leaves a generator).
+            seed: seed of the first environment, from which those of the others count up; or a
+                sequence of seeds, in which None leaves a generator as it is.
             options: Gymnasium's reset options for the task, and `reset_mask`: shape (N,), bool,
-                with a True in it.
+                with at least one True.
 
         Raises:
-            ValueError: wrong number of seeds, or a mask of wrong shape or type.
+            ValueError: wrong number of seeds, or wrong shape or type of the mask.
         """
         options = dict(options or {})
         mask = options.pop("reset_mask", np.ones(self.num_envs, dtype=bool))
@@ -239,8 +247,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             or not mask.any()
         ):
             raise ValueError(
-                f"reset_mask = {mask!r}: must be a bool array of shape ({self.num_envs},) with a"
-                " True in it"
+                f"reset_mask = {mask!r}: must be a bool array of shape ({self.num_envs},) with at"
+                " least one True"
             )
         seeds: Sequence[int | None]
         if seed is None or isinstance(seed, int | np.integer):
@@ -249,21 +257,21 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             seeds = seed
         if len(seeds) != self.num_envs:
             raise ValueError(
-                f"seed: {len(seeds)} seeds for {self.num_envs} environments: there must be one for"
-                " each"
+                f"seed: got {len(seeds)} seeds for {self.num_envs} environments; give one for each"
+                " environment"
             )
         rows = np.flatnonzero(mask)
-        chosen = [seeds[row] for row in rows.tolist()]
-        if any(one is not None for one in chosen):
-            self._streams.seed(rows, chosen)
+        chosen_seeds = [seeds[row] for row in rows.tolist()]
+        if any(env_seed is not None for env_seed in chosen_seeds):
+            self._streams.seed(rows, chosen_seeds)
         infos = self._restart(rows, options or None)
         return self._observations.copy(), infos
 
     def _restart(self, rows: Array, options: dict[str, Any] | None) -> dict[str, Any]:
-        """Start episodes in some environments; their observations are in `_observations` then.
+        """Start episodes in some environments, and write `_observations`.
 
         Returns:
-            The infos of the reset: what was drawn.
+            Infos of the reset, with the drawn values.
         """
         low, high = self.setup.task.bounds(options) if options else self.setup.initial_bounds
         draws = low + (high - low) * self._streams.random(rows, len(low))
@@ -288,18 +296,18 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             bool, infos.
 
         Raises:
-            ValueError: actions of wrong shape or type, or one that is not in the action space: the
+            ValueError: actions of wrong shape or type, or one that is not in the action space; the
                 message names the environment, and none was stepped.
-            SimulationDivergedError: a simulation left the finite numbers; the message names the
-                environment. All were stepped; once it is reset, by `reset(options={"reset_mask":
-                ...})`, they can go on.
+            SimulationDivergedError: a value of a simulation is not finite; the message names the
+                environment. All were stepped, and can continue after a reset of this one by
+                `reset(options={"reset_mask": ...})`.
             RuntimeError: in `DISABLED` mode, an environment whose episode ended was not reset.
         """
         forces = self.setup.commands.forces(actions)
         if len(forces) != self.num_envs:
             raise ValueError(
-                f"actions: {len(forces)} rows for {self.num_envs} environments: there must be one"
-                " for each"
+                f"actions: got {len(forces)} rows for {self.num_envs} environments; give one for"
+                " each environment"
             )
         if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
             row = int(np.argmax(self._ended))
@@ -307,7 +315,8 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
                 f"environment {row} has ended and was not reset: "
                 "call reset(options={'reset_mask': terminated | truncated})"
             )
-        stepping = ~self._ended  # in NEXT_STEP mode, environments that ended are reset instead
+        # In NEXT_STEP mode, environments whose episode ended are reset instead of stepped.
+        stepping = ~self._ended
         kernels, steps = self._compiled()
         steps.forces[:], steps.stepping[:] = forces, stepping
         steps.limit[0] = np.inf if self.max_episode_steps is None else self.max_episode_steps
@@ -320,63 +329,64 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         columns = steps.signals.reshape(-1, *forces.shape).copy()
         self.signals = signals = self.setup.signals([forces, *columns], forces)
         if broken:
-            self._ended |= terminated | truncated  # what is to be reset still is
+            # The exception leaves this method; episodes that ended must still be reset later.
+            self._ended |= terminated | truncated
             self.physics.check_finite(self.physics.state, stepping)
-        infos = _infos(signals, stepping)
+        infos = _vector_infos(signals, stepping)
         if not stepping.all():
             infos |= self._restart(np.flatnonzero(~stepping), None)
         self._ended = terminated | truncated
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
-            infos = self._finish(infos)
+            infos = self._reset_ended(infos)
         return self._observations.copy(), rewards, terminated, truncated, infos
 
     def _compiled(self) -> tuple[Kernels, VectorStep]:
-        """The compiled functions, and what a step is given and fills."""
+        """Return the compiled functions, and the inputs and outputs of their step."""
         if self._kernels is None:
-            count, motors = self.num_envs, len(self.task.motors)
-            columns = 1 + len(self.setup.plant.family.Signals._fields)
+            num_envs, motors = self.num_envs, len(self.task.motors)
+            columns = 1 + len(self.setup.simulation.family.Signals._fields)
             steps = VectorStep(
-                np.empty(count if motors == 1 else (count, motors)),
-                np.empty(count, dtype=bool),
+                np.empty(num_envs if motors == 1 else (num_envs, motors)),
+                np.empty(num_envs, dtype=bool),
                 self._observations,
-                np.empty(count),
-                np.empty(count, dtype=bool),
-                np.empty(count, dtype=bool),
+                np.empty(num_envs),
+                np.empty(num_envs, dtype=bool),
+                np.empty(num_envs, dtype=bool),
                 self._elapsed,
                 np.empty(1),
                 self.setup.options,
-                np.empty((columns, count, motors)),
+                np.empty((columns, num_envs, motors)),
             )
             self._kernels = compiled_kernels(self.setup, self.physics), steps
         return self._kernels
 
-    def _finish(self, infos: dict[str, Any]) -> dict[str, Any]:
-        """Reset the environments that ended; what they saw last goes into the infos, as in Gymnasium."""
+    def _reset_ended(self, infos: dict[str, Any]) -> dict[str, Any]:
+        """Reset environments whose episode ended; put their last data into the infos."""
         ended, rows = self._ended.copy(), np.flatnonzero(self._ended)
         final_obs = np.full(self.num_envs, None, dtype=object)
-        for row, seen in zip(rows.tolist(), self._observations[rows], strict=True):
-            final_obs[row] = seen
-        final: dict[str, Any] = {}
+        for row, observation in zip(rows.tolist(), self._observations[rows], strict=True):
+            final_obs[row] = observation
+        final_info: dict[str, Any] = {}
         remaining: dict[str, Any] = {}
         for name in [name for name in infos if not name.startswith("_")]:
-            final[name], final[f"_{name}"] = np.zeros_like(infos[name]), ended.copy()
-            final[name][rows] = infos[name][rows]
+            final_info[name], final_info[f"_{name}"] = np.zeros_like(infos[name]), ended.copy()
+            final_info[name][rows] = infos[name][rows]
             if len(rows) < self.num_envs:
                 remaining[name], remaining[f"_{name}"] = infos[name].copy(), ~ended
                 remaining[name][rows] = 0
-        drawn = self._restart(rows, None)
+        reset_infos = self._restart(rows, None)
         return {
             "final_obs": final_obs,
             "_final_obs": ended.copy(),
-            "final_info": final,
+            "final_info": final_info,
             "_final_info": ended.copy(),
             **remaining,
-            **drawn,
+            **reset_infos,
         }
 
     def snapshot(self) -> dict[str, Array]:
-        """Everything that the future depends on, as plain arrays: simulations, motors, generators, bookkeeping."""
-        everything = {
+        """Return the complete state as arrays: simulations, motors, generators, bookkeeping."""
+        state = {
             "physics": self.physics.snapshot(),
             "streams": self._streams.state(),
             "elapsed": self._elapsed.copy(),
@@ -384,11 +394,11 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             "observations": self._observations.copy(),
         }
         if self.physics.memory.size:
-            everything["disturbances"] = self.physics.memory.copy()
-        return everything | self._draws.snapshot()
+            state["disturbances"] = self.physics.memory.copy()
+        return state | self._draws.snapshot()
 
     def restore(self, snapshot: Mapping[str, Array]) -> None:
-        """Continue from what `snapshot` returned, bit for bit.
+        """Continue from a snapshot, bit for bit.
 
         Raises:
             ValueError: the snapshot is of another number of environments, or of another task.
@@ -399,21 +409,22 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         self._streams.set_state(snapshot["streams"])
         self._elapsed[:], self._ended[:] = snapshot["elapsed"], snapshot["ended"]
         self._observations[:] = snapshot["observations"]
-        self.signals = None  # of a step that was not this one's past
+        # The signals belong to a step that is not in the restored episode's past.
+        self.signals = None
         if self.physics.memory.size:
             self.physics.memory[:] = snapshot["disturbances"]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the renderer and the compiled step, which a copy makes anew."""
+        """Return all but the renderer and the compiled step; a copy makes new ones."""
         return self.__dict__ | {"_renderer": None, "_kernels": None}
 
     def render(self) -> tuple[Array, ...] | None:  # type: ignore[override]
-        """Images of the environments, shape (height, width, 3), uint8; None if there is no render mode."""
+        """Return images (height, width, 3), uint8, of all environments; None if not rendered."""
         images = [self.image(row) for row in range(self.num_envs if self.render_mode else 1)]
         return None if images[0] is None else tuple(images)  # type: ignore[arg-type]
 
     def image(self, row: int = 0) -> Array | None:
-        """One environment as an image, shape (height, width, 3), uint8; None if there is no render mode."""
+        """Return an image (height, width, 3), uint8, of one environment; None if not rendered."""
         if self.render_mode is None:
             gymnasium.logger.warn(
                 "render() without a render mode: pass render_mode='rgb_array' when making it"
@@ -422,7 +433,7 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
         if self._renderer is None:
             self._renderer = OffscreenRenderer(self.physics.model, **self._view)  # type: ignore[arg-type]
         write_fields(self.physics.model, self._draws.model_fields(np.array([row]), shown=True))
-        write_fields(self.physics.model, self.looks, row)
+        write_fields(self.physics.model, self.model_fields, row)
         self.physics.show(row)
         return self._renderer.render(self.physics.data)
 
@@ -434,29 +445,35 @@ class ActuatedVectorEnv(GymnasiumAttributes, VectorEnv[Array, Array, Array]):
             self._renderer = None
 
 
-def check_counts(num_envs: int, max_episode_steps: int | None, each: int = 3_000) -> None:
-    """Refuse impossible numbers of environments, each of which takes memory of `each` [bytes], and of steps."""
-    limit = {} if max_episode_steps is None else {"max_episode_steps": max_episode_steps}
-    for name, count in {"num_envs": num_envs, **limit}.items():
+def check_counts(num_envs: int, max_episode_steps: int | None, bytes_per_env: int = 3_000) -> None:
+    """Raise if the numbers of environments or steps are invalid, or the memory is too small.
+
+    Args:
+        num_envs: number of environments.
+        max_episode_steps: time limit [steps], or None.
+        bytes_per_env: memory that an environment takes [bytes].
+    """
+    counts_of_steps = {} if max_episode_steps is None else {"max_episode_steps": max_episode_steps}
+    for name, count in {"num_envs": num_envs, **counts_of_steps}.items():
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise ValueError(f"{name} = {count!r}: must be an integer >= 1")
-    if (room := free_memory()) is not None and num_envs * each > room:
+    if (free_bytes := free_memory()) is not None and num_envs * bytes_per_env > free_bytes:
         raise ValueError(
-            f"num_envs = {num_envs}: takes about {num_envs * each / 1e9:.3g} GB of memory, of which"
-            f" {room / 1e9:.3g} are free: must be <= {room // each}"
+            f"num_envs = {num_envs}: takes about {num_envs * bytes_per_env / 1e9:.3g} GB of memory,"
+            f" but {free_bytes / 1e9:.3g} GB are free: must be <= {free_bytes // bytes_per_env}"
         )
 
 
-def _infos(signals: Signals, stepping: Array) -> dict[str, Any]:
-    """The signals as Gymnasium's vector infos: zero, and masked, where an environment was reset instead of stepped."""
+def _vector_infos(signals: Signals, stepping: Array) -> dict[str, Any]:
+    """Return the signals as Gymnasium's vector infos: 0 and masked where no step was taken."""
     if not stepping.any():
         return {}
-    reset = np.flatnonzero(~stepping)
+    reset_rows = np.flatnonzero(~stepping)
     infos: dict[str, Any] = {}
     for name, values in signals.items():
         infos[name] = values
-        if len(reset):
+        if len(reset_rows):
             infos[name] = values.copy()
-            infos[name][reset] = 0
+            infos[name][reset_rows] = 0
         infos[f"_{name}"] = stepping.copy()
     return infos

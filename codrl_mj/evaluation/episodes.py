@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.actuators import IDEAL, actuator_from_mapping, mapping_of, trusting
+from codrl_mj.actuators import IDEAL, actuator_from_mapping, allow_imports, mapping_of
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import check_memory
 from codrl_mj.runs.files import below, writing
@@ -166,7 +166,7 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
             arrays = {name: archive[name] for name in archive.files}
         described = json.loads(str(arrays["actuator"]))
         several = isinstance(described, list)
-        with trusting(trust):
+        with allow_imports(trust):
             actuators = [
                 IDEAL if one is None else actuator_from_mapping(one)
                 for one in (described if several else [described])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Drive, Ideal, shaft
-from codrl_mj.envs.worlds import EnvSource, find_world
+from codrl_mj.envs.sources import EnvSource, find_source
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.evaluation.measures import (
     Interval,
@@ -184,7 +184,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     Raises:
         ValueError: unknown task.
     """
-    world = find_world(task)
+    world = find_source(task)
     returns = np.array([episode.total for episode in episodes])
     goals = [_time_to_goal(world, episode) for episode in episodes]
     reached = np.array([time for time in goals if time is not None])

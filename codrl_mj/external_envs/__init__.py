@@ -1,4 +1,4 @@
-"""Motors in environments of others: Gymnasium's, dm_control's, and whatever builds its model from XML."""
+"""Motors in third-party environments: Gymnasium's, dm_control's, and others with XML models."""
 
 import importlib.metadata
 import re
@@ -6,16 +6,16 @@ import re
 import mujoco
 
 NEWEST_DM_CONTROL_WITHOUT_MUJOCO_4 = (1, 0, 50)
-"""Newest version of dm_control, which reads fields that MuJoCo 4 removed (`MjModel.flex_vertedge`)."""
+"""Newest dm_control that reads fields which MuJoCo 4 removed (`MjModel.flex_vertedge`)."""
 
 
 def check_dm_control() -> None:
-    """Refuse a dm_control that cannot load a model with the installed MuJoCo.
+    """Raise if dm_control cannot load a model with the installed MuJoCo.
 
-    Without this check the first model ends in an AttributeError about a field of the engine.
+    Without this check, loading the first model raises an AttributeError about a field of MuJoCo.
 
     Raises:
-        RuntimeError: MuJoCo is 4 or newer, and this dm_control needs 3; the message has the remedy.
+        RuntimeError: MuJoCo is 4 or newer, but this dm_control needs 3; the message has the remedy.
         importlib.metadata.PackageNotFoundError: dm_control is not installed.
     """
     version = importlib.metadata.version("dm-control")

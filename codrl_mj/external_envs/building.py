@@ -1,4 +1,4 @@
-"""Motors for every model that others' code builds from XML: `motors_added`."""
+"""Motors for every model that third-party code builds from XML: `motors_added`."""
 
 import contextlib
 import contextvars
@@ -14,8 +14,8 @@ from codrl_mj.engine.specs import add_motors, match_pattern, matchable_names, re
 from codrl_mj.tasks import TASKS
 
 
-class Building:
-    """The actuators for models yet to be built, and what was met of these."""
+class ModelPatcher:
+    """Adds motors to models that are built later, and records the names in these models."""
 
     def __init__(
         self,
@@ -24,130 +24,141 @@ class Building:
         joint_dynamics: str | None = None,
         action: str | None = None,
     ) -> None:
-        """Take patterns and their actuators, and the action if it is known; a pattern may match nothing in a model."""
+        """Store arguments of `add_motors`, and the action, if known; nothing is matched yet."""
         self.actuators, self._action = actuators, action
-        self._how = allow_unstable, joint_dynamics
-        self._met: dict[str, list[list[str]]] = {}
+        self._add_motors_arguments = allow_unstable, joint_dynamics
+        self._names_of_models: dict[str, list[list[str]]] = {}
 
     @contextlib.contextmanager
-    def motorising(self) -> Iterator[None]:
-        """Give motors to every model that this thread builds from XML in a `with` block."""
-        token = _PRESENT.set(self)
+    def patch_model_loading(self) -> Iterator[None]:
+        """Add motors to every model that this thread builds from XML in a `with` block."""
+        token = _ACTIVE_PATCHER.set(self)
         with _LOCK:
-            for name, spec in _SPECS.items() if not _BLOCKS else ():
-                _PLAIN.callback(setattr, mujoco.MjModel, name, vars(mujoco.MjModel)[name])
-                setattr(
-                    mujoco.MjModel, name, staticmethod(_loader(getattr(mujoco.MjModel, name), spec))
+            for name, spec in _SPEC_READERS.items() if not _OPEN_BLOCKS else ():
+                _ORIGINAL_LOADERS.callback(
+                    setattr, mujoco.MjModel, name, vars(mujoco.MjModel)[name]
                 )
-            _BLOCKS.append(self)
+                setattr(
+                    mujoco.MjModel,
+                    name,
+                    staticmethod(_patched_loader(getattr(mujoco.MjModel, name), spec)),
+                )
+            _OPEN_BLOCKS.append(self)
         try:
             yield
         finally:
             with _LOCK:
-                _BLOCKS.remove(self)
-                if not _BLOCKS:
-                    _PLAIN.close()
-            _PRESENT.reset(token)
+                _OPEN_BLOCKS.remove(self)
+                if not _OPEN_BLOCKS:
+                    _ORIGINAL_LOADERS.close()
+            _ACTIVE_PATCHER.reset(token)
 
     def motors_added(
-        self, plain: mujoco.MjModel, spec: Callable[[], mujoco.MjSpec]
+        self, model: mujoco.MjModel, spec: Callable[[], mujoco.MjSpec]
     ) -> mujoco.MjModel:
-        """A model with the motors that are for it; it itself if none are.
+        """Return a model with the motors that match it; the same model if none match.
 
         Args:
-            plain: the model.
-            spec: reads its spec.
+            model: the model without motors.
+            spec: function that reads the model's spec.
 
         Raises:
             ValueError: see `codrl_mj.add_motors`.
         """
-        names = matchable_names(plain)
-        self._met[repr(names)] = (
-            names  # once each, though some build their model anew at every reset
-        )
-        wanted = {
+        names = matchable_names(model)
+        # A dictionary, because some environments build the same model at every reset.
+        self._names_of_models[repr(names)] = names
+        matching = {
             pattern: actuator
             for pattern, actuator in self.actuators.items()
             if match_pattern(pattern, names, needed=False)
         }
-        if not wanted:
-            return plain
-        for pattern, actuator in wanted.items() if self._action == "force" else ():
-            plainly = plain.actuator_biastype[match_pattern(pattern, names)] == int(
+        if not matching:
+            return model
+        for pattern, actuator in matching.items() if self._action == "force" else ():
+            is_force_actuator = model.actuator_biastype[match_pattern(pattern, names)] == int(
                 mujoco.mjtBias.mjBIAS_NONE
             )
-            if actuator.MOTION and actuator.commands() and plainly.any():
+            if actuator.MOTION and actuator.commands() and is_force_actuator.any():
                 raise ValueError(
-                    f"action = 'force': {pattern!r}: the environment asks its actuators for forces,"
-                    f" and a {type(actuator).__name__} is asked for motions; must be"
+                    f"action = 'force': {pattern!r}: the environment's actions are forces, but a"
+                    f" {type(actuator).__name__} takes motions; must be"
                     f" {' or '.join(actuator.commands())}"
                 )
-        with (
-            warnings.catch_warnings()
-        ):  # MuJoCo's of the model, which building it without motors has shown
-            ours = r"codrl_mj\.(engine\.specs|foreign\.building)"
-            warnings.filterwarnings("ignore", category=UserWarning, module=ours)
-            return add_motors(spec(), wanted, *self._how).compile()
+        # The model without motors has already been built with MuJoCo's warnings about it; those of
+        # the second build would only repeat them.
+        with warnings.catch_warnings():
+            own_modules = r"codrl_mj\.(engine\.specs|external_envs\.building)"
+            warnings.filterwarnings("ignore", category=UserWarning, module=own_modules)
+            return add_motors(spec(), matching, *self._add_motors_arguments).compile()
 
     def check(self, env_id: str = "") -> None:
-        """Refuse patterns that matched nothing, and an environment, of Gymnasium's if it has an id, without a model."""
-        if not self._met and env_id:
+        """Raise if a pattern matched nothing, or if no model was built from XML.
+
+        `env_id` is the id of a Gymnasium environment, for the message.
+        """
+        if not self._names_of_models and env_id:
             task = next((task.name for task in TASKS.values() if task.gymnasium_id == env_id), None)
             remedy = (
-                f"take {task!r}, our task of it that has"
+                f"use {task!r}, the task of this package that has motors"
                 if task
-                else "only environments that have can get motors"
+                else "only environments with such a model can get motors"
             )
             raise ValueError(
                 f"the environment has no MuJoCo model built from XML, and so no motors: {remedy}"
             )
-        if not self._met:
+        if not self._names_of_models:
             raise ValueError(
-                f"actuators = {list(self.actuators)}: no model was built inside by"
-                " MjModel.from_xml_path or from_xml_string in this thread; build the environment"
-                " inside, or put motors into its MjSpec with codrl_mj.add_motors"
+                f"actuators = {list(self.actuators)}: no model was built in the block by"
+                " MjModel.from_xml_path or from_xml_string in this thread; build the environment in"
+                " the block, or add motors to its MjSpec with codrl_mj.add_motors"
             )
         for pattern in self.actuators:
-            match_pattern(pattern, [own for names in self._met.values() for own in names])
+            match_pattern(
+                pattern,
+                [names for model_names in self._names_of_models.values() for names in model_names],
+            )
 
 
 @contextlib.contextmanager
 def motors_added(
     actuators: Mapping[Any, Any], allow_unstable: bool = False, joint_dynamics: str | None = None
 ) -> Iterator[None]:
-    """Put motors into any environment that is built inside: Gymnasium's, dm_control's, anybody's.
+    """Add motors to every environment that is built in a `with` block, whatever its library.
 
     Models that this thread builds by `mujoco.MjModel.from_xml_path` or `from_xml_string` in the
-    block go through `codrl_mj.add_motors`. Of nested blocks the innermost counts. What builds its
-    model again later, as composer environments of dm_control do at every reset, has to do so inside
-    too (`codrl_mj.make_dm_control` sees to that).
+    block pass through `codrl_mj.add_motors`. In nested blocks the innermost applies. An environment
+    that builds its model again later, as composer environments of dm_control do at every reset,
+    must do so in such a block too (`codrl_mj.make_dm_control` ensures this).
 
         >>> with codrl_mj.motors_added({".*": "maxon-ec45-flat-50w"}):
         ...     env = gym.make("HalfCheetah-v5")
 
     Args:
-        actuators: as for `codrl_mj.add_motors`; a pattern has to match something in one of the models
-            at least.
-        allow_unstable: likewise.
-        joint_dynamics: likewise.
+        actuators: as for `codrl_mj.add_motors`; each pattern must match something in at least one
+            of the models.
+        allow_unstable: as for `codrl_mj.add_motors`.
+        joint_dynamics: as for `codrl_mj.add_motors`.
 
     Raises:
-        ValueError: see `codrl_mj.add_motors`; or, at the end, no model was built inside, or a pattern
-            matched nothing.
+        ValueError: see `codrl_mj.add_motors`; or, at the end of the block, no model was built, or a
+            pattern matched nothing.
     """
-    building = Building(
-        resolve_patterns(actuators, "another's environment"), allow_unstable, joint_dynamics
+    patcher = ModelPatcher(
+        resolve_patterns(actuators, "a third-party environment"), allow_unstable, joint_dynamics
     )
-    with building.motorising():
+    with patcher.patch_model_loading():
         yield
-    building.check()
+    patcher.check()
 
 
-_PRESENT: contextvars.ContextVar[Building | None] = contextvars.ContextVar("present", default=None)
-"""What the models of this thread are built with."""
+_ACTIVE_PATCHER: contextvars.ContextVar[ModelPatcher | None] = contextvars.ContextVar(
+    "present", default=None
+)
+"""Patcher of the innermost block of this thread."""
 
 
-_SPECS: dict[str, Callable[..., mujoco.MjSpec]] = {
+_SPEC_READERS: dict[str, Callable[..., mujoco.MjSpec]] = {
     "from_xml_path": lambda filename, assets=None, vfs=None: mujoco.MjSpec.from_file(
         filename, include=assets, assets=assets, vfs=vfs
     ),
@@ -155,21 +166,25 @@ _SPECS: dict[str, Callable[..., mujoco.MjSpec]] = {
         xml, include=assets, assets=assets, vfs=vfs
     ),
 }
-"""MuJoCo's two ways to build a model from XML -> what reads its spec from the same arguments."""
-_LOCK, _PLAIN = threading.Lock(), contextlib.ExitStack()
-_BLOCKS: list[Building] = []
-"""The blocks of `motorising` that any thread is in: while there are any, models are built by `_loader`s."""
+"""MuJoCo's functions that build a model from XML -> readers of its spec with the same arguments."""
+_LOCK, _ORIGINAL_LOADERS = threading.Lock(), contextlib.ExitStack()
+_OPEN_BLOCKS: list[ModelPatcher] = []
+"""Blocks of all threads; while there are any, MuJoCo's functions are replaced."""
 
 
-def _loader(
-    plain: Callable[..., mujoco.MjModel], spec: Callable[..., mujoco.MjSpec]
+def _patched_loader(
+    original: Callable[..., mujoco.MjModel], read_spec: Callable[..., mujoco.MjSpec]
 ) -> Callable[..., mujoco.MjModel]:
+    """Return a replacement of one of MuJoCo's functions, which adds motors to the loaded model."""
+
+    # MuJoCo's functions are replaced for all threads; the context variable restricts the motors to
+    # the thread of the block.
     def load(*arguments: Any, **options: Any) -> mujoco.MjModel:
-        model, building = plain(*arguments, **options), _PRESENT.get()
+        model, patcher = original(*arguments, **options), _ACTIVE_PATCHER.get()
         return (
             model
-            if building is None
-            else building.motors_added(model, lambda: spec(*arguments, **options))
+            if patcher is None
+            else patcher.motors_added(model, lambda: read_spec(*arguments, **options))
         )
 
     return load

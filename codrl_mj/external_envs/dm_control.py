@@ -1,4 +1,4 @@
-"""dm_control's environments with motors: `make_dm_control`. Needs the extra `dm-control`."""
+"""Environments of dm_control with motors: `make_dm_control`. Needs the extra `dm-control`."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -16,15 +16,15 @@ from codrl_mj.disturbances import OFF, resolve
 from codrl_mj.engine.specs import resolve_patterns
 from codrl_mj.envs.motors import ActuatorBank, MotorSettings
 from codrl_mj.external_envs import check_dm_control
-from codrl_mj.external_envs.building import Building
+from codrl_mj.external_envs.building import ModelPatcher
 from codrl_mj.fields import did_you_mean
 
 
 class MotorsAddedEnvironment(dm_env.Environment):
-    """An environment of dm_control's that builds all its models with motors; whatever else it has is had through this.
+    """A dm_control environment that builds all its models with motors; it has all its attributes.
 
-    Its own order of stepping is kept: by default `mj_step2` before `mj_step1`, where `signals` are
-    those of the forces that moved it last.
+    The order of stepping stays dm_control's: by default `mj_step2` before `mj_step1`, so `signals`
+    are those of the forces that acted in the last completed step.
     """
 
     def __init__(
@@ -33,62 +33,64 @@ class MotorsAddedEnvironment(dm_env.Environment):
         settings: MotorSettings,
         noise_seed: int | None = None,
     ) -> None:
-        """Build it."""
+        """Build the environment, with motors."""
         self._settings = settings
-        self._building = Building(
+        self._patcher = ModelPatcher(
             settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action
         )
-        with self._building.motorising():
+        with self._patcher.patch_model_loading():
             self._environment = build()
-        self._building.check()
-        kinds = type(
-            self._environment
-        ).__mro__  # of `dm_control.composer`, which need not have been imported?
+        self._patcher.check()
+        # Compared by name, because dm_control.composer may not be imported.
+        classes = type(self._environment).__mro__
         if settings.randomize is not None and any(
-            one.__module__.startswith("dm_control.composer") for one in kinds
+            environment_class.__module__.startswith("dm_control.composer")
+            for environment_class in classes
         ):
             raise ValueError(
-                f"randomize: {type(self._environment).__name__} builds its model anew at every"
-                " reset; let its own variations change it"
+                f"randomize: {type(self._environment).__name__} builds its model again at every"
+                " reset; use its own variations instead"
             )
         self._generator = np.random.default_rng(noise_seed)
         self._ended = True
         self._bound: tuple[mujoco.MjModel, ActuatorBank] | None = None
-        _ = self._motors  # what is wrong is said here
+        # The property raises here, and not later, if the motors do not fit the environment.
+        _ = self._bank
 
     def reset(self) -> dm_env.TimeStep:
-        """Start an episode, the motors at rest; composer environments build their model anew."""
+        """Start an episode, with the motors at rest; composer environments rebuild their model."""
         if self._settings.randomize is not None:
-            self._motors.draws.draw_one(self._generator)
-        with self._building.motorising():
+            self._bank.draws.draw_single(self._generator)
+        with self._patcher.patch_model_loading():
             timestep = self._environment.reset()
         self._ended = False
-        self._motors.begin(self._generator)
+        self._bank.begin(self._generator)
         return timestep
 
     def step(self, action: Any) -> dm_env.TimeStep:
-        """Advance by one environment step; an episode that has ended starts anew.
+        """Advance by one environment step; the step after the end of an episode resets.
 
         Raises:
-            ValueError: the action has not the shape of the action specification.
-            SimulationDivergedError: the simulation left the finite numbers, where the environment
-                does not end then.
+            ValueError: the shape of the action is not that of the action specification.
+            SimulationDivergedError: a value of the simulation is not finite, and the environment
+                itself does not end the episode then.
         """
         if self._ended:
             return self.reset()
-        motors, time = self._motors, self.mujoco[1].time
+        bank, time = self._bank, self.mujoco[1].time
         try:
-            with self._building.motorising():
-                timestep = self._environment.step(motors.controls(action))
-        except control.PhysicsError:  # or whatever else ends its simulation
-            motors.check_finite(type(self._environment).__name__, time)
+            with self._patcher.patch_model_loading():
+                timestep = self._environment.step(bank.controls(action))
+        except control.PhysicsError:
+            # The environment ended the simulation for its own reason, or because it diverged.
+            bank.check_finite(type(self._environment).__name__, time)
             raise
         self._ended = timestep.last()
         return timestep
 
     @property
-    def _motors(self) -> ActuatorBank:
-        """The motors in the present model."""
+    def _bank(self) -> ActuatorBank:
+        """Motors of the present model, which changes when the environment rebuilds it."""
         model, data = self.mujoco
         if self._bound is None or self._bound[0] is not model:
             spec = self._environment.action_spec()
@@ -96,62 +98,60 @@ class MotorsAddedEnvironment(dm_env.Environment):
                 np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum)
             )
             actions = spaces.Box(low, high, dtype=np.float64)
-            motors = ActuatorBank(
-                data, self._settings, actions, self._environment.control_timestep()
-            )
-            self._bound = model, motors
+            bank = ActuatorBank(data, self._settings, actions, self._environment.control_timestep())
+            self._bound = model, bank
         return self._bound[1]
 
     @property
     def motors(self) -> dict[int, ActuatorModel]:
-        """The motors of the present episode, by the index of the actuator in the model."""
-        return dict(self._motors.present)
+        """Actuator index in the model -> motor of the present episode."""
+        return dict(self._bank.motors)
 
     @property
     def randomization(self) -> dict[str, Any]:
-        """What the present episode was drawn with; empty if nothing was drawn."""
-        return self._motors.draws.report()
+        """Drawn values of the present episode; empty if nothing is randomized."""
+        return self._bank.draws.report()
 
     def signals(self) -> dict[str, Any]:
-        """The motors' signals after the last step, as in `info` of `codrl_mj.make`.
+        """Return the motors' signals after the last step, as in `info` of `codrl_mj.make`.
 
         `desired_force` and `actual_force` [N or N*m], the signals of the families and `saturated`;
-        of several motors arrays (n_motors,) in the model's order.
+        for several motors arrays (n_motors,) in the model's order.
         """
-        return self._motors.signals()
+        return self._bank.signals()
 
     @property
     def mujoco(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Present model and data; those of a composer environment change with every reset."""
+        """Present model and data; a composer environment replaces them at every reset."""
         physics = self._environment.physics
         return physics.model.ptr, physics.data.ptr
 
     def observation_spec(self) -> Any:
-        """The environment's."""
+        """Return the environment's observation specification."""
         return self._environment.observation_spec()
 
     def action_spec(self) -> Any:
-        """The environment's, with the limits of the motors' commands where these are what an action stands for."""
+        """Return the action specification, with the limits of the motors' commands."""
         spec = self._environment.action_spec()
         if self._settings.action == "force":
             return spec
-        space: Any = self._motors.action_space
+        space: Any = self._bank.action_space
         return specs.BoundedArray(spec.shape, spec.dtype, space.low, space.high, spec.name)
 
     def reward_spec(self) -> Any:
-        """The environment's."""
+        """Return the environment's reward specification."""
         return self._environment.reward_spec()
 
     def discount_spec(self) -> Any:
-        """The environment's."""
+        """Return the environment's discount specification."""
         return self._environment.discount_spec()
 
     def close(self) -> None:
-        """Free what the environment holds."""
+        """Close the environment."""
         self._environment.close()
 
     def __getattr__(self, name: str) -> Any:
-        """What else the environment has, such as `physics` and `task`."""
+        """Return another attribute of the environment, such as `physics` or `task`."""
         if name.startswith("__") or name == "_environment":
             raise AttributeError(name)
         return getattr(self._environment, name)
@@ -169,31 +169,32 @@ def make_dm_control(
     noise_seed: int | None = None,
     **options: Any,
 ) -> MotorsAddedEnvironment:
-    """An environment of dm_control's, or of anybody's made with it, with motors behind its actuators.
+    """Create a dm_control environment, or another of its interface, with motors.
 
-        >>> env = codrl_mj.make_dm_control("cheetah/run", {".*": "maxon-ec45-flat-50w"}, task_kwargs={"random": 1})
+        >>> motors = {".*": "maxon-ec45-flat-50w"}
+        >>> env = codrl_mj.make_dm_control("cheetah/run", motors, task_kwargs={"random": 1})
 
     With `"ideal"` actuators it is bit for bit the environment without them.
 
     Args:
         environment: `DOMAIN/TASK` of the suite, or a function that makes an environment.
-        actuators: what goes where, as for `codrl_mj.add_motors`.
-        action: as for `codrl_mj.make`, and so are the next three.
-        randomize: see there; what was drawn is in `randomization`. Not for environments that build
-            their model anew at every reset.
-        disturbances: see there; actions have to be the model's controls.
-        allow_unstable: see there.
-        joint_dynamics: see there.
-        noise_seed: of the noise of the motors' sensors, of draws and of load pulses.
-        **options: of `dm_control.suite.load`, or of the function.
+        actuators: pattern of actuators' names -> actuator, as for `codrl_mj.add_motors`.
+        action: as for `codrl_mj.make`.
+        randomize: as for `codrl_mj.make`; the drawn values are in `randomization`. Not for
+            environments that rebuild their model at every reset.
+        disturbances: as for `codrl_mj.make`; actions must be the model's controls.
+        allow_unstable: as for `codrl_mj.make`.
+        joint_dynamics: as for `codrl_mj.make`.
+        noise_seed: seed of the sensors' noise, of randomization and of load pulses.
+        **options: arguments of `dm_control.suite.load`, or of the function.
 
     Raises:
-        ValueError: see `codrl_mj.add_motors`; an unknown environment; its model is not built from
-            XML; or an argument does not go with the actuators or the environment.
+        ValueError: see `codrl_mj.add_motors`; an unknown environment; a model that is not built
+            from XML; or an argument that does not fit the actuators or the environment.
         RuntimeError: dm_control does not work with the installed MuJoCo.
     """
     check_dm_control()
-    resolved = resolve_patterns(actuators, "an environment of dm_control")
+    resolved = resolve_patterns(actuators, "a dm_control environment")
     disturbed = resolve(disturbances, OFF)
     settings = MotorSettings(
         resolved, action, False, randomize, disturbed, allow_unstable, joint_dynamics
@@ -202,7 +203,7 @@ def make_dm_control(
         return MotorsAddedEnvironment(lambda: environment(**options), settings, noise_seed)
     domain, _, task = environment.partition("/")
     if (domain, task) not in suite.ALL_TASKS:
-        known = ["/".join(each) for each in suite.ALL_TASKS]
+        known = ["/".join(pair) for pair in suite.ALL_TASKS]
         raise ValueError(
             f"environment = {environment!r}: {did_you_mean(environment, known)}must be DOMAIN/TASK"
             " of dm_control.suite.ALL_TASKS, or a function"

@@ -1,4 +1,4 @@
-"""Gymnasium's environments with motors: `make`."""
+"""Gymnasium environments with motors: `make`."""
 
 import copy
 import dataclasses
@@ -17,18 +17,18 @@ from codrl_mj.actuators import ActuatorModel
 from codrl_mj.disturbances import OFF, resolve
 from codrl_mj.engine.reading import bring_to_rest, motor_slots, motors
 from codrl_mj.engine.specs import resolve_patterns
-from codrl_mj.envs.motors import ActuatorBank, MotorSettings, longer
+from codrl_mj.envs.motors import ActuatorBank, MotorSettings, extend_space
 from codrl_mj.envs.recording import SubstepRecorder
 from codrl_mj.envs.snapshots import (
     check_snapshot,
     elapsed_steps,
     encode_name,
-    generator_of,
+    generator_from_words,
     set_elapsed_steps,
     set_state_of,
     state_of,
 )
-from codrl_mj.external_envs.building import Building
+from codrl_mj.external_envs.building import ModelPatcher
 from codrl_mj.physics.streams import words_of
 
 
@@ -44,37 +44,36 @@ def make(
     joint_dynamics: str | None = None,
     **options: Any,
 ) -> "MotorsAddedEnv":
-    """An environment of Gymnasium's, or of anybody's who registers with it, with motors behind its actuators.
+    """Create a Gymnasium environment, or another registered with it, with motors.
 
     With `"ideal"` actuators it is bit for bit the environment that `gymnasium.make` makes.
 
     Args:
-        env_id: the id; or a function, or class, that makes an environment of one's own, which needs
-            no id.
-        actuators: what goes where, as for `codrl_mj.add_motors`.
-        action: `force`: the environment's own actions, whose forces are what is desired (a position
-            servo stays one); or what the actuators take besides, such as `current` and `voltage`,
-            with their limits as the action space. The environment still computes its costs from its
-            own controls: from the torque that a current makes, or as many amperes as volts.
-        observe_actuator: whether the observation ends with what the motors' sensors say, motor by
+        env_id: the id; or a function, or class, that makes an environment, which needs no id.
+        actuators: pattern of actuators' names -> actuator, as for `codrl_mj.add_motors`.
+        action: `force`: the environment's own actions, whose forces are the desired ones (a
+            position servo stays one); or another command of the actuators, such as `current` and
+            `voltage`, whose limits become the action space. The environment still computes its
+            costs from its own controls: from the torque of a current, or from the number of volts.
+        observe_actuator: True to append the motors' sensor values to the observation, motor by
             motor.
-        randomize: path -> distribution (or its text): what is drawn at every reset: FIELD of all
-            motors, PATTERN:FIELD of those of a pattern, and of the model `model.mass.BODY`,
-            `model.gravity` and `model.damping.JOINT`; or pattern -> field -> distribution. What was
-            drawn is in the reset's info, `randomization`. The generator is not the environment's:
-            its initial states are the same as without.
-        disturbances: delay, quantum and rate of the commands, and load pulses, once an environment
-            step: see `codrl_mj.Disturbances`. Of a plain motor in its force [N or N*m] before the
-            gear, of others in what their control stands for.
+        randomize: path -> distribution (or its text), drawn at every reset: FIELD of all motors,
+            PATTERN:FIELD of those of a pattern, and of the model `model.mass.BODY`,
+            `model.gravity` and `model.damping.JOINT`; or pattern -> field -> distribution. The
+            drawn values are in the reset's info, `randomization`. The generator is not the
+            environment's, whose initial states therefore do not change.
+        disturbances: delay, quantum and rate of the commands, and load pulses, once per environment
+            step: see `codrl_mj.Disturbances`. They act on a plain motor's force [N or N*m] before
+            the gear, and on the control of other actuators.
         allow_unstable: as for `codrl_mj.add_motors`.
-        joint_dynamics: likewise.
-        **options: of `gymnasium.make` and the environment, such as `render_mode` and
+        joint_dynamics: as for `codrl_mj.add_motors`.
+        **options: arguments of `gymnasium.make` and the environment, such as `render_mode` and
             `max_episode_steps`.
 
     Raises:
         gymnasium.error.UnregisteredEnv: there is no such environment.
-        ValueError: see `codrl_mj.add_motors`; a model is not built from XML; or an argument does not
-            go with the actuators or the environment.
+        ValueError: see `codrl_mj.add_motors`; a model is not built from XML; or an argument does
+            not fit the actuators or the environment.
     """
     if isinstance(env_id, str):
         entry = gymnasium.spec(env_id)
@@ -87,7 +86,7 @@ def make(
         env_id = entry.id
     if str(entry.entry_point).startswith("codrl_mj.envs:"):
         raise ValueError(
-            f"{env_id}: its actuators are its own: gymnasium.make({env_id!r}, actuator=...)"
+            f"{env_id}: this task has its own actuators: gymnasium.make({env_id!r}, actuator=...)"
         )
     settings = MotorSettings(
         resolve_patterns(actuators, f"the environment {env_id}"),
@@ -98,91 +97,95 @@ def make(
         allow_unstable,
         joint_dynamics,
     )
-    spec, makes = copy.copy(entry), entry.entry_point
-    spec.entry_point = MotorsAdded(
-        load_env_creator(makes) if isinstance(makes, str) else makes, settings, env_id
+    spec, entry_point = copy.copy(entry), entry.entry_point
+    spec.entry_point = MotorsAddedCreator(
+        load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point,
+        settings,
+        env_id,
     )
     return MotorsAddedEnv(gymnasium.make(spec, **options))
 
 
 @dataclasses.dataclass(frozen=True)
-class MotorsAdded:
-    """What makes an environment with motors, in place of what makes it without."""
+class MotorsAddedCreator:
+    """Callable that makes an environment with motors, in place of the original entry point."""
 
     creator: Any
-    """A class or function that makes it without."""
+    """Original class or function, which makes it without motors."""
     settings: MotorSettings
-    """Of the motors."""
+    """Settings of the motors."""
     env_id: str
-    """The environment's, for messages."""
+    """Id of the environment, for messages."""
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """The environment's, which `gymnasium.make` asks for."""
-        return (
-            self.creator.metadata
-        )  # an AttributeError where a plain function makes the environment
+        """Metadata of the environment, which `gymnasium.make` reads."""
+        # A plain function has none; Gymnasium handles the AttributeError.
+        return self.creator.metadata
 
     def __call__(self, **options: Any) -> gymnasium.Env:
-        """Make it."""
+        """Make the environment."""
         settings = self.settings
-        building = Building(
+        patcher = ModelPatcher(
             settings.simulated, settings.allow_unstable, settings.joint_dynamics, settings.action
         )
-        with building.motorising():
+        with patcher.patch_model_loading():
             env = self.creator(**options)
-        building.check(self.env_id)
+        patcher.check(self.env_id)
         base: Any = env.unwrapped
-        kind: Any = type(base)
-        if issubclass(kind, MujocoEnv):
-            base.__class__, base.remade = (
-                _with_motors(kind),
+        env_class: Any = type(base)
+        # The class is exchanged on the existing object: the original creator, which may be a
+        # function, decides on the class and on the wrappers around it.
+        if issubclass(env_class, MujocoEnv):
+            base.__class__, base.recreate = (
+                _class_with_motors(env_class),
                 functools.partial(self.base, **options),
             )
         return env
 
     def base(self, **options: Any) -> gymnasium.Env:
-        """Make it, without wrappers around it."""
+        """Make the environment, without wrappers."""
         return self(**options).unwrapped
 
 
 @functools.cache
-def _with_motors(kind: Any) -> Any:
-    """A subclass of an environment's class that brings motors to rest where the state is set, and keeps them if copied.
+def _class_with_motors(env_class: Any) -> Any:
+    """Return a subclass that brings motors to rest with the state, and keeps motors in copies.
 
-    Gymnasium's environments copy and pickle themselves by being made again.
+    Gymnasium's environments copy and pickle themselves by calling their constructor again, which
+    knows nothing of motors.
     """
 
-    class WithMotors(kind):
-        remade: Any = None
+    class WithMotors(env_class):
+        recreate: Any = None
 
         @functools.cached_property
-        def _motors(self) -> list[np.ndarray]:
+        def _slots(self) -> list[np.ndarray]:
             return list(motor_slots(self.data, motors(self.model)).values())
 
         def set_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
-            for slot in self._motors:
+            for slot in self._slots:
                 bring_to_rest(slot, self.data.time, slot[1])
             super().set_state(qpos, qvel)
 
         def __reduce__(self) -> Any:
-            return self.remade, ()
+            return self.recreate, ()
 
     for name in ("__name__", "__qualname__", "__module__", "__doc__"):
-        setattr(WithMotors, name, getattr(kind, name))
+        setattr(WithMotors, name, getattr(env_class, name))
     return WithMotors
 
 
 class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
-    """What `make` adds to an environment that was built with motors.
+    """Wrapper that `make` puts around an environment that was built with motors.
 
     Every step's `info` has `desired_force` and `actual_force` [N or N*m], at the motors' side of
     the model's gears, the signals of the actuators' families and `saturated`, at the end of the
-    step; of several motors arrays (n_motors,) in the model's order.
+    step; for several motors arrays (n_motors,) in the model's order.
     """
 
     def __init__(self, env: gymnasium.Env) -> None:
-        """Wrap an environment that `MotorsAdded` made."""
+        """Wrap an environment that a `MotorsAddedCreator` made."""
         RecordConstructorArgs.__init__(self)
         super().__init__(env)
         base, name = env.unwrapped, env.spec.id if env.spec else ""
@@ -190,127 +193,140 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
             base, "data"
         ):
             raise ValueError(
-                f"{name}: has no MuJoCo model and data as attributes: build it inside"
+                f"{name}: has no MuJoCo model and data as attributes: build it in a block of"
                 " codrl_mj.motors_added, and read the motors with codrl_mj.signals"
             )
         assert base.spec is not None
         self._settings: MotorSettings = base.spec.entry_point.settings  # type: ignore[union-attr]
         self._generator = np.random.default_rng()
-        self._begun = False
+        self._was_reset = False
         self._bind()
 
     def _bind(self) -> None:
-        """Find the motors of the environment's model."""
+        """Find the motors of the environment's model, and set the spaces."""
         base: Any = self.unwrapped
-        self._watch: SubstepRecorder | None = None
-        self._motors = ActuatorBank(
+        self._recorder: SubstepRecorder | None = None
+        self._bank = ActuatorBank(
             base.data, self._settings, self.env.action_space, getattr(base, "dt", None)
         )
-        if self._motors.action_space is not self.env.action_space:
-            self.action_space = self._motors.action_space
-        if self._motors.sensors:
-            self.observation_space = longer(self.env.observation_space, len(self._motors.sensors))
+        if self._bank.action_space is not self.env.action_space:
+            self.action_space = self._bank.action_space
+        if self._bank.sensors:
+            self.observation_space = extend_space(
+                self.env.observation_space, len(self._bank.sensors)
+            )
 
     @property
     def motors(self) -> dict[int, ActuatorModel]:
-        """The motors of the present episode, by the index of the actuator in the model."""
-        return dict(self._motors.present)
+        """Actuator index in the model -> motor of the present episode."""
+        return dict(self._bank.motors)
 
     @property
     def signal_names(self) -> tuple[str, ...]:
-        """Of the motors' signals in `info`."""
-        return tuple(self._motors.signals())
+        """Names of the motors' signals in `info`."""
+        return tuple(self._bank.signals())
 
     @property
     def recorder(self) -> SubstepRecorder:
-        """Reads the environment between its steps; from now on every integration step is looked at."""
-        if self._watch is None:
+        """Reader of the state between steps; its first use starts recording integration steps."""
+        if self._recorder is None:
             dt = getattr(self.unwrapped, "dt", None)
-            self._watch = SubstepRecorder(
-                self._motors, self._settings.action, dt if isinstance(dt, float) else None
+            self._recorder = SubstepRecorder(
+                self._bank, self._settings.action, dt if isinstance(dt, float) else None
             )
-        return self._watch
+        return self._recorder
 
     @property
     def sensor_names(self) -> tuple[str, ...]:
-        """Names of what `observe_actuator` appends to the observation."""
-        return self._motors.sensors
+        """Names of the values that `observe_actuator` appends to the observation."""
+        return self._bank.sensors
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode, the motors at rest; a seed starts the generator of their draws too."""
+        """Start an episode, with the motors at rest; a seed also seeds the motors' generator."""
         if seed is not None:
-            own = np.random.SeedSequence(seed, spawn_key=(1,))  # independent of the environment's
-            self._generator = np.random.Generator(np.random.PCG64(own))
-        self._motors.draws.draw_one(self._generator)
+            # The spawn key makes the motors' numbers independent of the environment's own.
+            seed_sequence = np.random.SeedSequence(seed, spawn_key=(1,))
+            self._generator = np.random.Generator(np.random.PCG64(seed_sequence))
+        self._bank.draws.draw_single(self._generator)
         observation, info = self.env.reset(seed=seed, options=options)
-        self._begun = True
-        self._motors.begin(self._generator)
-        drawn = self.randomization
-        return self._observed(observation), info | ({"randomization": drawn} if drawn else {})
+        self._was_reset = True
+        self._bank.begin(self._generator)
+        drawn_values = self.randomization
+        return self._with_sensors(observation), info | (
+            {"randomization": drawn_values} if drawn_values else {}
+        )
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance by one environment step.
 
         Raises:
-            ValueError: the action has not the shape of the action space.
-            SimulationDivergedError: the simulation left the finite numbers.
+            ValueError: the shape of the action is not that of the action space.
+            SimulationDivergedError: a value of the simulation is not finite.
         """
-        motors = self._motors
-        time = motors.data.time
-        controls = motors.controls(action)
+        bank = self._bank
+        time = bank.data.time
+        controls = bank.controls(action)
         outcome = (
-            self.env.step(controls) if self._watch is None else self._watch.step(self.env, controls)
+            self.env.step(controls)
+            if self._recorder is None
+            else self._recorder.step(self.env, controls)
         )
         observation, reward, terminated, truncated, info = outcome
-        motors.check_finite(self._id, time)
-        return self._observed(observation), reward, terminated, truncated, info | motors.signals()
+        bank.check_finite(self._id, time)
+        return (
+            self._with_sensors(observation),
+            reward,
+            terminated,
+            truncated,
+            info | bank.signals(),
+        )
 
-    def _observed(self, observation: Any) -> Any:
-        if not self._motors.sensors:
+    def _with_sensors(self, observation: Any) -> Any:
+        if not self._bank.sensors:
             return observation
-        return np.concatenate([observation, self._motors.seen()]).astype(observation.dtype)
+        return np.concatenate([observation, self._bank.sensor_values()]).astype(observation.dtype)
 
     @property
     def randomization(self) -> dict[str, Any]:
-        """What the present episode was drawn with, as in the reset's info; empty if nothing was drawn."""
-        return self._motors.draws.report()
+        """Drawn values of the present episode, as in the reset's info; empty without draws."""
+        return self._bank.draws.report()
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on, as plain arrays: simulation, motors, generators, draws, time limit.
+        """Return the complete state as arrays: simulation, motors, generators, draws, time limit.
 
-        That is MuJoCo's state and what was computed from it, which observations and rewards read;
-        not what an environment keeps in attributes of its own, nor what wrappers count besides
-        `TimeLimit`. Of environments that are no `MujocoEnv` of Gymnasium's nobody knows where their
-        state is: the snapshot has the generators, and `restore` starts an episode.
+        It has MuJoCo's state and the arrays computed from it, which observations and rewards read;
+        not the environment's own attributes, nor counts of wrappers except `TimeLimit`. An
+        environment that is not a Gymnasium `MujocoEnv` may store its state anywhere: its snapshot
+        has only the generators, and `restore` starts an episode.
         """
         return {
             "environment": encode_name(self._id),
-            **(state_of(self._motors.data) if self._whole else {}),
+            **(state_of(self._bank.data) if self._has_known_state else {}),
             "generator": words_of(self.unwrapped.np_random),
             "motors_generator": words_of(self._generator),
             "elapsed_steps": elapsed_steps(self.env),
-            **self._motors.snapshot(),
+            **self._bank.snapshot(),
         }
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> Any:
-        """Continue from what `snapshot` returned, bit for bit, in an environment made with the same arguments.
+        """Continue from a snapshot, bit for bit, in an environment made with the same arguments.
 
         Returns:
-            None; or the first observation of the episode that was started, where the state is not
-            in the snapshot.
+            None; or the first observation of a new episode, if the state is not in the snapshot.
         """
         check_snapshot(snapshot, self.snapshot(), "environment")
-        if not self._begun:  # which Gymnasium's wrappers insist on
+        # Gymnasium's wrappers refuse to be used before a first reset.
+        if not self._was_reset:
             self.env.reset()
-            self._begun = True
-        self._motors.restore(snapshot)
-        self.unwrapped.np_random = generator_of(snapshot["generator"])
-        self._generator = generator_of(snapshot["motors_generator"])
-        if not self._whole:
+            self._was_reset = True
+        self._bank.restore(snapshot)
+        self.unwrapped.np_random = generator_from_words(snapshot["generator"])
+        self._generator = generator_from_words(snapshot["motors_generator"])
+        if not self._has_known_state:
             return self.reset()[0]
-        set_state_of(self._motors.data, snapshot["state"], snapshot["computed"])
+        set_state_of(self._bank.data, snapshot["state"], snapshot["computed"])
         set_elapsed_steps(self.env, snapshot["elapsed_steps"])
         return None
 
@@ -319,22 +335,23 @@ class MotorsAddedEnv(gymnasium.Wrapper, RecordConstructorArgs):
         return "" if self.env.spec is None else self.env.spec.id
 
     @property
-    def _whole(self) -> bool:
-        """Whether all of the environment's state is known."""
+    def _has_known_state(self) -> bool:
+        """True if MuJoCo's data contain the environment's whole state."""
         return isinstance(self.unwrapped, MujocoEnv)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but what belongs to the model, which a copied environment makes again."""
+        """Return all but what belongs to the model, which a copied environment builds again."""
         return {
             name: value
             for name, value in self.__dict__.items()
-            if name not in ("_motors", "_watch")
+            if name not in ("_bank", "_recorder")
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore, in this or another process; as with all of Gymnasium's, the copy has to be reset."""
-        self.__dict__.update(state, _begun=False)
+        """Restore in this or another process; as with Gymnasium's environments, reset the copy."""
+        self.__dict__.update(state, _was_reset=False)
         base = self.unwrapped
-        if base.model is not base.data.model:  # type: ignore[attr-defined]  # MuJoCo copies data with its model
+        # MuJoCo copies data together with a model of its own.
+        if base.model is not base.data.model:  # type: ignore[attr-defined]
             base.model = base.data.model  # type: ignore[attr-defined]
         self._bind()

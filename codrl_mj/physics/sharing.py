@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numba import types
 
-from codrl_mj.compile_cache import external, njit
+from codrl_mj.compile_cache import external_function, njit
 from codrl_mj.engine.memory import atomic_add, atomic_load, internal
 from codrl_mj.physics.compiled_task import Compiled
 
@@ -27,7 +27,7 @@ _PATIENCE, _AT_ONCE = 1000, 500
 """How often a thread looks for the next turn before it sleeps: about a millisecond; and before it
 offers its CPU to those who have none.
 """
-_offer_cpu = external(
+_offer_cpu = external_function(
     "offer_cpu",
     ctypes.windll.kernel32.SwitchToThread if os.name == "nt" else ctypes.CDLL(None).sched_yield,  # type: ignore[attr-defined]
     types.int32(),

@@ -8,12 +8,12 @@ import numpy as np
 from gymnasium.utils import seeding
 from numba import types
 
-from codrl_mj.compile_cache import external, njit
+from codrl_mj.compile_cache import external_function, njit
 
 WORDS = 6
 """Numbers that hold one generator's state: PCG64's state and increment (two words each), and its spare 32 bits."""
 _LOW = 2**64 - 1
-_next_double = external(
+_next_double = external_function(
     "next_double",
     ctypes.cast(np.random.PCG64(0).ctypes.next_double, ctypes.c_void_p),
     types.float64(types.uintp),

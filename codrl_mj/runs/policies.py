@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.actuators import trusting
+from codrl_mj.actuators import allow_imports
 from codrl_mj.agents import AgentConfig, agent_from_mapping
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs import DESCRIPTION, DIGEST, WEIGHTS
@@ -106,7 +106,7 @@ def load_policy(folder: Path, trust: bool = False) -> Any:
     content = weights.read_bytes()
     check_digest(weights, content, description.get(DIGEST), DESCRIPTION)
     try:
-        with trusting(trust):
+        with allow_imports(trust):
             agent = agent_from_mapping(description["agent"])
         spaces_ = (
             _make_space(description["observation_space"]),

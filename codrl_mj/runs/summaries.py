@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from codrl_mj.actuators import actuator_from_mapping, name_of, trusting
-from codrl_mj.envs.worlds import patterns_of
+from codrl_mj.actuators import actuator_from_mapping, allow_imports, name_of
+from codrl_mj.envs.sources import pattern_mapping
 from codrl_mj.fields import leaves
 from codrl_mj.runs import (
     BEST,
@@ -270,7 +270,7 @@ def _actuator_of(env: Mapping[str, Any], task: str | None, labels: Any) -> str |
     """What to call an environment's actuators: those of motors, in environments of others those of patterns."""
     if "actuator" not in env:
         return None
-    each, patterns = env["actuator"], patterns_of(env["actuator"])
+    each, patterns = env["actuator"], pattern_mapping(env["actuator"])
     if patterns is not None:
         each = list(patterns.values())
     elif not isinstance(each, list):
@@ -285,7 +285,7 @@ def _actuator_of(env: Mapping[str, Any], task: str | None, labels: Any) -> str |
             names.append(str(label or actuator or "ideal"))
             continue
         try:
-            with trusting(False):
+            with allow_imports(False):
                 names.append(name_of(actuator_from_mapping(actuator), paper))
         except (
             ValueError,

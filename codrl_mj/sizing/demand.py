@@ -129,15 +129,15 @@ def demands_of(
                 f"{path}: was trained on {others[0]}: must be ideal, whose torques are the task's"
                 " and not a motor's; train it with --actuator ideal, or name the task instead"
             )
-        env = env.world.as_with_motors(env)
+        env = env.source.as_with_motors(env)
         ran = run_episodes(load_policy(path, trust), env.make, episodes, seed)
         return _gathered(f"the policy {path.name} of {env.task}", env, ran)
     from codrl_mj.sizing.scripted import Scripted, state_observed
 
     env = EnvConfig(str(what), "ideal")
-    policy, env = Scripted(env.world.scripted), env.world.as_with_motors(env)
+    policy, env = Scripted(env.source.scripted), env.source.as_with_motors(env)
     ran = run_episodes(policy, lambda: state_observed(env.make()), episodes, seed)
-    return _gathered(f"{policy.description} of {env.world.name}", env, ran)
+    return _gathered(f"{policy.description} of {env.source.name}", env, ran)
 
 
 def recorded(time: Any, torque: Any, speed: Any, source: str = "a recording") -> Demand:
@@ -186,7 +186,7 @@ def _gathered(source: str, env: Any, ran: Sequence[Any]) -> dict[str, Demand]:
     from codrl_mj.engine.reading import motors
     from codrl_mj.engine.specs import ON_JOINT
 
-    swing, ends = None, [env.world.at_goal(one) for one in ran]
+    swing, ends = None, [env.source.at_goal(one) for one in ran]
     if all(end is not None for end in ends):
         source = (
             f"{source}, {sum(bool(end[-1]) for end in ends if end is not None)} of {len(ran)}"

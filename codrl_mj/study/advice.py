@@ -309,7 +309,7 @@ def measurement(
     )
     options = {IDEAL: Trial(base, "it", here)}
     if (
-        "timestep" in here.world.fields and len(here.actuators) == 1
+        "timestep" in here.source.fields and len(here.actuators) == 1
     ):  # a loop is designed, and a lag drawn, for one
         better = redesign(here.actuators[0], base.task)
         if better is not None:
@@ -330,7 +330,7 @@ def _ideal_arm(subject: str, trust: bool = False) -> Arm:
         config = load_config(Path(subject), trust)
     else:
         env = EnvConfig(subject)
-        config = TrainConfig.preset(subject, env.world.default_agent(env))
+        config = TrainConfig.preset(subject, env.source.default_agent(env))
     never = max(config.total_steps or 10**9, 10**9)
     env = dataclasses.replace(
         config.env, actuator=IDEAL_ACTUATOR, randomize=None, allow_unstable=False

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.user_code import call, check_form, place
+from codrl_mj.user_code import call, check_form, source_location
 
 _TEXTS = ("name", "env_id", "asset", "actuator", "agent")
 _NAMES = ("state_names", "observation_names", "motors", "integrators")
@@ -120,7 +120,9 @@ def check_functions(task: Any) -> None:
         or (np.subtract(*bounds) > 0.0).any()
     ):
         form = "the lower and the upper bounds of the draws, two arrays (k,) of finite numbers"
-        raise ValueError(f"{place(task.initial_bounds)}: returns {bounds!r}, must return {form}")
+        raise ValueError(
+            f"{source_location(task.initial_bounds)}: returns {bounds!r}, must return {form}"
+        )
     low, high = np.asarray(bounds, dtype=np.float64)
     draws = np.stack([low + share * (high - low) for share in (0.25, 0.75)], axis=-1)
     before, after = (
@@ -162,7 +164,7 @@ def _call_function(task: Any, name: str, names: str, *arguments: Any) -> Any:
     # Entries must be finite, but a start may have an infinite reward.
     if (~np.isfinite(array) if names else np.isnan(array)).any():
         raise ValueError(
-            f"{place(function)}: returns {value} for a state where an episode may start: must be"
+            f"{source_location(function)}: returns {value} for a state where an episode may start: must be"
             " finite"
         )
     return value

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.actuators import trusting
+from codrl_mj.actuators import allow_imports
 from codrl_mj.agents import AgentConfig, agent_from_mapping, check_fits
 from codrl_mj.agents.ppo import PPOConfig
 from codrl_mj.agents.presets import OTHER_ENV, find_preset
@@ -109,7 +109,7 @@ class TrainConfig(Checked):
         """
         env_config = EnvConfig(task, options=(env or {}).get("options"))
         check_fits(agent, env_config)
-        preset = find_preset(agent, env_config.world.preset or OTHER_ENV, settings)
+        preset = find_preset(agent, env_config.source.preset or OTHER_ENV, settings)
         names = {field.name for field in dataclasses.fields(cls)} - {"env"}
         values = {name: value for name, value in vars(preset).items() if name in names}
         fields = {"actuator": actuator, **preset.env, **(env or {}), "task": task}
@@ -118,7 +118,7 @@ class TrainConfig(Checked):
     @property
     def evaluation_env(self) -> EnvConfig:
         """Environment of evaluations: without the training's changes of time limit and reward."""
-        changed: dict[str, Any] = dict.fromkeys(self.env.world.posed)
+        changed: dict[str, Any] = dict.fromkeys(self.env.source.evaluation_overrides)
         return dataclasses.replace(self.env, **changed)
 
     def as_mapping(self) -> dict[str, Any]:
@@ -186,7 +186,7 @@ def default_agent(task: str, options: Any = None) -> str:
     actions may depend on the environment's `options`.
     """
     env_config = EnvConfig(task, options=options)
-    return env_config.world.default_agent(env_config)
+    return env_config.source.default_agent(env_config)
 
 
 def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConfig:
@@ -218,7 +218,7 @@ def read_config(path: Path, trust: bool = False, **overriding: Any) -> TrainConf
                 **content,
                 **{key: value for key, value in overriding.items() if value is not None},
             }
-        with trusting(trust):
+        with allow_imports(trust):
             return TrainConfig.from_mapping(content)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None

@@ -13,7 +13,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from codrl_mj.actuators import label_of, set_display_name, trusting
+from codrl_mj.actuators import allow_imports, label_of, set_display_name
 from codrl_mj.fields import command, differing
 from codrl_mj.runs import (
     BEST,
@@ -65,7 +65,7 @@ def load_config(run: Path, trust: bool = False) -> TrainConfig:
     """
     content = read_json(run / CONFIG, "run configuration")
     try:
-        with trusting(trust):
+        with allow_imports(trust):
             config = TrainConfig.from_mapping(content["train"], whole=True)
         for actuator, label in zip(config.actuators, content.get("labels", ()), strict=False):
             set_display_name(actuator, label)

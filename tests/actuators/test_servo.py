@@ -286,7 +286,7 @@ def test_an_agent_asks_a_servo_for_positions():
 @pytest.mark.parametrize(
     ("env_id", "options", "message"),
     [
-        ("Pendulum-v0", {}, "a Servo is not asked for forces; must be one of position"),
+        ("Pendulum-v0", {}, "a Servo does not take forces; must be one of position"),
         (
             "Acrobot-v0",
             {"levels": (-1.0, 0.0, 1.0)},

@@ -16,12 +16,12 @@ from tests.add_motors.models import Signals, Worn, arm
 
 
 def test_the_plugin_is_registered_once_and_keeps_its_slot():
-    slot, structure = plugin.registered()[plugin.NAME]
+    slot, structure = plugin.registered_plugins()[plugin.NAME]
     count = plugin.library().mjp_pluginCount()
     plugin.register()
     importlib.reload(codrl_mj)
     assert plugin.library().mjp_pluginCount() == count
-    assert plugin.registered()[plugin.NAME][0] == slot
+    assert plugin.registered_plugins()[plugin.NAME][0] == slot
     assert structure.capabilityflags == 1
     assert [structure.attributes[index] for index in range(structure.nattribute)] == [b"family"]
 
@@ -30,7 +30,7 @@ def test_an_import_compiles_nothing_and_a_second_copy_raises():
     """Without the check, MuJoCo would end the process."""
     code = (
         "import sys, codrl_mj; from codrl_mj import plugin; assert 'numba' not in"
-        " sys.modules\nprint(list(plugin.registered())[-1])\nfor name in [name for name in"
+        " sys.modules\nprint(list(plugin.registered_plugins())[-1])\nfor name in [name for name in"
         " sys.modules if name.startswith('codrl_mj')]: del sys.modules[name]\nimport codrl_mj"
     )
     result = subprocess.run(
@@ -56,7 +56,7 @@ def test_an_import_compiles_nothing_and_a_second_copy_raises():
     ],
 )
 def test_another_structure_raises(change):
-    slot, original = plugin.registered()["mujoco.pid"]
+    slot, original = plugin.registered_plugins()["mujoco.pid"]
     structure = plugin.Plugin()
     ctypes.pointer(structure)[0] = original
     plugin.check_structure({"mujoco.pid": (slot, structure)})

@@ -15,7 +15,7 @@ import pytest
 
 import codrl_mj
 from codrl_mj.actuators import Lag, reference
-from codrl_mj.plugin import NAME, registered
+from codrl_mj.plugin import NAME, registered_plugins
 from tests.add_motors.models import (
     GYMNASIUM,
     INTEGRATORS,
@@ -209,7 +209,10 @@ def register_anew(model):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (register_anew, f"plugin slot = 0: a motor of codrl_mj needs {registered()[NAME][0]}"),
+        (
+            register_anew,
+            f"plugin slot = 0: a motor of codrl_mj needs {registered_plugins()[NAME][0]}",
+        ),
         (set_user(0, 1.0), "its actuator's user data do not begin with codrl_mj's signature"),
         (swap_families, "family = 'codrl_mj.actuators.current_loop:DCMotorActuator' of its plugin"),
         (set_user(2, 123.0), "family 123 is not known in this process: import its module and call"),

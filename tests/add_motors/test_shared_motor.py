@@ -234,7 +234,7 @@ def test_evaluation_variants_keep_a_shared_motor(monkeypatch):
     )
     config = codrl_mj.EnvConfig("Leg-v0", ACTUATORS, max_episode_steps=10)
     lag = Lag(time_constant=0.01)
-    assert config.world.overlaid(config, {"knee": "ideal"}) == {
+    assert config.source.overlaid(config, {"knee": "ideal"}) == {
         "hip_p & hip_v": lag,
         "knee": "ideal",
     }
@@ -258,7 +258,7 @@ def test_both_commands_are_delayed_and_loads_act_once():
 
 
 def test_a_shared_motor_refuses_current_commands():
-    with pytest.raises(ValueError, match="hip_p: is no plain motor of its own"):
+    with pytest.raises(ValueError, match="hip_p: is not a plain motor"):
         codrl_mj.make(Leg, {"hip_p & hip_v": MAXON}, action="current", disable_env_checker=True)
 
 

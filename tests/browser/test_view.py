@@ -97,7 +97,10 @@ def test_settings_change_the_simulation_and_unstable_ones_are_said(browser, open
     voltage = field(page, "voltage [V]")
     voltage.fill("7")
     voltage.press("Enter")
-    until(page, lambda: browser.session.config.driven[".*"].supply.voltage == pytest.approx(7.0))
+    until(
+        page,
+        lambda: browser.session.config.actuators_by_name[".*"].supply.voltage == pytest.approx(7.0),
+    )
 
 
 def test_signals_that_differ_by_rounding_alone_are_drawn(browser, opened):

@@ -84,4 +84,4 @@ def test_ctrl_c_while_the_program_is_imported_is_one_line(words):
     Path("sitecustomize.py").write_text(STOPPED_AT_AN_IMPORT)
     path = os.pathsep.join([str(Path.cwd()), *filter(None, sys.path)])
     done = program(*words, "--help", env=os.environ | {"PYTHONPATH": path})
-    assert (done.returncode, done.stderr) == (130, "codrl-mj: stopped before anything was begun\n")
+    assert (done.returncode, done.stderr) == (130, "codrl-mj: stopped before it started\n")

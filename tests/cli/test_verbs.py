@@ -15,7 +15,7 @@ from codrl_mj.actuators import NAMED, CurrentLoop, Motor, Supply
 from codrl_mj.agents.presets import OTHER_ENV, PRESETS
 from codrl_mj.cli import VERBS, find_verb, main
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.envs.worlds import find_world
+from codrl_mj.envs.sources import find_source
 from codrl_mj.evaluation import evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.tasks import TASKS, named_actuator
@@ -71,7 +71,7 @@ def test_the_help_explains_every_named_actuator_and_every_field_with_its_unit(ca
         "[s]",
     ):
         assert unit in text
-    names = {*find_world("cartpole").fields} - {"task", "actuator", "options"}
+    names = {*find_source("cartpole").fields} - {"task", "actuator", "options"}
     for flag in (
         *(f"env.{name.replace('_', '-')}" for name in names),
         "env.center-radius",

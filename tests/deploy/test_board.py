@@ -128,7 +128,7 @@ def test_changed_gain_in_the_c_changes_the_motor_current(folder, tmp_path):
 
 
 FURUTA = EnvConfig("furuta")
-(DRIVE,) = FURUTA.driven.values()
+(DRIVE,) = FURUTA.actuators_by_name.values()
 CLAMPING = DRIVE.replaced({"controller.anti_windup": "clamping"})
 LATE_AND_SAGGING = {
     "controller.delayed": True,

@@ -115,7 +115,7 @@ LOOPS = {
 
 @pytest.mark.parametrize(("name", "double"), each(LOOPS, "late"))
 def test_current_loop_in_c_equals_the_drives_sample_by_sample(tmp_path, name, double):
-    (usual,) = EnvConfig("furuta").driven.values()
+    (usual,) = EnvConfig("furuta").actuators_by_name.values()
     changed = {f"controller.{field}": value for field, value in LOOPS[name].items()}
     # The infinite inertia keeps the speed during a step, as the engine does.
     drive = usual.replaced(changed | {"motor.load_inertia": np.inf})
@@ -166,7 +166,7 @@ PID = {
 
 @pytest.mark.parametrize(("name", "double"), each(PID, "filtered"))
 def test_papers_loop_in_c_equals_the_actuators_sample_by_sample(tmp_path, name, double):
-    (usual,) = EnvConfig("cartpole").driven.values()
+    (usual,) = EnvConfig("cartpole").actuators_by_name.values()
     controller = dataclasses.replace(usual.controller, **PID[name])
     supply = Supply(12.0, 0.5) if name == "sagging" else usual.supply
     actuator = dataclasses.replace(usual, controller=controller, supply=supply)
@@ -233,7 +233,7 @@ SERVOS = {
 
 @pytest.mark.parametrize(("name", "double"), each(SERVOS, "position"))
 def test_servo_loops_in_c_equal_the_servos_sample_by_sample(tmp_path, name, double):
-    (drive,) = EnvConfig("furuta").driven.values()
+    (drive,) = EnvConfig("furuta").actuators_by_name.values()
     loop = ServoLoop(servo_rate=500.0, **SERVOS[name])
     servo = Servo(
         dataclasses.replace(drive.motor, gear_ratio=3.0), drive.controller, drive.supply, loop

@@ -53,7 +53,7 @@ def test_log_of_the_simulation_equals_the_simulation(logged, task):
 
 
 def test_real_motor_in_the_simulation_reduces_the_errors(logged, tmp_path):
-    (drive,) = FURUTA.driven.values()
+    (drive,) = FURUTA.actuators_by_name.values()
     real = drive.replaced({"motor.torque_constant": 0.03, "motor.viscous_friction": 3e-5})
     log, contract, *_ = logged("furuta")
     # The loop in the C has the motor of the training.
@@ -130,7 +130,7 @@ def test_bad_logs_and_options_are_errors(logged, tmp_path, capsys):
         assert message in capsys.readouterr().err
     with pytest.raises(ValueError, match="unknown to the policy"):
         compare(EnvConfig("cartpole"), log)
-    (drive,) = FURUTA.driven.values()
+    (drive,) = FURUTA.actuators_by_name.values()
     with pytest.raises(
         ValueError, match=r"converted to this motor, is beyond the simulation's bound, \["
     ):

@@ -184,7 +184,7 @@ CURRENTS = {"action": "current", "observe_actuator": True}
 )
 def test_units_are_those_of_state_signals_and_commands(task, changes, units, expected):
     config = EnvConfig(task, **changes)
-    observations, (action,) = config.world.interface(config)
+    observations, (action,) = config.source.interface(config)
     assert [entry["unit"] for entry in observations] == units
     assert (action["name"], action["unit"], action.get("levels"), action.get("most")) == expected
 
@@ -213,7 +213,7 @@ def test_raises_for_wrong_observations_or_a_wrong_rate(exported, change, rate, m
 
 def test_raises_for_another_actuator_with_the_field_that_differs(exported):
     contract = Contract.read(exported)
-    (drive,) = EnvConfig("furuta").driven.values()
+    (drive,) = EnvConfig("furuta").actuators_by_name.values()
     contract.check_actuators({"motor": drive})
     weaker = drive.replaced({"supply.voltage": 6.0})
     for actuator, message in {

@@ -1,4 +1,4 @@
-"""Every face of an environment, set up and driven alike; run as a program, it goes on from what another one left."""
+"""All interfaces of an environment, built and stepped alike; as a program, it resumes snapshots."""
 
 import math
 import sys
@@ -20,12 +20,13 @@ from tests.envs.vectors import batched
 PHYSICS = ("mujoco", "analytic")
 MOTOR = changed(FULL, inductance=0.2, substeps=3)
 """A motor whose every constant differs from 1, slow enough for the longest step, 0.05 s."""
-LIMIT = {task: {"current": TASKS[task].max_force * 0.5 / 0.8, "voltage": 4.0} for task in TASKS}
+COMMAND_LIMITS = {
+    task: {"current": TASKS[task].max_force * 0.5 / 0.8, "voltage": 4.0} for task in TASKS
+}
 """Largest command by task and kind, for `MOTOR`: arm 0.5, kT 0.8 N m/A, 4 V."""
 DRIVE = {
-    "controller.kp": LogUniform(
-        0.3, 15.0
-    ),  # straddles instability on every task; such draws are rejected
+    # The range includes unstable gains on every task; such draws are rejected.
+    "controller.kp": LogUniform(0.3, 15.0),
     "motor.inductance": Uniform(0.05, 0.2),
     "motor.torque_constant": Uniform(0.5, 1.5),
     "motor.arm_radius": Uniform(0.2, 1.2),
@@ -33,28 +34,28 @@ DRIVE = {
     "controller.substeps": Choice([1, 2, 3]),
     "controller.bemf_compensation": Choice([True, False]),
 }
-"""Of the motor, drawn."""
+"""Randomized fields of the motor."""
 
 
-# -- set-ups ------------------------------------------------------------------------------------------------
+# -- arguments ------------------------------------------------------------------------------------
 
 
 def commanded(task, command):
-    """Arguments for a command of `MOTOR`; discrete tasks get four uneven levels."""
+    """Return arguments for a command of `MOTOR`; discrete tasks get four uneven levels."""
     arguments = {"actuator": MOTOR, "action": command}
     if command != "force" and isinstance(TASKS[task].action_space, gymnasium.spaces.Discrete):
-        limit = LIMIT[task][command]
+        limit = COMMAND_LIMITS[task][command]
         arguments["levels"] = (-limit, -limit / 3, limit / 7, limit)
     return arguments
 
 
 def scales(task):
-    """Every scale factor of a task's model, drawn."""
+    """Return a distribution for each scale factor of a task's model."""
     return {name: Uniform(0.6, 1.7) for name in variable(bare_model(task)) if "damping" not in name}
 
 
 def everything(task, physics):
-    """Arguments with every disturbance, and every field drawn, that the physics has."""
+    """Return arguments with every disturbance and every random field that the physics supports."""
     model = {} if physics == "analytic" else scales(task)
     return {
         "actuator": imperfect(named_actuator("paper", task).as_mapping()),
@@ -69,7 +70,7 @@ SETUPS = ("ideal", "force", "current", "voltage", "everything")
 
 
 def arguments(task, setup, physics="mujoco"):
-    """An environment's, by the set-up's name."""
+    """Return the arguments of a setup by its name."""
     if setup == "ideal":
         return {"actuator": "ideal"}
     if setup == "everything":
@@ -78,38 +79,38 @@ def arguments(task, setup, physics="mujoco"):
     return commanded(task, setup) | {"observe_actuator": setup != "force"} | drawn
 
 
-# -- faces --------------------------------------------------------------------------------------------------
+# -- interfaces -----------------------------------------------------------------------------------
 
 
 LIMITED = {"max_episode_steps": 11}
 FACES = {
     "one": ActuatedEnv,
-    "one, analytic": lambda task, **given: ActuatedEnv(task, physics="analytic", **given),
-    "many, NextStep": lambda task, **given: (
-        batched(task, 3, "NextStep", **LIMITED, **given).unwrapped
+    "one, analytic": lambda task, **options: ActuatedEnv(task, physics="analytic", **options),
+    "many, NextStep": lambda task, **options: (
+        batched(task, 3, "NextStep", **LIMITED, **options).unwrapped
     ),
-    "many, SameStep": lambda task, **given: (
-        batched(task, 3, "SameStep", **LIMITED, **given).unwrapped
+    "many, SameStep": lambda task, **options: (
+        batched(task, 3, "SameStep", **LIMITED, **options).unwrapped
     ),
-    "serial, analytic": lambda task, **given: SerialVectorEnv(
-        3, task, physics="analytic", **LIMITED, **given
+    "serial, analytic": lambda task, **options: SerialVectorEnv(
+        3, task, physics="analytic", **LIMITED, **options
     ),
-    "Stable-Baselines3": lambda task, **given: make_sb3_vec_env(
-        TASKS[task].env_id, 3, **LIMITED, **given
+    "Stable-Baselines3": lambda task, **options: make_sb3_vec_env(
+        TASKS[task].env_id, 3, **LIMITED, **options
     ),
-    "dm_control": lambda task, **given: suite.load(task, **LIMITED, **given),
+    "dm_control": lambda task, **options: suite.load(task, **LIMITED, **options),
 }
 
 
-def made(face, task, setup):
-    """An environment."""
+def make_face(face, task, setup):
+    """Make an environment with an interface."""
     return FACES[face](
         task, **arguments(task, setup, "analytic" if "analytic" in face else "mujoco")
     )
 
 
-def begun(env, seed=None):
-    """What the start of an episode returns, of a seed if one is given."""
+def start_episode(env, seed=None):
+    """Start an episode, with a seed if one is given; return what the interface returns."""
     if isinstance(env, suite.DmEnvironment):
         env.env.reset(seed=seed)
         return env.reset()
@@ -121,9 +122,9 @@ def begun(env, seed=None):
 
 
 def plain(value):
-    """Nested results as dictionaries, tuples and arrays of their own, without the times that things took."""
+    """Return nested results as dictionaries, tuples and copied arrays, without measured times."""
     if isinstance(value, dict):
-        return {name: plain(one) for name, one in value.items() if name != "t"}
+        return {name: plain(item) for name, item in value.items() if name != "t"}
     if isinstance(value, tuple | list):
         return tuple(map(plain, value))
     if isinstance(value, np.ndarray) and value.dtype == object:
@@ -132,24 +133,29 @@ def plain(value):
 
 
 def arrays(value):
-    """Every numeric array in nested results."""
+    """Return all numeric arrays in nested results."""
     if isinstance(value, dict):
         value = tuple(value.values())
     if isinstance(value, tuple | list) or (isinstance(value, np.ndarray) and value.dtype == object):
-        return [array for one in value for array in arrays(one)]
+        return [array for item in value for array in arrays(item)]
     return [value] if isinstance(value, np.ndarray) else []
 
 
 def run(env, count, seed, vandal=False):
-    """All that random steps return and leave, with a new episode after each that ended and after every 40th.
+    """Return results and states of random steps; reset after an episode and every 40th step.
 
-    A vandal writes into all that it was given, and into the actions that were taken.
+    If `vandal` is True, all returned arrays and the actions are overwritten after each step.
     """
     generator = np.random.default_rng(seed)
-    several, found, kept, over = hasattr(env, "num_envs"), [plain(env.randomization)], [], False
+    is_vector, results, returned, ended = (
+        hasattr(env, "num_envs"),
+        [plain(env.randomization)],
+        [],
+        False,
+    )
     space, shape = (
         getattr(env, "single_action_space", env.action_space),
-        (env.num_envs,) if several else (),
+        (env.num_envs,) if is_vector else (),
     )
     for index in range(count):
         if hasattr(space, "n"):
@@ -158,27 +164,28 @@ def run(env, count, seed, vandal=False):
             action = (space.high * generator.uniform(-1.5, 1.5, (*shape, *space.shape))).astype(
                 np.float32
             )
-        given = np.array(action)
-        seen = begun(env) if over or index % 40 == 39 else env.step(action)
-        np.testing.assert_array_equal(action, given)
-        stepped = isinstance(env, ActuatedEnv) and len(seen) == 5
-        over = stepped and seen[2]
-        states = env.get_attr("state") if several else env.state
-        found.append(plain((seen, states, env.randomization, env.trace if stepped else None)))
+        original_action = np.array(action)
+        outcome = start_episode(env) if ended or index % 40 == 39 else env.step(action)
+        np.testing.assert_array_equal(action, original_action)
+        is_step = isinstance(env, ActuatedEnv) and len(outcome) == 5
+        ended = is_step and outcome[2]
+        states = env.get_attr("state") if is_vector else env.state
+        results.append(plain((outcome, states, env.randomization, env.trace if is_step else None)))
         if vandal:
-            for array in arrays((seen, states, action)):
+            for array in arrays((outcome, states, action)):
                 array[...] = 1
         else:
-            kept += [(array, array.copy()) for array in arrays((seen, states))]
-    for array, copied in kept:  # no later step has written into what was returned
+            returned += [(array, array.copy()) for array in arrays((outcome, states))]
+    # No later step may write into arrays that were returned earlier.
+    for array, copied in returned:
         np.testing.assert_array_equal(array, copied)
-    return tuple(found)
+    return tuple(results)
 
 
 def main(folder):
-    """Restore every snapshot that is in a folder, and leave beside each the one that follows from it."""
+    """Restore every snapshot in a folder, continue, and write the next snapshot beside it."""
     for file in sorted(Path(folder).glob("*.before")):
-        env = made("Stable-Baselines3", file.stem, "everything")
+        env = make_face("Stable-Baselines3", file.stem, "everything")
         env.restore(load_file(file))
         run(env, 60, seed=1)
         save_file(env.snapshot(), file.with_suffix(".after"))

@@ -1,4 +1,4 @@
-"""A world from outside: a rig that is registered nowhere, found as `tests.envs.rig:RIG`."""
+"""Custom env source that is registered nowhere: `tests.envs.rig:RIG`."""
 
 import gymnasium
 import mujoco
@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 import codrl_mj
-from codrl_mj.envs.worlds import EnvSource
+from codrl_mj.envs.sources import EnvSource
 
 XML = """
 <mujoco model="rig">
@@ -16,18 +16,20 @@ XML = """
     <body name="rod"><joint name="hinge" axis="0 1 0" damping="0.01"/>
       <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="0.2"/></body>
   </worldbody>
-  <actuator><motor name="drive" joint="hinge" gear="1" ctrllimited="true" ctrlrange="-1 1"/></actuator>
+  <actuator>
+    <motor name="drive" joint="hinge" gear="1" ctrllimited="true" ctrlrange="-1 1"/>
+  </actuator>
 </mujoco>
 """
 
 
 class RigEnv(gymnasium.Env):
-    """A hanging rod that is to be held at one radian."""
+    """Hanging rod that must be held at one radian."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
 
     def __init__(self, target: float = 1.0, render_mode: str | None = None) -> None:
-        """Hang it up."""
+        """Build the model with the rod at rest."""
         self.model = mujoco.MjModel.from_xml_string(XML)
         self.data, self.dt, self._target, self.render_mode = (
             mujoco.MjData(self.model),
@@ -42,14 +44,14 @@ class RigEnv(gymnasium.Env):
         super().reset(seed=seed)
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[0] = self.np_random.uniform(-0.1, 0.1)
-        return self._seen(), {}
+        return self._observation(), {}
 
     def step(self, action):
         self.data.ctrl[:] = action
         for _ in range(10):
             mujoco.mj_step(self.model, self.data)
-        off = abs(float(self.data.qpos[0]) - self._target)
-        return self._seen(), -off, False, False, {"is_success": off < 0.1}
+        error = abs(float(self.data.qpos[0]) - self._target)
+        return self._observation(), -error, False, False, {"is_success": error < 0.1}
 
     def render(self):
         renderer = mujoco.Renderer(self.model, 120, 160)
@@ -58,12 +60,12 @@ class RigEnv(gymnasium.Env):
         renderer.close()
         return image
 
-    def _seen(self):
+    def _observation(self):
         return np.concatenate([self.data.qpos, self.data.qvel])
 
 
 class Rig(EnvSource):
-    """Environments of the rig."""
+    """Env source of the rig."""
 
     name, time_limit = "rig", 30
 

@@ -1,4 +1,4 @@
-"""CartPole with the ideal actuator is a drop-in for Gymnasium's CartPole-v1."""
+"""CartPole with the ideal actuator is a drop-in replacement for Gymnasium's CartPole-v1."""
 
 import gymnasium
 import numpy as np
@@ -11,10 +11,12 @@ every_physics = pytest.mark.parametrize("physics", PHYSICS)
 
 
 def pair(seed=0, **arguments):
-    """Ours and Gymnasium's, just reset."""
-    gymnasiums = {name: value for name, value in arguments.items() if name == "sutton_barto_reward"}
+    """Make this package's and Gymnasium's environment, both just reset."""
+    gymnasium_arguments = {
+        name: value for name, value in arguments.items() if name == "sutton_barto_reward"
+    }
     ours = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", **arguments)
-    theirs = gymnasium.make("CartPole-v1", **gymnasiums)
+    theirs = gymnasium.make("CartPole-v1", **gymnasium_arguments)
     theirs.unwrapped.kinematics_integrator = arguments.get("integrator", "euler")
     np.testing.assert_array_equal(ours.reset(seed=seed)[0], theirs.reset(seed=seed)[0])
     np.testing.assert_array_equal(ours.unwrapped.state, theirs.unwrapped.state)
@@ -25,28 +27,28 @@ def pair(seed=0, **arguments):
 @pytest.mark.parametrize(
     "options", [{}, {"sutton_barto_reward": True}, {"integrator": "semi-implicit"}]
 )
-def test_random_episodes_are_gymnasiums(physics, options):
+def test_random_episodes_equal_gymnasiums(physics, options):
     for seed in range(20):
         ours, theirs = pair(seed, physics=physics, **options)
         terminated, count = False, 0
         for action in np.random.default_rng(seed).integers(0, 2, 500):
-            found, expected = ours.step(action), theirs.step(action)
+            outcome, expected = ours.step(action), theirs.step(action)
             np.testing.assert_allclose(
                 ours.unwrapped.state, theirs.unwrapped.state, rtol=0, atol=1e-9
             )
-            np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=1e-6)
-            assert found[1:4] == expected[1:4]
+            np.testing.assert_allclose(outcome[0], expected[0], rtol=0, atol=1e-6)
+            assert outcome[1:4] == expected[1:4]
             count += 1
-            if terminated := found[2]:
+            if terminated := outcome[2]:
                 break
         assert terminated
         assert 5 < count < 200
-        # and the next episode draws the next initial state
+        # The next episode must draw the next initial state.
         np.testing.assert_array_equal(ours.reset()[0], theirs.reset()[0])
 
 
 def test_an_episode_is_truncated_after_five_hundred_steps():
-    """A policy that each environment closes by itself, so that rounding errors do not grow."""
+    """Use a policy that stabilizes each environment, so that rounding errors do not grow."""
     for env in pair():
         (x, x_dot, theta, theta_dot), _ = env.reset(seed=0)
         for step in range(1, 501):
@@ -75,11 +77,11 @@ def test_terminations_are_at_gymnasiums_limits():
 def test_reset_options_are_gymnasiums(physics, options):
     ours, theirs = pair(physics=physics)
     for seed in range(20):
-        found, expected = (
+        outcome, expected = (
             ours.reset(seed=seed, options=options),
             theirs.reset(seed=seed, options=options),
         )
-        np.testing.assert_array_equal(found[0], expected[0])
+        np.testing.assert_array_equal(outcome[0], expected[0])
 
 
 @every_physics
@@ -90,30 +92,30 @@ def test_bad_reset_options_are_refused_as_by_gymnasium(physics, options):
             env.reset(seed=0, options=options)
 
 
-# -- rewards ------------------------------------------------------------------------------------------------
+# -- rewards --------------------------------------------------------------------------------------
 
 
-def test_sutton_and_bartos_reward_is_the_same_in_every_face():
+def test_sutton_and_bartos_reward_is_the_same_in_every_interface():
     arguments = {"actuator": "ideal", "sutton_barto_reward": True}
-    many = make_sb3_vec_env("codrl_mj/CartPole-v0", 3, **arguments)
-    many.seed(0)
-    many.reset()
-    rewards, ended = np.array([many.step(np.ones(3, dtype=int))[1:3] for _ in range(40)]).swapaxes(
-        0, 1
-    )
+    vec_env = make_sb3_vec_env("codrl_mj/CartPole-v0", 3, **arguments)
+    vec_env.seed(0)
+    vec_env.reset()
+    rewards, ended = np.array(
+        [vec_env.step(np.ones(3, dtype=int))[1:3] for _ in range(40)]
+    ).swapaxes(0, 1)
     np.testing.assert_array_equal(rewards, -ended)
     assert ended.any(axis=0).all()
-    theirs = suite.load("cartpole", **arguments)
-    theirs.reset()
-    steps = [theirs.step(1)]
+    dm_environment = suite.load("cartpole", **arguments)
+    dm_environment.reset()
+    steps = [dm_environment.step(1)]
     while not steps[-1].last():
-        steps.append(theirs.step(1))
+        steps.append(dm_environment.step(1))
     assert [step.reward for step in steps] == [0.0] * (len(steps) - 1) + [-1.0]
 
 
 @every_physics
 @pytest.mark.parametrize("x", [-0.2, -0.11, -0.09, 0.0, 0.09, 0.11, 0.2])
-def test_nothing_is_earned_outside_the_centre_radius_and_the_episode_goes_on(physics, x):
+def test_there_is_no_reward_outside_the_center_radius_and_the_episode_continues(physics, x):
     for options, inside, outside in (
         ({}, 1.0, 1.0),
         ({"center_radius": 0.1}, 1.0, 0.0),

@@ -1,4 +1,4 @@
-"""The compiled step and reset: against a plain composition of their parts, in loops of one's own, in threads."""
+"""The compiled step and reset: equal to their parts, in custom loops, and in threads."""
 
 import itertools
 from concurrent.futures import ThreadPoolExecutor
@@ -35,14 +35,14 @@ SETUPS = {
     "sensing": {"observe_actuator": True, "actuator": NOISY},
     "voltage": {"observe_actuator": True, "action": "voltage", "actuator": NOISY},
 }
-KEPT = [("pendulum", "motor"), ("cartpole", "disturbed")]
+QUICK_CASES = [("pendulum", "motor"), ("cartpole", "disturbed")]
 every_setup = pytest.mark.parametrize(
-    ("task", "kind"), matrix_params(KEPT, itertools.product(REBUILT, SETUPS))
+    ("task", "setup"), matrix_params(QUICK_CASES, itertools.product(REBUILT, SETUPS))
 )
 
 
-def _env(task, kind="motor", **more):
-    arguments = SETUPS[kind] | more
+def _env(task, setup="motor", **options):
+    arguments = SETUPS[setup] | options
     if arguments.get("action") == "voltage" and isinstance(
         TASKS[task].action_space, gymnasium.spaces.Discrete
     ):
@@ -53,17 +53,17 @@ def _env(task, kind="motor", **more):
 
 
 def _plain_step(env, task, state, force):
-    """The engine's bindings and the task's functions as they stand, in plain Python: state, force."""
+    """Take a step by MuJoCo's bindings and the task's Python functions; return state and force."""
     definition, model, data = TASKS[task], env.model, mujoco.MjData(env.model)
     positions, velocities = list(definition.qpos), list(definition.qvel)
     data.qpos[:], data.qvel[:] = state[positions], state[velocities]
     arm = env.actuator.arm_radius
     data.ctrl[0] = force * arm
     for _ in range(env.setup.inner_steps):
-        moved = data.qpos + model.opt.timestep * data.qvel
+        explicit_positions = data.qpos + model.opt.timestep * data.qvel
         mujoco.mj_step(model, data)
-        if env.setup.plant.integrator == "euler":
-            data.qpos[:] = moved
+        if env.setup.simulation.integrator == "euler":
+            data.qpos[:] = explicit_positions
         state = np.empty_like(state)
         state[positions], state[velocities] = data.qpos, data.qvel
         if definition.constrain is not None:
@@ -77,11 +77,11 @@ def _plain_step(env, task, state, force):
 
 
 @every_rebuilt
-@pytest.mark.parametrize("kind", ["ideal", "motor"])
-def test_a_step_is_the_plain_composition_of_engine_bounds_and_task(task, kind):
+@pytest.mark.parametrize("setup", ["ideal", "motor"])
+def test_a_step_is_the_composition_of_engine_bounds_and_task(task, setup):
     definition = TASKS[task]
     for integrator in definition.integrators:
-        env = _env(task, kind, integrator=integrator)
+        env = _env(task, setup, integrator=integrator)
         env.reset(seed=0)
         for before, action in zip(random_states(task, 7, 100), actions(task, 8, 100), strict=True):
             env.physics.reset(before)
@@ -96,29 +96,33 @@ def test_a_step_is_the_plain_composition_of_engine_bounds_and_task(task, kind):
                 observation[size:],
                 np.float32([info["current"], info["reference_current"]])[: len(observation) - size],
             )
-            plain = definition.reward(before, info["actual_force"], after, definition.options())
-            assert reward == pytest.approx(float(plain), rel=1e-14, abs=1e-14)
+            expected_reward = definition.reward(
+                before, info["actual_force"], after, definition.options()
+            )
+            assert reward == pytest.approx(float(expected_reward), rel=1e-14, abs=1e-14)
             assert terminated == bool(definition.terminated(after))
             assert not truncated
 
 
 @numba.njit
-def _episode(step, reset, forces, chosen, generator, low, high, rows, rewards, observation, where):
-    reset(generator, low, high, where)
+def _episode(
+    step, reset, forces, indices, generator, low, high, rows, rewards, observation, pointers
+):
+    reset(generator, low, high, pointers)
     rows[0] = observation
-    for index in range(len(chosen)):
-        force = forces[chosen[index]]
-        reward, terminated, fine = step(force, where)
+    for index in range(len(indices)):
+        force = forces[indices[index]]
+        reward, terminated, is_finite = step(force, pointers)
         rows[index + 1] = observation
         rewards[index] = reward
-        if terminated or not fine:
+        if terminated or not is_finite:
             return index + 1
-    return len(chosen)
+    return len(indices)
 
 
 @every_setup
-def test_a_compiled_loop_is_the_loop_over_the_environment_bit_for_bit(task, kind):
-    ours, theirs = _env(task, kind), _env(task, kind)
+def test_a_compiled_loop_is_the_loop_over_the_environment_bit_for_bit(task, setup):
+    ours, theirs = _env(task, setup), _env(task, setup)
     parts = compiled_env(ours)
     ours.reset(seed=3)
     theirs.reset(seed=3)
@@ -126,30 +130,30 @@ def test_a_compiled_loop_is_the_loop_over_the_environment_bit_for_bit(task, kind
     forces = parts.forces
     if forces is None:
         table = generator.uniform(-1, 1, (50, 1)).astype(np.float32) * ours.action_space.high
-        forces, chosen = (
+        forces, indices = (
             np.array([theirs.setup.commands.force(action) for action in table]),
             np.arange(50),
         )
-        given = list(table)
+        env_actions = list(table)
     else:
-        chosen = generator.integers(len(forces), size=50)
-        given = list(chosen)
+        indices = generator.integers(len(forces), size=50)
+        env_actions = list(indices)
     rows, rewards = np.zeros((51, *ours.observation_space.shape), np.float32), np.zeros(50)
-    loop = (forces, chosen, ours.np_random, parts.low, parts.high, rows, rewards)
-    taken = _episode(parts.step, parts.reset, *loop, parts.observation, parts.where)
+    loop = (forces, indices, ours.np_random, parts.low, parts.high, rows, rewards)
+    num_steps = _episode(parts.step, parts.reset, *loop, parts.observation, parts.pointers)
     observation, _ = theirs.reset()
     np.testing.assert_array_equal(rows[0], observation)
-    for index in range(taken):
-        observation, reward, terminated, _, _ = theirs.step(given[index])
+    for index in range(num_steps):
+        observation, reward, terminated, _, _ = theirs.step(env_actions[index])
         np.testing.assert_array_equal(rows[index + 1], observation)
         assert rewards[index] == reward
-    assert terminated or taken == 50
+    assert terminated or num_steps == 50
     np.testing.assert_array_equal(ours.state, theirs.state)
     np.testing.assert_array_equal(ours.physics.trace, theirs.physics.trace)
     assert ours.np_random.random() == theirs.np_random.random()
 
 
-def test_what_python_has_to_do_is_not_offered_as_compiled():
+def test_environments_that_need_python_are_not_compiled():
     assert compiled_env(ActuatedEnv("pendulum", physics="analytic")) is None
     assert (
         compiled_env(ActuatedEnv("pendulum", randomize={"motor.inductance": Uniform(0.08, 0.12)}))
@@ -157,14 +161,15 @@ def test_what_python_has_to_do_is_not_offered_as_compiled():
     )
 
 
-def test_what_a_user_writes_into_the_data_is_where_the_step_begins():
+def test_a_step_starts_from_data_that_the_user_has_written():
     env = _env("pendulum", "ideal")
     env.reset(seed=0)
     env.step(np.zeros(1))
     env.data.qpos[0], env.data.qvel[0] = np.pi / 2, 1.0
     _, reward, _, _, _ = env.step(np.zeros(1))
     assert reward == pytest.approx(-((np.pi / 2) ** 2 + 0.1), rel=1e-12)
-    assert env.state[1] == pytest.approx(1.0 + 0.05 * 15.0, rel=1e-12)  # 3 g / 2 l sin(theta)
+    # The acceleration is 3 g / (2 l) sin(theta) = 15.
+    assert env.state[1] == pytest.approx(1.0 + 0.05 * 15.0, rel=1e-12)
 
 
 def test_threads_do_not_disturb_each_other():
@@ -175,7 +180,7 @@ def test_threads_do_not_disturb_each_other():
             env.step((index * seed) % 2)
         return env.state
 
-    alone = [run(seed) for seed in range(1, 9)]
+    sequential = [run(seed) for seed in range(1, 9)]
     with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(run, range(1, 9)))
-    np.testing.assert_array_equal(alone, together)
+        concurrent = list(pool.map(run, range(1, 9)))
+    np.testing.assert_array_equal(sequential, concurrent)

@@ -1,4 +1,4 @@
-"""What every environment keeps of Gymnasium's contract and of Gymnasium's environment: any task, physics, set-up."""
+"""Conformance of all tasks, physics and setups with Gymnasium's interface and environments."""
 
 import unittest.mock
 import warnings
@@ -20,15 +20,15 @@ every_physics = pytest.mark.parametrize("physics", PHYSICS)
 every_setup = pytest.mark.parametrize("setup", SETUPS)
 
 
-def make(task, setup, physics="mujoco", **more):
+def make(task, setup, physics="mujoco", **options):
     """The environment as a user makes it, in Gymnasium's wrappers."""
     return gymnasium.make(
-        TASKS[task].env_id, physics=physics, **arguments(task, setup, physics), **more
+        TASKS[task].env_id, physics=physics, **arguments(task, setup, physics), **options
     )
 
 
 class Blank(gymnasium.Env):
-    """An environment with given spaces in which nothing happens: what a checker says of it, it says of its spaces."""
+    """Environment with given spaces in which nothing happens; checkers only warn of its spaces."""
 
     def __init__(self, action_space, observation_space):  # noqa: D107
         self.action_space, self.observation_space = action_space, observation_space
@@ -45,8 +45,8 @@ class Blank(gymnasium.Env):
         return self._observation(), 0.0, False, False, {}
 
 
-def _complaints(check, env, **options):
-    """The warnings of a checker; an error of it is an error."""
+def _warnings_of(check, env, **options):
+    """Return the warnings of a checker; its errors are raised."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check(env, **options)
@@ -59,22 +59,21 @@ def _complaints(check, env, **options):
 @pytest.mark.parametrize(
     "check", [check_env, check_env_sb3], ids=["gymnasium", "stable_baselines3"]
 )
-def test_the_checkers_complain_about_nothing_but_the_spaces(check, task, physics, setup):
+def test_environment_checkers_warn_only_about_spaces(check, task, physics, setup):
     env = make(task, setup, physics).unwrapped
-    of_spaces = _complaints(
+    space_warnings = _warnings_of(
         check, Blank(env.action_space, env.observation_space), skip_render_check=True
     )
-    assert _complaints(check, env, skip_render_check=True) <= of_spaces
+    assert _warnings_of(check, env, skip_render_check=True) <= space_warnings
 
 
 @pytest.mark.parametrize("task", matrix_params(["pendulum"], REBUILT))
-def test_gymnasiums_checker_has_no_complaint_about_rendering(task, monkeypatch):
-    monkeypatch.setattr(
-        "codrl_mj.envs.single.Window", unittest.mock.Mock()
-    )  # pygame may not be there
+def test_gymnasiums_checker_does_not_warn_about_rendering(task, monkeypatch):
+    # pygame may not be installed.
+    monkeypatch.setattr("codrl_mj.envs.single.Window", unittest.mock.Mock())
     env = make(task, "force", render_mode="rgb_array", width=64, height=48)
     blank = Blank(env.action_space, env.observation_space)
-    assert _complaints(check_env, env.unwrapped) <= _complaints(
+    assert _warnings_of(check_env, env.unwrapped) <= _warnings_of(
         check_env, blank, skip_render_check=True
     )
     env.close()
@@ -97,8 +96,8 @@ def test_steps_have_gymnasiums_types_and_observations_are_in_the_space(task, phy
         assert info.keys() == (
             {"randomization"} if "randomize" in arguments(task, setup, physics) else set()
         )
-        over = False
-        while not over:
+        ended = False
+        while not ended:
             assert observation in env.observation_space
             observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
             assert observation.dtype == np.float32
@@ -116,29 +115,28 @@ def test_steps_have_gymnasiums_types_and_observations_are_in_the_space(task, phy
             assert isinstance(info["saturated"], bool)
             if setup != "voltage":
                 assert abs(info["desired_force"]) <= TASKS[task].max_force
-            over = terminated or truncated
+            ended = terminated or truncated
         assert observation in env.observation_space
 
 
 @every_rebuilt
 @every_physics
 def test_the_ideal_actuator_delivers_what_is_desired_and_a_motor_tracks_its_current(task, physics):
-    ideal, driven = make(task, "ideal", physics), make(task, "force", physics)
-    for env in (ideal, driven):
+    ideal, with_motor = make(task, "ideal", physics), make(task, "force", physics)
+    for env in (ideal, with_motor):
         env.reset(seed=0)
     for action in actions(task, 0, 10):
         info = ideal.step(action)[-1]
         assert info["actual_force"] == info["desired_force"]
         assert info["current"] == info["reference_current"] == info["voltage"] == 0.0
         assert not info["saturated"]
-        info = driven.step(action)[-1]
-        assert info["reference_current"] == pytest.approx(
-            info["desired_force"] * 0.5 / 0.8
-        )  # arm and kT
+        info = with_motor.step(action)[-1]
+        # The arm is 0.5, the torque constant 0.8.
+        assert info["reference_current"] == pytest.approx(info["desired_force"] * 0.5 / 0.8)
 
 
 @every_rebuilt
-def test_mujoco_model_and_data_are_at_hand_and_analytic_physics_says_it_has_none(task):
+def test_mujoco_model_and_data_are_attributes_and_analytic_physics_raises(task):
     env = ActuatedEnv(task)
     env.reset(seed=0)
     env.step(env.action_space.sample())

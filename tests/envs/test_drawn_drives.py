@@ -1,4 +1,4 @@
-"""Bench motors in every task, alone and in batches, and whatever of them sits in the model drawn at resets."""
+"""Motors from datasheets in tasks and batches, with randomized parts in the model."""
 
 import dataclasses
 import math
@@ -26,8 +26,8 @@ from tests.envs.vectors import assert_equal_episodes, assert_same, batched, loop
 from tests.matrix import matrix_params
 from tests.tasks.faces import actions
 
-# every field counts: 60 turns make the rod light for its motor, so that its speed changes within a
-# step
+# Every field has an effect: the ratio of 60 makes the rod light for its motor, so that its speed
+# changes within a step.
 MOTOR = GearMotor(
     *(0.942, 0.363e-3, 0.036, 0.036),
     rotor_inertia=1.35e-5,
@@ -56,32 +56,32 @@ SIMPLE = {
     "resistance_coefficient": 0.0,
     "max_temperature": math.inf,
 }
-"""What `DriveOracle` does not know, left out."""
-ONE = Drive(MOTOR, supply=Supply(6.0))  # which is short at times
-ADDED = {
+"""Values that remove effects which `DriveOracle` does not model."""
+# The voltage of the supply is sometimes too low.
+NOMINAL_DRIVE = Drive(MOTOR, supply=Supply(6.0))
+JOINT_FIELDS = {
     name: getattr(MOTOR, name) for name in ("rotor_inertia", "coulomb_friction", "viscous_friction")
 }
 NOMINAL = {
     path: value
-    for path, value in zip(field_paths(Drive), field_values(ONE), strict=True)
+    for path, value in zip(field_paths(Drive), field_values(NOMINAL_DRIVE), strict=True)
     if path.startswith("motor.") and value != 0.0
 }
-DRAWN = {name: Uniform(0.7 * value, 1.2 * value) for name, value in NOMINAL.items()}
-DRAWN["motor.max_temperature"] = Uniform(
-    24.5, 26.0
-)  # above all that the surroundings are drawn to be
+RANGES = {name: Uniform(0.7 * value, 1.2 * value) for name, value in NOMINAL.items()}
+# The limit stays above all drawn ambient temperatures.
+RANGES["motor.max_temperature"] = Uniform(24.5, 26.0)
 every_field = pytest.mark.parametrize("name", NOMINAL)
 
 
 def episode(env, seed=0):
-    """Whatever is seen of an episode's steps, as rows; observations come first."""
+    """Return observations and signals of an episode's steps as rows; observations come first."""
     env.reset(seed=seed)
     steps = [env.step(action) for action in actions(env.task.name, 1, 12)]
     return np.array([[*step[0], *step[4].values()] for step in steps], dtype=np.float64)
 
 
-def on_joint(model):
-    """What the model has on the actuated joint."""
+def joint_additions(model):
+    """Return the model's values on the actuated joint."""
     dof = model.jnt_dofadr[model.actuator("motor").trnid[0]]
     return JointAdditions(
         *(getattr(model, f"dof_{kind}")[dof] for kind in ("armature", "damping", "frictionloss"))
@@ -89,27 +89,34 @@ def on_joint(model):
 
 
 @every_field
-def test_a_drawn_field_acts_as_in_a_drive_that_has_it(name):
-    drawn = ActuatedEnv("pendulum", ONE, randomize={name: DRAWN[name]})
-    found = episode(drawn, seed=3)
+def test_a_drawn_field_acts_as_in_a_drive_with_that_value(name):
+    randomized_env = ActuatedEnv("pendulum", NOMINAL_DRIVE, randomize={name: RANGES[name]})
+    rows = episode(randomized_env, seed=3)
     part, field = name.split(".")
     assert (
-        getattr(getattr(drawn.actuator, part), field) == drawn.randomization[name] != NOMINAL[name]
+        getattr(getattr(randomized_env.actuator, part), field)
+        == randomized_env.randomization[name]
+        != NOMINAL[name]
     )
-    fixed = ActuatedEnv("pendulum", drawn.actuator)
-    fixed.reset(seed=3)
-    drawn.reset(seed=3)
-    fixed.state = drawn.state
+    fixed_env = ActuatedEnv("pendulum", randomized_env.actuator)
+    fixed_env.reset(seed=3)
+    randomized_env.reset(seed=3)
+    fixed_env.state = randomized_env.state
     for action in actions("pendulum", 1, 12):
-        one, other = drawn.step(action), fixed.step(action)
-        assert one[4] == other[4]
-        np.testing.assert_array_equal(drawn.state, fixed.state)
-    assert on_joint(drawn.model) == on_joint(fixed.model) == drawn.actuator.additions
-    np.testing.assert_array_equal(drawn.model.actuator_gear, fixed.model.actuator_gear)
-    np.testing.assert_array_equal(drawn.model.dof_invweight0, fixed.model.dof_invweight0)
-    assert not np.array_equal(
-        found, episode(ActuatedEnv("pendulum", ONE), seed=3)
-    )  # it has an effect
+        outcome, expected = randomized_env.step(action), fixed_env.step(action)
+        assert outcome[4] == expected[4]
+        np.testing.assert_array_equal(randomized_env.state, fixed_env.state)
+    assert (
+        joint_additions(randomized_env.model)
+        == joint_additions(fixed_env.model)
+        == randomized_env.actuator.additions
+    )
+    np.testing.assert_array_equal(randomized_env.model.actuator_gear, fixed_env.model.actuator_gear)
+    np.testing.assert_array_equal(
+        randomized_env.model.dof_invweight0, fixed_env.model.dof_invweight0
+    )
+    # The field must have an effect.
+    assert not np.array_equal(rows, episode(ActuatedEnv("pendulum", NOMINAL_DRIVE), seed=3))
 
 
 IN_TURN = [
@@ -122,110 +129,131 @@ IN_TURN = [
 
 
 @pytest.mark.parametrize("name", matrix_params(IN_TURN, ["everything", *NOMINAL]))
-def test_a_drawn_field_is_drawn_in_a_batch_as_alone_and_brought_back(name):
-    randomize = DRAWN if name == "everything" else {name: DRAWN[name]}
-    arguments = {"actuator": ONE, "randomize": randomize, "max_episode_steps": 5}
-    env, fresh = (batched("pendulum", 2, **arguments) for _ in range(2))
+def test_a_batch_draws_and_restores_fields_as_a_single_environment(name):
+    randomize = RANGES if name == "everything" else {name: RANGES[name]}
+    arguments = {"actuator": NOMINAL_DRIVE, "randomize": randomize, "max_episode_steps": 5}
+    env, other_env = (batched("pendulum", 2, **arguments) for _ in range(2))
     assert_equal_episodes(env, looped("pendulum", 2, **arguments), 12)
-    fresh.reset(seed=50)
-    for start in (env.unwrapped.snapshot(), fresh.unwrapped.snapshot()):  # of two draws
+    other_env.reset(seed=50)
+    # The two snapshots have different draws.
+    for start_snapshot in (env.unwrapped.snapshot(), other_env.unwrapped.snapshot()):
         runs = []
-        for one in (env, fresh):
-            one.restore(start)
-            runs.append(run(one.unwrapped, 12, seed=0))
+        for each_env in (env, other_env):
+            each_env.restore(start_snapshot)
+            runs.append(run(each_env.unwrapped, 12, seed=0))
         assert_same(*runs)
 
 
-def test_before_the_first_draw_everything_is_nominal_and_can_be_again():
-    alone, many = (
-        ActuatedEnv("pendulum", ONE, randomize=DRAWN),
-        batched("pendulum", 2, actuator=ONE, randomize=DRAWN),
+def test_everything_is_nominal_before_the_first_reset_and_after_restoring_that_state():
+    single_env, vector_env = (
+        ActuatedEnv("pendulum", NOMINAL_DRIVE, randomize=RANGES),
+        batched("pendulum", 2, actuator=NOMINAL_DRIVE, randomize=RANGES),
     )
 
-    def mounted():
+    def mountings():
         rows = [
-            (on_joint(model), model.actuator("motor").gear[0])
-            for model in many.unwrapped.physics.models()
+            (joint_additions(model), model.actuator("motor").gear[0])
+            for model in vector_env.unwrapped.physics.models()
         ]
-        return [(on_joint(alone.model), alone.model.actuator("motor").gear[0]), *rows]
+        return [
+            (joint_additions(single_env.model), single_env.model.actuator("motor").gear[0]),
+            *rows,
+        ]
 
-    nominal, starts = (
-        (ONE.additions, 1.0 / ONE.arm_radius),
-        [env.snapshot() for env in (alone, many)],
+    nominal, start_snapshots = (
+        (NOMINAL_DRIVE.additions, 1.0 / NOMINAL_DRIVE.arm_radius),
+        [env.snapshot() for env in (single_env, vector_env)],
     )
-    for env in (alone, many):
+    for env in (single_env, vector_env):
         env.reset(seed=0)
-    assert len({nominal, *mounted()}) == 3  # the first of many is the one alone
-    for env, start in zip((alone, many), starts, strict=True):
-        env.restore(start)
-    assert mounted() == [nominal] * 3
+    # The vector's first environment has the same seed as the single one.
+    assert len({nominal, *mountings()}) == 3
+    for env, start_snapshot in zip((single_env, vector_env), start_snapshots, strict=True):
+        env.restore(start_snapshot)
+    assert mountings() == [nominal] * 3
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("task", ["pendulum", "cartpole"])
-def test_everything_drawn_moves_as_the_equations_say(task, seed):
-    """Against Gymnasium's equations with rotor and friction, and a winding by scipy's matrix exponential."""
-    # the load is heavy for this gear: with a light one the held speed rings, and rounding grows
-    # threefold a step
-    nominal = dataclasses.replace(ONE, motor=dataclasses.replace(MOTOR, gear_ratio=20.0, **SIMPLE))
-    ranges = {name: one for name, one in DRAWN.items() if name.removeprefix("motor.") not in SIMPLE}
+def test_a_randomized_drive_follows_the_equations(task, seed):
+    """Compare with Gymnasium's equations with rotor and friction, and a matrix exponential."""
+    # The load is heavy for this gear: with a light one the held speed oscillates, and rounding
+    # errors grow threefold per step.
+    nominal = dataclasses.replace(
+        NOMINAL_DRIVE, motor=dataclasses.replace(MOTOR, gear_ratio=20.0, **SIMPLE)
+    )
+    ranges = {
+        name: distribution
+        for name, distribution in RANGES.items()
+        if name.removeprefix("motor.") not in SIMPLE
+    }
     ranges["motor.gear_ratio"] = Uniform(15.0, 25.0)
     env = ActuatedEnv(task, nominal, randomize=ranges)
     env.reset(seed=seed)
-    one, definition, state = env.actuator, env.task, env.state
-    timestep, at = definition.step_duration, definition.speed_indices[0]
+    actuator, definition, state = env.actuator, env.task, env.state
+    timestep, speed_index = definition.step_duration, definition.speed_indices[0]
     bench, mechanics = (
-        DriveOracle(one, timestep),
-        JointOracle(definition, one, timestep, definition.integrators[0]),
+        DriveOracle(actuator, timestep),
+        JointOracle(definition, actuator, timestep, definition.integrators[0]),
     )
-    arm = one.motor.arm_radius / one.motor.gear_ratio
+    arm = actuator.motor.arm_radius / actuator.motor.gear_ratio
     for action in actions(task, seed, 30):
         force = env.setup.commands.force(action)
         env.step(action)
-        state = mechanics.step(state, bench.torque(force * arm, state[at] / arm) / arm)
+        state = mechanics.step(state, bench.torque(force * arm, state[speed_index] / arm) / arm)
         np.testing.assert_allclose(env.state, state, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("field", ADDED)
-def test_what_a_motor_lacks_can_be_drawn_and_goes_away_again(field):
-    """Friction needs the engine's solver, which is on in the episodes that have some, and off in the others."""
-    bare = dataclasses.replace(ONE, motor=dataclasses.replace(MOTOR, **dict.fromkeys(ADDED, 0.0)))
-    arguments = {"actuator": bare, "randomize": {f"motor.{field}": Choice([0.0, ADDED[field]])}}
+@pytest.mark.parametrize("field", JOINT_FIELDS)
+def test_quantities_that_the_nominal_motor_lacks_can_be_drawn(field):
+    """Check friction, whose solver in the engine is only on in episodes with friction."""
+    bare_drive = dataclasses.replace(
+        NOMINAL_DRIVE, motor=dataclasses.replace(MOTOR, **dict.fromkeys(JOINT_FIELDS, 0.0))
+    )
+    arguments = {
+        "actuator": bare_drive,
+        "randomize": {f"motor.{field}": Choice([0.0, JOINT_FIELDS[field]])},
+    }
     env = ActuatedEnv("cartpole", **arguments)
-    constraint, seen = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT), set()
+    constraint, seen_values = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT), set()
     for seed in range(8):
-        found = episode(env, seed)
+        rows = episode(env, seed)
         value = env.randomization[f"motor.{field}"]
-        fixed = ActuatedEnv("cartpole", env.actuator)
-        np.testing.assert_array_equal(episode(fixed, seed), found)
+        fixed_env = ActuatedEnv("cartpole", env.actuator)
+        np.testing.assert_array_equal(episode(fixed_env, seed), rows)
         assert bool(env.model.opt.disableflags & constraint) == (
             field != "coulomb_friction" or value == 0.0
         )
-        assert any(on_joint(env.model)) == (value > 0.0)
-        seen.add(value)
-    assert seen == {0.0, ADDED[field]}
+        assert any(joint_additions(env.model)) == (value > 0.0)
+        seen_values.add(value)
+    assert seen_values == {0.0, JOINT_FIELDS[field]}
     arguments["max_episode_steps"] = 4
     assert_equal_episodes(
         batched("cartpole", 4, **arguments), looped("cartpole", 4, **arguments), 20
     )
 
 
-def test_damping_is_drawn_on_top_of_the_drive_s_and_the_joint_s():
+def test_drawn_damping_is_added_to_that_of_the_drive_and_the_joint():
     env = ActuatedEnv(
         "pendulum",
-        ONE,
+        NOMINAL_DRIVE,
         joint={"damping": 0.25, "armature": 0.5},
         randomize={"model.damping.hinge": Uniform(0.1, 0.3)},
     )
     env.reset(seed=0)
-    drawn, arm = env.randomization["model.damping.hinge"], ONE.arm_radius
-    assert on_joint(env.model).damping == pytest.approx(0.25 + drawn + 1e-5 / arm**2, rel=1e-14)
-    assert on_joint(env.model).armature == pytest.approx(0.5 + 1.35e-5 / arm**2, rel=1e-14)
-    both = {"model.damping.hinge": Uniform(0.1, 0.3), "motor.viscous_friction": Uniform(0.0, 2e-5)}
+    drawn_damping, arm = env.randomization["model.damping.hinge"], NOMINAL_DRIVE.arm_radius
+    assert joint_additions(env.model).damping == pytest.approx(
+        0.25 + drawn_damping + 1e-5 / arm**2, rel=1e-14
+    )
+    assert joint_additions(env.model).armature == pytest.approx(0.5 + 1.35e-5 / arm**2, rel=1e-14)
+    both_dampings = {
+        "model.damping.hinge": Uniform(0.1, 0.3),
+        "motor.viscous_friction": Uniform(0.0, 2e-5),
+    }
     arguments = {
-        "actuator": ONE,
+        "actuator": NOMINAL_DRIVE,
         "joint": {"damping": 0.25},
-        "randomize": both,
+        "randomize": both_dampings,
         "max_episode_steps": 5,
     }
     assert_equal_episodes(
@@ -236,9 +264,13 @@ def test_damping_is_drawn_on_top_of_the_drive_s_and_the_joint_s():
 @pytest.mark.parametrize(
     "randomize", [None, {"motor.gear_ratio": Uniform(10.0, 80.0)}], ids=["fixed", "drawn"]
 )
-def test_different_drives_bring_each_their_own_rotor_and_friction(randomize):
+def test_each_environment_has_the_rotor_and_friction_of_its_drive(randomize):
     frictions = {"coulomb_friction": 0.0, "viscous_friction": 0.0}
-    drives = [ONE, Drive(), Drive(dataclasses.replace(MOTOR, rotor_inertia=2e-4, **frictions))]
+    drives = [
+        NOMINAL_DRIVE,
+        Drive(),
+        Drive(dataclasses.replace(MOTOR, rotor_inertia=2e-4, **frictions)),
+    ]
     arguments = {
         "actuator": drives,
         "max_episode_steps": 6,
@@ -247,21 +279,23 @@ def test_different_drives_bring_each_their_own_rotor_and_friction(randomize):
     env = batched("pendulum", 3, **arguments)
     assert_equal_episodes(env, looped("pendulum", 3, **arguments), 15)
     if randomize is None:
-        assert [on_joint(model) for model in env.unwrapped.physics.models()] == [
-            one.additions for one in drives
+        assert [joint_additions(model) for model in env.unwrapped.physics.models()] == [
+            drive.additions for drive in drives
         ]
 
 
 @every_field
-def test_gymnasium_s_equations_refuse_by_name_what_they_have_no_place_for(name):
-    bare = dataclasses.replace(ONE, motor=dataclasses.replace(MOTOR, **dict.fromkeys(ADDED, 0.0)))
+def test_raises_for_fields_that_gymnasiums_equations_do_not_contain(name):
+    bare_drive = dataclasses.replace(
+        NOMINAL_DRIVE, motor=dataclasses.replace(MOTOR, **dict.fromkeys(JOINT_FIELDS, 0.0))
+    )
     arguments = {
-        "actuator": bare,
+        "actuator": bare_drive,
         "physics": "analytic",
-        "randomize": {name: DRAWN[name]},
+        "randomize": {name: RANGES[name]},
         "inner_steps": 5,
     }
-    if name.removeprefix("motor.") in {"gear_ratio", "arm_radius", *ADDED}:
+    if name.removeprefix("motor.") in {"gear_ratio", "arm_radius", *JOINT_FIELDS}:
         with pytest.raises(
             ValueError, match=rf"cannot draw {re.escape(name)}: .*friction and rotors; use"
         ):
@@ -270,21 +304,33 @@ def test_gymnasium_s_equations_refuse_by_name_what_they_have_no_place_for(name):
         episode(ActuatedEnv("pendulum", **arguments))
 
 
-def test_where_a_current_is_commanded_a_rotor_is_drawn_and_what_would_change_its_meaning_is_not():
+def test_a_current_command_allows_to_draw_the_rotor_but_not_the_gear_ratio():
     env = ActuatedEnv(
-        "pendulum", ONE, action="current", randomize={"motor.rotor_inertia": Uniform(1e-6, 1e-5)}
+        "pendulum",
+        NOMINAL_DRIVE,
+        action="current",
+        randomize={"motor.rotor_inertia": Uniform(1e-6, 1e-5)},
     )
     env.reset(seed=0)
-    assert on_joint(env.model).armature == env.actuator.additions.armature != ONE.additions.armature
+    assert (
+        joint_additions(env.model).armature
+        == env.actuator.additions.armature
+        != NOMINAL_DRIVE.additions.armature
+    )
     with pytest.raises(
         ValueError, match=r"motor\.gear_ratio.*it would change what an action means"
     ):
         ActuatedEnv(
-            "pendulum", ONE, action="current", randomize={"motor.gear_ratio": Uniform(1.0, 2.0)}
+            "pendulum",
+            NOMINAL_DRIVE,
+            action="current",
+            randomize={"motor.gear_ratio": Uniform(1.0, 2.0)},
         )
 
 
-@pytest.mark.parametrize("one", [ONE, DCMotorActuator()], ids=["drive", "current loop"])
-def test_an_unchecked_actuator_follows_as_a_checked_one(one):
-    twin = from_array(type(one), field_values(one))
-    assert (twin.arm_radius, twin.additions) == (one.arm_radius, one.additions)
+@pytest.mark.parametrize(
+    "actuator", [NOMINAL_DRIVE, DCMotorActuator()], ids=["drive", "current loop"]
+)
+def test_an_actuator_from_an_array_has_the_same_arm_and_additions(actuator):
+    unchecked = from_array(type(actuator), field_values(actuator))
+    assert (unchecked.arm_radius, unchecked.additions) == (actuator.arm_radius, actuator.additions)

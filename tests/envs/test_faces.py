@@ -1,4 +1,4 @@
-"""Whatever face an environment has, it can be copied, stored, repeated, and written over, and goes on the same."""
+"""Every interface of an environment can be copied, stored and repeated, and continues the same."""
 
 import copy
 import pickle
@@ -20,10 +20,10 @@ from tests.envs.faces import (
     SETUPS,
     arguments,
     arrays,
-    begun,
-    made,
+    make_face,
     plain,
     run,
+    start_episode,
 )
 from tests.envs.vectors import assert_same
 from tests.tasks.faces import every_rebuilt
@@ -35,80 +35,84 @@ every_setup = pytest.mark.parametrize("setup", SETUPS)
 @every_face
 @every_setup
 @every_rebuilt
-def test_copies_and_restored_snapshots_go_on_as_the_original(face, task, setup):
-    env, fresh, used = (made(face, task, setup) for _ in range(3))
-    begun(used, 99)
-    for steps in (None, 23):  # before the first reset, and in an episode
+def test_copies_and_restored_snapshots_continue_like_the_original(face, task, setup):
+    env, fresh, used = (make_face(face, task, setup) for _ in range(3))
+    start_episode(used, 99)
+    # First before any reset, then in the middle of an episode.
+    for steps in (None, 23):
         if steps:
-            begun(env, 5)
+            start_episode(env, 5)
             run(env, steps, seed=0)
-        kept = env.snapshot()
+        snapshot = env.snapshot()
         twins = [copy.deepcopy(env), pickle.loads(pickle.dumps(env)), fresh, used]
         for twin in (fresh, used):
-            twin.restore(load(save(kept)))
-        following = []
-        for one in (env, *twins):
-            assert_same(one.snapshot(), kept)  # which moves with none of those before
-            if (
-                steps is None and face == "serial, analytic"
-            ):  # Gymnasium's time limit insists on a reset
-                begun(one)
-            following.append(run(one, 60, seed=1))
-        for other in following[1:]:
-            assert_same(other, following[0])
-        if face == "one":  # one model, the twin's own: changing it changes the twin
+            twin.restore(load(save(snapshot)))
+        runs = []
+        for resumed in (env, *twins):
+            # The twins that ran before must not have changed this one.
+            assert_same(resumed.snapshot(), snapshot)
+            # Gymnasium's time limit cannot step before a first reset.
+            if steps is None and face == "serial, analytic":
+                start_episode(resumed)
+            runs.append(run(resumed, 60, seed=1))
+        for run_of_twin in runs[1:]:
+            assert_same(run_of_twin, runs[0])
+        # Each twin has a model of its own: changing it changes only the twin.
+        if face == "one":
             assert all(twin.model is twin.data.model is not env.model for twin in twins)
 
 
 @every_face
 @every_rebuilt
-def test_what_is_returned_and_given_is_nobody_elses(face, task):
-    env, control = (made(face, task, "everything") for _ in range(2))
-    for one in (env, control):
-        begun(one, 2)
+def test_overwriting_returned_arrays_and_actions_changes_nothing(face, task):
+    env, control = (make_face(face, task, "everything") for _ in range(2))
+    for each_env in (env, control):
+        start_episode(each_env, 2)
     assert_same(run(env, 45, seed=0, vandal=True), run(control, 45, seed=0))
 
 
 @every_face
 @every_rebuilt
 def test_a_seed_repeats_and_another_differs(face, task):
-    env = made(face, task, "force")
-    first, again, other = ((plain(begun(env, seed)), run(env, 30, seed=0)) for seed in (3, 3, 4))
+    env = make_face(face, task, "force")
+    first, again, other_run = (
+        (plain(start_episode(env, seed)), run(env, 30, seed=0)) for seed in (3, 3, 4)
+    )
     assert_same(again, first)
     with pytest.raises(AssertionError):
-        assert_same(other, first)
+        assert_same(other_run, first)
 
 
 @every_rebuilt
 @every_setup
-def test_both_physics_tell_the_same_story(task, setup):
-    """Over the first steps, before chaos: states, rewards, ends and signals."""
-    given = arguments(task, setup, "analytic")
-    pair = [ActuatedEnv(task, physics=physics, **given) for physics in PHYSICS]
-    for one, other in zip(
-        *(arrays(plain((begun(env, 7), run(env, 15, seed=0)))) for env in pair), strict=True
+def test_both_physics_give_the_same_results(task, setup):
+    """Compare states, rewards, ends and signals of the first steps, before chaos sets in."""
+    options = arguments(task, setup, "analytic")
+    pair = [ActuatedEnv(task, physics=physics, **options) for physics in PHYSICS]
+    for values, expected in zip(
+        *(arrays(plain((start_episode(env, 7), run(env, 15, seed=0)))) for env in pair), strict=True
     ):
-        rounding = 1e-6 if one.dtype == np.float32 else 1e-9
-        np.testing.assert_allclose(one, other, rtol=rounding, atol=rounding)
+        rounding = 1e-6 if values.dtype == np.float32 else 1e-9
+        np.testing.assert_allclose(values, expected, rtol=rounding, atol=rounding)
 
 
 @every_rebuilt
 @every_setup
 def test_dm_control_has_the_episodes_of_a_single_environment(task, setup):
-    given = arguments(task, setup) | LIMITED
-    theirs = suite.load(task, task_kwargs={"random": 4}, **given)
-    ours = gymnasium.make(TASKS[task].env_id, disable_env_checker=True, **given)
+    options = arguments(task, setup) | LIMITED
+    theirs = suite.load(task, task_kwargs={"random": 4}, **options)
+    ours = gymnasium.make(TASKS[task].env_id, disable_env_checker=True, **options)
     for seed in (4, None):
-        step, (seen, info) = theirs.reset(), ours.reset(seed=seed)
-        np.testing.assert_array_equal(np.concatenate([*step.observation.values()]), seen)
+        step, (observation, info) = theirs.reset(), ours.reset(seed=seed)
+        np.testing.assert_array_equal(np.concatenate([*step.observation.values()]), observation)
         assert theirs.randomization == info.get("randomization", {})
         while not step.last():
             action = ours.action_space.sample()
-            step, (seen, reward, terminated, truncated, info) = (
+            step, (observation, reward, terminated, truncated, info) = (
                 theirs.step(action),
                 ours.step(action),
             )
-            np.testing.assert_array_equal(np.concatenate([*step.observation.values()]), seen)
+            np.testing.assert_array_equal(np.concatenate([*step.observation.values()]), observation)
             assert (step.reward, step.last(), theirs.info) == (
                 reward,
                 terminated or truncated,
@@ -118,11 +122,11 @@ def test_dm_control_has_the_episodes_of_a_single_environment(task, setup):
 
 
 @pytest.mark.matrix
-def test_another_process_goes_on_as_the_original(tmp_path):
+def test_another_process_continues_like_the_original(tmp_path):
     expected = {}
     for task in ("cartpole", "mountain_car"):
-        env = made("Stable-Baselines3", task, "everything")
-        begun(env, 3)
+        env = make_face("Stable-Baselines3", task, "everything")
+        start_episode(env, 3)
         save_file(env.snapshot(), tmp_path / f"{task}.before")
         run(env, 60, seed=1)
         expected[task] = env.snapshot()

@@ -1,4 +1,4 @@
-"""Every constructor of vectors takes the same arguments, and makes what Gymnasium's loop over single ones makes."""
+"""Constructors of vectors accept the same arguments, and equal Gymnasium's loop."""
 
 import functools
 import itertools
@@ -37,92 +37,98 @@ ARGUMENTS = {
 VECTORS = {
     "name": functools.partial(make_vec, "cartpole"),
     "id": functools.partial(make_vec, ID),
-    "configuration": lambda num_envs, **given: make_vec(EnvConfig("cartpole"), num_envs, **given),
-    "its method": lambda num_envs, **given: EnvConfig("cartpole").make_vec(num_envs, **given),
-    "class": lambda num_envs, **given: ActuatedVectorEnv(
-        num_envs, "cartpole", **{"autoreset_mode": "SameStep", **given}
+    "configuration": lambda num_envs, **options: make_vec(
+        EnvConfig("cartpole"), num_envs, **options
     ),
-    "Gymnasium": lambda num_envs, **given: gymnasium.make_vec(
-        ID, num_envs, **{"autoreset_mode": "SameStep", **given}
+    "its method": lambda num_envs, **options: EnvConfig("cartpole").make_vec(num_envs, **options),
+    "class": lambda num_envs, **options: ActuatedVectorEnv(
+        num_envs, "cartpole", **{"autoreset_mode": "SameStep", **options}
     ),
-    "Stable-Baselines3, name": lambda num_envs, **given: make_sb3_vec_env(
-        "cartpole", num_envs, **given
+    "Gymnasium": lambda num_envs, **options: gymnasium.make_vec(
+        ID, num_envs, **{"autoreset_mode": "SameStep", **options}
     ),
-    "Stable-Baselines3, configuration": lambda num_envs, **given: make_sb3_vec_env(
-        EnvConfig("cartpole"), num_envs, **given
+    "Stable-Baselines3, name": lambda num_envs, **options: make_sb3_vec_env(
+        "cartpole", num_envs, **options
+    ),
+    "Stable-Baselines3, configuration": lambda num_envs, **options: make_sb3_vec_env(
+        EnvConfig("cartpole"), num_envs, **options
     ),
 }
 SINGLE = {
     "name": functools.partial(make, "cartpole"),
-    "configuration": lambda **given: make(EnvConfig("cartpole"), **given),
-    "its method": lambda **given: EnvConfig("cartpole").make(**given),
-    "dm_control": lambda **given: suite.load("cartpole", **given).env,
+    "configuration": lambda **options: make(EnvConfig("cartpole"), **options),
+    "its method": lambda **options: EnvConfig("cartpole").make(**options),
+    "dm_control": lambda **options: suite.load("cartpole", **options).env,
 }
 
 
-def of_gymnasium(given):
-    """Gymnasium's loop over environments with the same arguments."""
+def of_gymnasium(options):
+    """Make Gymnasium's loop over environments with the same arguments."""
     single = {
         name: value
-        for name, value in given.items()
+        for name, value in options.items()
         if name not in ("num_threads", "autoreset_mode")
     }
-    mode = AutoresetMode(given.get("autoreset_mode", "SameStep"))
+    mode = AutoresetMode(options.get("autoreset_mode", "SameStep"))
     return looped("cartpole", COUNT, mode, **LIMITED, **single)
 
 
-@pytest.mark.parametrize("given", ARGUMENTS.values(), ids=ARGUMENTS)
-def test_every_argument_does_the_same_in_every_constructor_of_vectors(given):
-    same_step = AutoresetMode(given.get("autoreset_mode", "SameStep")) == AutoresetMode.SAME_STEP
+@pytest.mark.parametrize("options", ARGUMENTS.values(), ids=ARGUMENTS)
+def test_arguments_have_the_same_effect_in_every_constructor_of_vector_environments(options):
+    same_step = AutoresetMode(options.get("autoreset_mode", "SameStep")) == AutoresetMode.SAME_STEP
     for name, constructor in VECTORS.items():
         if name.startswith("Stable") and not same_step:
             with pytest.raises(ValueError, match=r"autoreset_mode = '.*': must be 'SameStep'"):
-                constructor(COUNT, **LIMITED, **given)
+                constructor(COUNT, **LIMITED, **options)
             continue
-        made = constructor(COUNT, **LIMITED, **given)
-        batch = getattr(made, "env", made).unwrapped
+        vector_env = constructor(COUNT, **LIMITED, **options)
+        batch = getattr(vector_env, "env", vector_env).unwrapped
         assert isinstance(batch, ActuatedVectorEnv), name
-        assert batch.render_mode == given.get("render_mode")
-        assert assert_equal_episodes(batch, of_gymnasium(given), 9).sum() >= 2, name
+        assert batch.render_mode == options.get("render_mode")
+        assert assert_equal_episodes(batch, of_gymnasium(options), 9).sum() >= 2, name
         if batch.render_mode:
             assert [image.shape for image in batch.render()] == [(48, 64, 3)] * COUNT
-        made.close()
+        vector_env.close()
 
 
 SINGLE_ARGUMENTS = {
-    name: given
-    for name, given in ARGUMENTS.items()
-    if not {"num_threads", "autoreset_mode"} & given.keys() and "one for each" not in name
+    name: options
+    for name, options in ARGUMENTS.items()
+    if not {"num_threads", "autoreset_mode"} & options.keys() and "one for each" not in name
 }
 
 
-@pytest.mark.parametrize("given", SINGLE_ARGUMENTS.values(), ids=SINGLE_ARGUMENTS)
-def test_every_argument_does_the_same_in_every_constructor_of_one(given):
-    def walked(env):
+@pytest.mark.parametrize("options", SINGLE_ARGUMENTS.values(), ids=SINGLE_ARGUMENTS)
+def test_arguments_have_the_same_effect_in_every_constructor_of_a_single_environment(options):
+    def episode(env):
         env.action_space.seed(1)
         steps = [env.reset(seed=5), *(env.step(env.action_space.sample()) for _ in range(4))]
         env.close()
         assert steps[-1][3]
-        return tuple((seen, *map(np.asarray, ends), info) for seen, *ends, info in steps)
+        return tuple(
+            (observation, *map(np.asarray, ends), info) for observation, *ends, info in steps
+        )
 
-    expected = walked(gymnasium.make(ID, **LIMITED, **given))
+    expected = episode(gymnasium.make(ID, **LIMITED, **options))
     for name, constructor in SINGLE.items():
-        for got, want in zip(walked(constructor(**LIMITED, **given)), expected, strict=True):
-            assert_same(got[:-1], want[:-1], name)
+        for outcome, expected_outcome in zip(
+            episode(constructor(**LIMITED, **options)), expected, strict=True
+        ):
+            assert_same(outcome[:-1], expected_outcome[:-1], name)
 
 
 @pytest.mark.parametrize("mode", [mode.value for mode in AutoresetMode])
-def test_one_by_one_too_an_episode_that_ended_is_reset_when_it_was_asked_for(mode):
-    given = {"physics": "analytic", "actuator": "weak", "max_episode_steps": 4}
+def test_serial_environments_reset_in_the_requested_autoreset_mode(mode):
+    options = {"physics": "analytic", "actuator": "weak", "max_episode_steps": 4}
     for make_serial in VECTORS["name"], VECTORS["configuration"]:
-        envs = make_serial(COUNT, autoreset_mode=mode, **given)
+        envs = make_serial(COUNT, autoreset_mode=mode, **options)
         assert isinstance(envs, SerialVectorEnv)
-        assert assert_equal_episodes(envs, looped("cartpole", COUNT, mode, **given), 20).sum() > 4
+        assert assert_equal_episodes(envs, looped("cartpole", COUNT, mode, **options), 20).sum() > 4
         envs.close()
 
 
-def test_a_snapshot_knows_which_of_the_serial_environments_are_to_be_reset():
-    envs, other = (
+def test_a_snapshot_knows_which_serial_environments_must_be_reset():
+    envs, other_envs = (
         make_vec("cartpole", 2, physics="analytic", autoreset_mode="NextStep", **LIMITED)
         for _ in "12"
     )
@@ -130,17 +136,17 @@ def test_a_snapshot_knows_which_of_the_serial_environments_are_to_be_reset():
     envs.reset(seed=0)
     for _ in range(4):
         envs.step(random_actions(envs, generator))
-    other.restore(envs.snapshot())
+    other_envs.restore(envs.snapshot())
     for _ in range(6):
         actions = random_actions(envs, generator)
-        assert_same(other.step(actions), envs.step(actions))
+        assert_same(other_envs.step(actions), envs.step(actions))
 
 
 @pytest.mark.parametrize(
     "env", ["Reacher-v5", EnvConfig("Reacher-v5"), functools.partial(gymnasium.make, "Reacher-v5")]
 )
-def test_what_is_stepped_one_by_one_has_no_threads_and_says_so(env):
-    with pytest.raises(ValueError, match=r"num_threads = 2: must be 0 or 1 here: .*leave it out"):
+def test_raises_if_serial_environments_get_several_threads(env):
+    with pytest.raises(ValueError, match=r"num_threads = 2: must be 0 or 1: .*leave it out"):
         make_vec(env, 1, "lag", num_threads=2)
     envs = make_vec(env, 1, "lag", num_threads=1, autoreset_mode="Disabled", max_episode_steps=5)
     assert envs.autoreset_mode == AutoresetMode.DISABLED
@@ -148,7 +154,7 @@ def test_what_is_stepped_one_by_one_has_no_threads_and_says_so(env):
     envs.close()
 
 
-def test_a_window_is_the_only_thing_that_makes_a_task_slow_and_that_is_said():
+def test_warns_if_a_window_makes_a_task_step_one_by_one():
     with pytest.warns(
         UserWarning,
         match="render_mode = 'human': 1 environments of pendulum are stepped one by one",
@@ -158,20 +164,22 @@ def test_a_window_is_the_only_thing_that_makes_a_task_slow_and_that_is_said():
     envs.close()
 
 
-def test_none_leaves_the_time_limit_of_a_task_as_it_is():
-    made = (
+def test_a_time_limit_of_none_selects_the_task_s_own():
+    vector_envs = (
         make_vec("cartpole", 1, max_episode_steps=None),
         make_sb3_vec_env("cartpole", 1, max_episode_steps=None).env,
     )
-    assert [env.max_episode_steps for env in made] == [gymnasium.spec(ID).max_episode_steps] * 2
+    assert [env.max_episode_steps for env in vector_envs] == [
+        gymnasium.spec(ID).max_episode_steps
+    ] * 2
 
 
-def test_actuators_stand_third_in_every_factory():
+def test_the_actuator_is_the_third_argument_of_every_vector_factory():
     for env, pattern in itertools.product(
         ("pendulum", EnvConfig("pendulum", "weak")), (".*", "motor")
     ):
-        given = env, 2, {pattern: "lag"}
-        for batch in make_vec(*given), make_sb3_vec_env(*given).env:
+        factory_arguments = env, 2, {pattern: "lag"}
+        for batch in make_vec(*factory_arguments), make_sb3_vec_env(*factory_arguments).env:
             assert batch.setup.config.actuator == codrl_mj.actuators.Lag()
     with pytest.raises(
         ValueError, match=r"the function makes environments that have their motors: leave it out"
@@ -180,23 +188,23 @@ def test_actuators_stand_third_in_every_factory():
 
 
 class Arm(gymnasium.Env):
-    """An environment whose class has an attribute that is called like the method of a configuration."""
+    """Environment whose class attribute has the name of a configuration's method."""
 
     make = "brand"
 
     def __new__(cls, **options):
-        """Be the reacher, whatever the class is called."""
+        """Make a Reacher, whatever the name of the class."""
         return gymnasium.make("Reacher-v5", **options)
 
 
-def test_a_class_is_called_whatever_attributes_it_has():
+def test_a_class_with_an_attribute_make_is_still_called():
     with make(Arm, "lag") as env:
         assert env.get_wrapper_attr("motors")[0] == codrl_mj.actuators.Lag()
 
 
-def test_a_field_that_only_tasks_have_is_an_argument_elsewhere():
+def test_a_field_that_only_tasks_have_is_an_option_of_other_environments():
     class Timed:
-        """Takes what a task calls its integration step."""
+        """Environment with an argument that is a field's name."""
 
         def __new__(cls, timestep=0.0, **options):
             assert timestep == 0.5
@@ -213,22 +221,22 @@ def test_a_field_that_only_tasks_have_is_an_argument_elsewhere():
 
 
 @pytest.mark.parametrize("name", ["frame_skip", "options"])
-def test_options_of_an_environment_of_others_are_taken_alike(name):
-    given = {"frame_skip": 7} if name == "frame_skip" else {"options": {"frame_skip": 7}}
+def test_options_of_a_third_party_environment_are_accepted_by_name_and_as_mapping(name):
+    options = {"frame_skip": 7} if name == "frame_skip" else {"options": {"frame_skip": 7}}
     for env in "Reacher-v5", EnvConfig("Reacher-v5"):
-        one, many = make(env, "lag", **given), make_vec(env, 1, "lag", **given)
-        assert {one.unwrapped.frame_skip, many.envs[0].unwrapped.frame_skip} == {7}
-        one.close(), many.close()
+        single, vector_env = make(env, "lag", **options), make_vec(env, 1, "lag", **options)
+        assert {single.unwrapped.frame_skip, vector_env.envs[0].unwrapped.frame_skip} == {7}
+        single.close(), vector_env.close()
 
 
-def test_another_task_given_over_a_configuration_is_that_task():
+def test_the_task_of_a_configuration_can_be_replaced():
     assert make(EnvConfig("pendulum", "weak"), task="cartpole", actuator="lag").spec.id == ID
 
 
 @pytest.mark.parametrize(
-    ("act", "message"),
+    ("call", "message"),
     [
-        (lambda: make_vec("pendulum", 3, ["lag", "lag"]), "2 actuators for 3 environments"),
+        (lambda: make_vec("pendulum", 3, ["lag", "lag"]), "got 2 actuators for 3 environments"),
         (
             lambda: make("pendulum", ["lag", "lag"]),
             (
@@ -250,10 +258,10 @@ def test_another_task_given_over_a_configuration_is_that_task():
         ),
         (
             lambda: suite.load(make),
-            "must be a task's name or an EnvConfig; others go into DmEnvironment",
+            "must be a task's name or an EnvConfig; wrap other environments in DmEnvironment",
         ),
     ],
 )
-def test_what_does_not_go_is_refused_by_its_name(act, message):
+def test_raises_for_wrong_arguments(call, message):
     with pytest.raises(ValueError, match=message):
-        act()
+        call()

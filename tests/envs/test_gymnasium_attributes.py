@@ -1,4 +1,4 @@
-"""What Gymnasium's environments have as attributes, ours have: read and written with the same effect."""
+"""Attributes of Gymnasium's environments can be read and written with the same effect."""
 
 import copy
 import inspect
@@ -70,17 +70,18 @@ WRITES = [
     ("mountain_car", {"gravity": 0.003}),
     ("mountain_car_continuous", {"power": 0.001}),
 ]
-"""Task -> numbers that make a consistent model in Gymnasium, where sums and products are attributes of their own."""
+"""Tasks, and consistent numbers: Gymnasium stores sums and products as separate attributes."""
 
 
 def _pair(task, **arguments):
-    """Ours and Gymnasium's, unwrapped, so that episodes go on beyond their end."""
-    made = gymnasium.make(TASKS[task].env_id, **{"actuator": "ideal", **arguments})
-    return made.unwrapped, gymnasium.make(TASKS[task].gymnasium_id).unwrapped
+    """Make this package's and Gymnasium's environment, without wrappers that end episodes."""
+    env = gymnasium.make(TASKS[task].env_id, **{"actuator": "ideal", **arguments})
+    return env.unwrapped, gymnasium.make(TASKS[task].gymnasium_id).unwrapped
 
 
 def _run(env, task, seed):
-    """States over 50 steps, shape (50, n); continuous actions are float64, or Gymnasium computes in float32."""
+    """Return the states over 50 steps, shape (50, n)."""
+    # Continuous actions are float64: with float32 Gymnasium computes in float32.
     generator = np.random.default_rng(seed)
     env.reset(seed=seed)
     states = []
@@ -95,10 +96,11 @@ def _run(env, task, seed):
 
 @pytest.mark.parametrize("physics", PHYSICS)
 @every_rebuilt
-def test_every_number_that_gymnasiums_environment_has_can_be_read(task, physics):
+def test_all_numbers_of_gymnasiums_environment_can_be_read(task, physics):
     ours, theirs = _pair(task, physics=physics)
     ours.reset(seed=0)
-    ours.step(ours.action_space.sample())  # which drives the analytic physics through attributes
+    # A step drives the analytic physics by its attributes.
+    ours.step(ours.action_space.sample())
     names = [name for name in dir(theirs) if name[0] != "_" and name not in NOT_OF_THE_TASK]
     expected = {
         name: value for name in names if not inspect.isroutine(value := getattr(theirs, name))
@@ -111,10 +113,10 @@ def test_every_number_that_gymnasiums_environment_has_can_be_read(task, physics)
 @pytest.mark.parametrize(
     ("task", "values"),
     WRITES,
-    ids=lambda given: given if isinstance(given, str) else "+".join(given),
+    ids=lambda case: case if isinstance(case, str) else "+".join(case),
 )
 @pytest.mark.parametrize("physics", PHYSICS)
-def test_a_written_number_has_the_effect_that_it_has_in_gymnasium(task, values, physics):
+def test_a_written_number_has_the_same_effect_as_in_gymnasium(task, values, physics):
     ours, theirs = _pair(task, physics=physics)
     before = _run(theirs, task, seed=3)
     state = ours.state = ours.state + 0.01
@@ -125,14 +127,15 @@ def test_a_written_number_has_the_effect_that_it_has_in_gymnasium(task, values, 
     np.testing.assert_array_equal(ours.state, state)
     # Gymnasium's continuous car rounds its state to float32 in every step
     tolerance = 1e-6 if task == "mountain_car_continuous" else 1e-9
-    for _ in range(2):  # what is written outlasts a reset
+    # Written values must outlast a reset.
+    for _ in range(2):
         after = _run(theirs, task, seed=3)
         np.testing.assert_allclose(_run(ours, task, seed=3), after, rtol=0, atol=tolerance)
     assert not np.allclose(after, before, rtol=0, atol=1e-3)
 
 
 @every_rebuilt
-def test_a_state_that_is_set_is_the_one_that_the_next_step_starts_from(task):
+def test_the_next_step_starts_from_a_state_that_was_set(task):
     ours, theirs = _pair(task)
     state = np.linspace(0.02, 0.05, len(TASKS[task].state_names))
     for env in (ours, theirs):
@@ -147,16 +150,16 @@ def test_a_state_that_is_set_is_the_one_that_the_next_step_starts_from(task):
 
 
 @pytest.mark.parametrize("physics", PHYSICS)
-def test_setting_the_state_leaves_the_motor_as_it_is(physics):
+def test_setting_the_state_does_not_change_the_motor(physics):
     env = gymnasium.make("codrl_mj/CartPole-v0", physics=physics).unwrapped
     env.reset(seed=0)
     env.step(1)
-    other = copy.deepcopy(env)
-    env.state = other.state
+    other_env = copy.deepcopy(env)
+    env.state = other_env.state
     for action in (1, 0, 1):
-        found, expected = env.step(action)[4], other.step(action)[4]
-        assert found == expected
-        assert found["current"] != 0.0
+        info, expected = env.step(action)[4], other_env.step(action)[4]
+        assert info == expected
+        assert info["current"] != 0.0
 
 
 def test_wrappers_and_copies_have_the_attributes():
@@ -171,7 +174,8 @@ def test_wrappers_and_copies_have_the_attributes():
     )
     assert env.unwrapped.model.opt.gravity[2] == -10.0
     assert not env.has_wrapper_attr("gravitation")
-    env.unwrapped.gravitation = 1  # any other attribute is just one
+    # Other attributes can still be set freely.
+    env.unwrapped.gravitation = 1
 
 
 @pytest.mark.filterwarnings("ignore:.*already returned terminated")
@@ -180,7 +184,7 @@ def test_wrappers_and_copies_have_the_attributes():
     ("task", "name", "values"),
     [("cartpole", "gravity", [9.81, 3.72, 1.62]), ("pendulum", "l", [1.0, 1.5, 0.7])],
 )
-def test_environments_of_a_vector_have_values_and_states_of_their_own(task, mode, name, values):
+def test_environments_of_a_vector_have_their_own_values_and_states(task, mode, name, values):
     env = gymnasium.make_vec(TASKS[task].env_id, 3, mode, actuator="ideal")
     env.reset(seed=[5, 5, 5])
     nominal = env.get_attr(name)
@@ -189,13 +193,13 @@ def test_environments_of_a_vector_have_values_and_states_of_their_own(task, mode
     env.set_attr(name, values)
     assert env.get_attr(name) == tuple(values)
     action = np.full((3, 1), 0.5) if TASKS[task].forces is None else np.ones(3, dtype=np.int64)
-    found = [env.step(action)[0] for _ in range(8)][-1]
+    observations = [env.step(action)[0] for _ in range(8)][-1]
     for row, value in enumerate(values):
         theirs = _pair(task)[1]
         setattr(theirs, name, value)
         theirs.reset(seed=5)
         expected = [theirs.step(action[row])[0] for _ in range(8)][-1]
-        np.testing.assert_allclose(found[row], expected, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(observations[row], expected, rtol=0, atol=1e-5)
     env.set_attr(name, 2.0)
     assert env.get_attr(name) == (2.0, 2.0, 2.0)
     states = np.arange(1.0, 1.0 + 3 * len(TASKS[task].state_names)).reshape(3, -1) / 100
@@ -204,7 +208,7 @@ def test_environments_of_a_vector_have_values_and_states_of_their_own(task, mode
     env.close()
 
 
-# -- refusals -----------------------------------------------------------------------------------------------
+# -- refusals -------------------------------------------------------------------------------------
 
 DRAWN_GRAVITY = {"randomize": {"model.gravity": Uniform(0.9, 1.1)}}
 CURRENT = {"actuator": "paper", "action": "current", "levels": (-1, 1)}
@@ -212,9 +216,9 @@ CHECKED = "motor and disturbances were checked for this step"
 
 
 @pytest.mark.parametrize(
-    ("arguments", "name", "value", "why"),
+    ("arguments", "name", "value", "message"),
     [
-        ({}, "x_threshold", 5.0, "2.4 here; it is compiled .* `gymnasium.Wrapper`"),
+        ({}, "x_threshold", 5.0, "must be 2.4 in .*; it is compiled .* `gymnasium.Wrapper`"),
         ({}, "kinematics_integrator", "semi-implicit", "make an environment with integrator="),
         ({}, "total_mass", 3.0, "write masscart and masspole first"),
         ({"actuator": "paper"}, "tau", 0.5, CHECKED),
@@ -223,17 +227,18 @@ CHECKED = "motor and disturbances were checked for this step"
         (DRAWN_GRAVITY, "masspole", 0.5, "give `randomize` a distribution"),
     ],
 )
-def test_what_cannot_be_changed_says_why_and_what_to_do(arguments, name, value, why):
+def test_raises_with_reason_and_remedy_for_read_only_attributes(arguments, name, value, message):
     env = _pair("cartpole", **arguments)[0]
-    with pytest.raises(AttributeError, match=why):
+    with pytest.raises(AttributeError, match=message):
         setattr(env, name, value)
     if not arguments:
-        setattr(env, name, getattr(env, name))  # is no change
+        # Writing the present value is no change.
+        setattr(env, name, getattr(env, name))
 
 
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, "heavy", None, [1.0, 2.0]])
-def test_impossible_masses_are_refused_and_nothing_is_changed(value, physics):
+def test_raises_for_impossible_masses_and_changes_nothing(value, physics):
     env = _pair("cartpole", physics=physics)[0]
     with pytest.raises(ValueError, match=r"masspole = .*: must be a finite number > 0"):
         env.masspole = value
@@ -244,20 +249,20 @@ def test_impossible_masses_are_refused_and_nothing_is_changed(value, physics):
     ("name", "value", "error", "message"),
     [
         ("state", np.zeros((4, 2)), ValueError, r"of shape \(2, 4\)"),
-        ("tau", 0.1, AttributeError, "tau = 0.1: the environments share it, as 0.02"),
+        ("tau", 0.1, AttributeError, "tau = 0.1: the environments share the value 0.02"),
         ("gravity", [1.0, 2.0, 3.0], ValueError, "must be one number, or 2"),
     ],
 )
-def test_what_cannot_be_changed_of_a_batch_is_refused(name, value, error, message):
+def test_raises_for_changes_that_a_batch_does_not_support(name, value, error, message):
     env = gymnasium.make_vec("codrl_mj/CartPole-v0", 2, actuator="ideal").unwrapped
     assert env.get_attr("num_envs") == (2, 2)
     with pytest.raises(error, match=message):
         setattr(env, name, value)
 
 
-def test_a_physics_of_ones_own_without_a_model_says_that_it_has_no_such_number(monkeypatch):
+def test_raises_if_a_custom_physics_without_a_model_has_no_such_number(monkeypatch):
     class Still(AnalyticPhysics):
-        """Goes nowhere."""
+        """Physics that does not move."""
 
         def __init__(self, *arguments, **options):
             super().__init__(*arguments, **options)

@@ -1,4 +1,4 @@
-"""Bad input is refused with a sentence that names field, value and bound, and changes nothing."""
+"""Errors for bad input name field, value and bound, and change nothing."""
 
 import functools
 import math
@@ -26,7 +26,7 @@ CURRENT = {"action": "current", "levels": (-1.0, 1.0)}
 VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
 
 
-# -- arguments ----------------------------------------------------------------------------------------------
+# -- arguments ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -94,8 +94,8 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
             {"action": "voltage", "actuator": {"controller": {"max_voltage": INF}}},
             "action = 'voltage': needs a finite controller.max_voltage, it is inf",
         ),
-        # |1 - (1 + 100) * 0.02 / 0.1| = 19.2; in inner steps of less than 2 L / (R + kp) = 0.00198
-        # s it is stable
+        # |1 - (1 + 100) * 0.02 / 0.1| = 19.2; inner steps below 2 L / (R + kp) = 0.00198 s are
+        # stable.
         ({"actuator": UNSTABLE}, "unstable at a step of 0.02 s: spectral radius 19.2, must be < 1"),
         ({"actuator": UNSTABLE, "inner_steps": 10}, "unstable at a step of 0.002 s"),
         # |1 - R dt / L| = 2
@@ -137,7 +137,7 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
         ),
     ],
 )
-def test_a_bad_argument_of_one_environment_is_refused(arguments, message):
+def test_raises_for_a_bad_argument_of_a_single_environment(arguments, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         ActuatedEnv(**{"task": "cartpole", **arguments})
 
@@ -154,12 +154,12 @@ def test_a_bad_argument_of_one_environment_is_refused(arguments, message):
         ({"max_episode_steps": True}, "max_episode_steps = True: must be an integer >= 1"),
         ({"task": "pendulm"}, "unknown task 'pendulm': did you mean 'pendulum'"),
         ({"centre_radius": 0.1}, "unknown option 'centre_radius' of pendulum: it has none"),
-        ({"actuator": [WEAK] * 2}, "2 actuators for 3 environments: there must be one for each"),
-        ({"actuator": [WEAK] * 4}, "4 actuators for 3 environments: there must be one for each"),
-        ({"actuator": []}, "0 actuators for 3 environments: there must be one for each"),
+        ({"actuator": [WEAK] * 2}, "actuator: got 2 actuators for 3 environments; give one for"),
+        ({"actuator": [WEAK] * 4}, "actuator: got 4 actuators for 3 environments; give one for"),
+        ({"actuator": []}, "actuator: got 0 actuators for 3 environments; give one for"),
     ],
 )
-def test_a_bad_argument_of_many_environments_is_refused(make, arguments, message):
+def test_raises_for_a_bad_argument_of_a_vector_environment(make, arguments, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         make(**{"task": "pendulum", "num_envs": 3, **arguments})
 
@@ -183,7 +183,7 @@ def test_a_bad_argument_of_many_environments_is_refused(make, arguments, message
             "actuator[1]: unknown actuator 'weka': did you mean 'weak'?",
         ),
         ({"actuator": ["weak", "weak", 3]}, "actuator[2]: actuator = 3: must be a name"),
-        ({"actuator": ["weak", "lag", "weak"]}, "actuators of several families (Actuator, Lag)"),
+        ({"actuator": ["weak", "lag", "weak"]}, "of several families (DCMotorActuator, Lag)"),
         ({"actuator": WILD}, "unstable at a step of 0.05 s: spectral radius"),
         (
             {"actuator": [STABLE, STABLE, WILD]},
@@ -191,18 +191,18 @@ def test_a_bad_argument_of_many_environments_is_refused(make, arguments, message
         ),
         (
             {"actuator": [STABLE] * 3, "action": "voltage"},
-            "with an actuator for each environment only 'force'",
+            "action = 'voltage': must be 'force' with one actuator per environment",
         ),
     ],
 )
-def test_a_bad_argument_of_a_batch_is_refused(arguments, message):
+def test_raises_for_a_bad_argument_of_a_batch(arguments, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         ActuatedVectorEnv(**{"task": "pendulum", "num_envs": 3, **arguments})
 
 
 @pytest.mark.parametrize("physics", PHYSICS)
-def test_an_unknown_render_mode_is_refused_when_it_is_rendered(physics):
-    """Gymnasium warns of it when the environment is made, and its test suite wants no more."""
+def test_raises_for_an_unknown_render_mode_at_rendering(physics):
+    """Gymnasium only warns of it at construction, and its test suite requires no more."""
     env = ActuatedEnv("cartpole", physics=physics, render_mode="rgb_aray")
     with pytest.raises(
         ValueError,
@@ -211,23 +211,23 @@ def test_an_unknown_render_mode_is_refused_when_it_is_rendered(physics):
         env.render()
 
 
-def test_an_unstable_loop_is_stable_with_the_substeps_that_the_refusal_proposes_and_in_a_shorter_step():
-    with pytest.raises(ValueError, match=r"controller\.substeps = \d+") as refused:
+def test_the_substeps_proposed_for_an_unstable_loop_make_it_stable():
+    with pytest.raises(ValueError, match=r"controller\.substeps = \d+") as error_info:
         ActuatedEnv("cartpole", actuator=UNSTABLE)
     mapping = UNSTABLE.as_mapping()
     mapping["controller"]["substeps"] = int(
-        re.search(r"controller\.substeps = (\d+)", str(refused.value)).group(1)
+        re.search(r"controller\.substeps = (\d+)", str(error_info.value)).group(1)
     )
     env = ActuatedEnv("cartpole", actuator=mapping)
     env.reset(seed=0)
     for _ in range(20):
         info = env.step(1)[-1]
-    # no integral: the current is kp/(R + kp) of its reference
+    # Without an integral part the current is kp/(R + kp) times its reference.
     assert info["current"] == pytest.approx(info["reference_current"] * 100 / 101, rel=1e-3)
     ActuatedEnv("cartpole", actuator=UNSTABLE, inner_steps=11)
 
 
-# -- what is drawn ------------------------------------------------------------------------------------------
+# -- what is drawn --------------------------------------------------------------------------------
 
 DISTRIBUTION = "is no distribution: must be uniform(LOW, HIGH), "
 
@@ -328,7 +328,7 @@ DISTRIBUTION = "is no distribution: must be uniform(LOW, HIGH), "
         ),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(make, randomize, message):
+def test_raises_for_fields_that_cannot_be_drawn(make, randomize, message):
     with pytest.raises(
         ValueError, match=f"^randomize.*{re.escape(message.removeprefix('randomize'))}"
     ):
@@ -370,11 +370,11 @@ def test_what_cannot_be_drawn_is_refused(make, randomize, message):
             {"actuator": GEARED, "randomize": {"motor.gear_efficiency": Uniform(0, 1)}},
             "GearMotor.gear_efficiency = 0",
         ),
-        # a model's draws leave the loop as it is
+        # Randomizing the model does not change the loop.
         ({"actuator": UNSTABLE, "randomize": {"model.gravity": Uniform(0.9, 1.1)}}, "unstable"),
     ],
 )
-def test_draws_that_do_not_go_with_the_rest_are_refused(arguments, message):
+def test_raises_for_distributions_that_contradict_other_arguments(arguments, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         ActuatedEnv("cartpole", **arguments)
 
@@ -392,12 +392,12 @@ def test_draws_that_do_not_go_with_the_rest_are_refused(arguments, message):
         (Choice, ([NAN],), "nan must be a number"),
     ],
 )
-def test_impossible_bounds_are_refused(distribution, arguments, message):
+def test_raises_for_impossible_bounds(distribution, arguments, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         distribution(*arguments)
 
 
-# -- actions ------------------------------------------------------------------------------------------------
+# -- actions --------------------------------------------------------------------------------------
 
 NEITHER = [
     None,
@@ -427,7 +427,7 @@ NO_CHOICE = [4, 1.0, np.array([0.0])]
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("command", ["force", "current", "voltage"])
-def test_an_invalid_action_raises_and_changes_nothing(task, command):
+def test_raises_for_invalid_actions_and_changes_nothing(task, command):
     env = ActuatedEnv(task, **commanded(task, command))
     env.reset(seed=0)
     before = env.snapshot()
@@ -440,39 +440,43 @@ def test_an_invalid_action_raises_and_changes_nothing(task, command):
 
 
 def _wrong_batches(env):
-    """Batches of actions for four that are refused, with the index of the environment to be named, or None."""
-    good = random_actions(env, np.random.default_rng(0))
-    wrong = [
-        (good[:3], None),
-        (np.concatenate([good, good]), None),
-        (good[0], None),
+    """Return batches for four environments that are refused, with the row that the error names."""
+    actions = random_actions(env, np.random.default_rng(0))
+    bad_batches = [
+        (actions[:3], None),
+        (np.concatenate([actions, actions]), None),
+        (actions[0], None),
         (None, None),
         ("left", None),
     ]
     if isinstance(env.single_action_space, gymnasium.spaces.Discrete):
-        wrong += [(good.astype(float), None), (good[:, None], None), (good > 0, None)]
+        bad_batches += [
+            (actions.astype(float), None),
+            (actions[:, None], None),
+            (actions > 0, None),
+        ]
         values = [-1, env.single_action_space.n, np.iinfo(np.int64).max]
     else:
-        wrong += [
+        bad_batches += [
             (np.ones((4, 1), int), None),
-            (good[:, 0], None),
+            (actions[:, 0], None),
             (np.ones((4, 2), np.float32), None),
         ]
         values = [np.nan]
     for row, value in zip((2, 0, 3), values * 3, strict=False):
-        bad = good.copy()
-        bad[row] = value
-        wrong.append((bad, row))
-    return wrong
+        batch = actions.copy()
+        batch[row] = value
+        bad_batches.append((batch, row))
+    return bad_batches
 
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("mode", MODES)
-def test_bad_batches_of_actions_are_refused_before_anything_is_stepped(task, mode):
+def test_raises_for_bad_batches_of_actions_before_a_step(task, mode):
     env, control = batched(task, 4, mode), batched(task, 4, mode)
     generator = np.random.default_rng(1)
-    for one in (env, control):
-        one.reset(seed=0)
+    for each_env in (env, control):
+        each_env.reset(seed=0)
     before = env.unwrapped.snapshot()
     for actions, row in _wrong_batches(env):
         with pytest.raises(
@@ -485,27 +489,27 @@ def test_bad_batches_of_actions_are_refused_before_anything_is_stepped(task, mod
     assert_same(env.step(actions), control.step(actions))
 
 
-# -- resets -------------------------------------------------------------------------------------------------
+# -- resets ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"seed": [1, 2]}, "seed: 2 seeds for 3 environments"),
-        ({"seed": [1, 2, 3, 4]}, "seed: 4 seeds for 3 environments"),
+        ({"seed": [1, 2]}, "seed: got 2 seeds for 3 environments; give one for each"),
+        ({"seed": [1, 2, 3, 4]}, "seed: got 4 seeds for 3 environments; give one for each"),
         (
             {"options": {"reset_mask": np.ones(2, bool)}},
-            "must be a bool array of shape (3,) with a True in it",
+            "must be a bool array of shape (3,) with at least one True",
         ),
         ({"options": {"reset_mask": np.ones(3)}}, "must be a bool array of shape (3,)"),
         ({"options": {"reset_mask": [True] * 3}}, "must be a bool array of shape (3,)"),
-        ({"options": {"reset_mask": np.zeros(3, bool)}}, "with a True in it"),
+        ({"options": {"reset_mask": np.zeros(3, bool)}}, "with at least one True"),
         ({"options": {"low": 0.5, "high": -0.5}}, "low"),
         ({"options": {"low": "left"}}, "left"),
         ({"seed": -1}, "-1"),
     ],
 )
-def test_a_bad_reset_of_many_is_refused_and_changes_nothing(arguments, message):
+def test_raises_for_a_bad_reset_of_a_batch_and_changes_nothing(arguments, message):
     env = ActuatedVectorEnv(3, "cartpole")
     env.reset(seed=0)
     env.step(np.ones(3, int))
@@ -517,14 +521,14 @@ def test_a_bad_reset_of_many_is_refused_and_changes_nothing(arguments, message):
 
 @pytest.mark.parametrize("value", [-1.0, NAN])
 @pytest.mark.parametrize("make", [ActuatedEnv, functools.partial(ActuatedVectorEnv, 2)])
-def test_reset_options_out_of_order_are_refused(make, value):
+def test_raises_for_reset_options_out_of_order(make, value):
     with pytest.raises(
         ValueError, match=re.escape(f"reset options = {{'x_init': {value}}}: ask for [")
     ):
         make("pendulum").reset(seed=0, options={"x_init": value})
 
 
-def test_an_environment_that_ended_is_not_stepped_again_unless_reset():
+def test_raises_if_an_ended_environment_is_stepped_without_a_reset():
     env = batched("cartpole", 3, "Disabled", max_episode_steps=2)
     env.reset(seed=0)
     env.step(np.zeros(3, int))

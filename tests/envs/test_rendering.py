@@ -1,4 +1,4 @@
-"""Images: what they show, and what is said where there are none."""
+"""Images of environments: their content, and the errors where rendering is impossible."""
 
 import sys
 import unittest.mock
@@ -20,37 +20,38 @@ every_physics = pytest.mark.parametrize("physics", PHYSICS)
 
 @pytest.fixture
 def make():
-    """Makes small rendering environments, reset, and closes them after the test."""
-    made = []
+    """Return a function that makes small rendering environments; they are closed after the test."""
+    envs = []
 
     def make(task="cartpole", seed=0, **options):
         view = {"render_mode": "rgb_array", "width": 120, "height": 90, "disable_env_checker": True}
-        made.append(gymnasium.make(TASKS[task].env_id, **{**view, **options}).unwrapped)
-        made[-1].reset(seed=seed)
-        made[-1].action_space.seed(0)
-        return made[-1]
+        envs.append(gymnasium.make(TASKS[task].env_id, **{**view, **options}).unwrapped)
+        envs[-1].reset(seed=seed)
+        envs[-1].action_space.seed(0)
+        return envs[-1]
 
     yield make
-    for env in made:
+    for env in envs:
         env.close()
 
 
 @every_rebuilt
 @every_physics
-def test_an_image_has_its_size_follows_the_state_and_stays_as_it_was(make, task, physics):
+def test_an_image_has_its_size_follows_the_state_and_is_not_overwritten(make, task, physics):
     env = make(task, physics=physics, width=100, height=60)
     first = env.render()
     assert first.shape == (60, 100, 3)
     assert first.dtype == np.uint8
     assert first.std() > 5.0
     assert len(np.unique(first.reshape(-1, 3), axis=0)) > 20
-    kept = first.copy()
-    np.testing.assert_array_equal(env.render(), kept)  # nothing happened
+    first_copy = first.copy()
+    # Nothing has happened since the first image.
+    np.testing.assert_array_equal(env.render(), first_copy)
     for _ in range(10):
         env.step(env.action_space.sample())
     later = env.render()
     assert not np.shares_memory(first, later)
-    np.testing.assert_array_equal(first, kept)
+    np.testing.assert_array_equal(first, first_copy)
     assert np.any(np.abs(first.astype(int) - later).max(axis=2) > 30)
     env.reset(seed=0)
     np.testing.assert_array_equal(env.render(), first)
@@ -69,17 +70,17 @@ def test_both_physics_draw_the_same_picture_of_the_same_state(make, task):
 @every_rebuilt
 @every_physics
 def test_rendering_changes_nothing_in_the_episode(make, task, physics):
-    watched, alone = (make(task, physics=physics, actuator="weak") for _ in range(2))
+    rendered_env, control = (make(task, physics=physics, actuator="weak") for _ in range(2))
     for _ in range(20):
-        action = watched.action_space.sample()
-        watched.render()
-        found, expected = watched.step(action), alone.step(action)
-        np.testing.assert_array_equal(found[0], expected[0])
-        assert found[1:] == expected[1:]
-        np.testing.assert_array_equal(watched.state, alone.state)
+        action = rendered_env.action_space.sample()
+        rendered_env.render()
+        outcome, expected = rendered_env.step(action), control.step(action)
+        np.testing.assert_array_equal(outcome[0], expected[0])
+        assert outcome[1:] == expected[1:]
+        np.testing.assert_array_equal(rendered_env.state, control.state)
 
 
-def test_environments_render_alternately_without_mixing_each_its_own_view(make):
+def test_environments_that_render_alternately_keep_their_own_views(make):
     views = [{}, {"physics": "analytic", "seed": 2}, {"camera": "close"}, {"pretty": True}]
     envs = [make(**view) for view in views]
     images = [env.render() for env in envs]
@@ -93,26 +94,26 @@ def test_environments_render_alternately_without_mixing_each_its_own_view(make):
 def test_every_step_of_the_human_mode_is_shown_in_a_window(make, monkeypatch, physics):
     window = unittest.mock.MagicMock()
     monkeypatch.setattr("codrl_mj.envs.single.Window", window)
-    ours, pictures = (
+    windowed, pictured = (
         make("pendulum", physics=physics, render_mode=mode) for mode in ("human", "rgb_array")
     )
-    expected = [pictures.render()]
+    expected = [pictured.render()]
     for _ in range(3):
-        ours.step(np.array([2.0], np.float32))
-        pictures.step(np.array([2.0], np.float32))
-        expected.append(pictures.render())
-    ours.close()
+        windowed.step(np.array([2.0], np.float32))
+        pictured.step(np.array([2.0], np.float32))
+        expected.append(pictured.render())
+    windowed.close()
     window.assert_called_once_with(120, 90)
     window.return_value.close.assert_called_once_with()
-    shown = window.return_value.show.call_args_list
-    for call, picture in zip(shown, expected, strict=True):
+    calls = window.return_value.show.call_args_list
+    for call, picture in zip(calls, expected, strict=True):
         np.testing.assert_array_equal(call.args[0], picture)
         assert call.args[1] == 30
     assert "HumanRendering" not in str(gymnasium.make("codrl_mj/Pendulum-v0", render_mode="human"))
 
 
 def test_a_window_shows_an_image_the_right_way_round(monkeypatch):
-    """By what it hands to pygame, whether that is there or not: its arrays have the axis to the right first."""
+    """Check the arrays passed to a mocked pygame, whose first axis points to the right."""
     pygame = unittest.mock.MagicMock()
     monkeypatch.setitem(sys.modules, "pygame", pygame)
     image = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
@@ -124,9 +125,9 @@ def test_a_window_shows_an_image_the_right_way_round(monkeypatch):
         6, 3
     ).tolist()
     pygame.time.Clock().tick.assert_called_once_with(30.0)
-    drawn = [name for name, *_ in pygame.mock_calls]
-    assert drawn.index("display.set_mode().blit") < drawn.index("display.flip")
-    assert "display.quit" not in drawn
+    call_names = [name for name, *_ in pygame.mock_calls]
+    assert call_names.index("display.set_mode().blit") < call_names.index("display.flip")
+    assert "display.quit" not in call_names
     window.close()
     pygame.display.quit.assert_called_once_with()
 
@@ -144,7 +145,7 @@ def test_pygame_shows_an_image(monkeypatch):
     assert not pygame.display.get_init()
 
 
-def test_a_window_says_what_it_needs(monkeypatch):
+def test_raises_if_pygame_is_missing_for_a_window(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     env = gymnasium.make("codrl_mj/Pendulum-v0", render_mode="human", width=64, height=48)
     with pytest.raises(
@@ -170,24 +171,24 @@ def test_the_error_names_the_backend_that_was_chosen(make, monkeypatch):
 
 @pytest.mark.parametrize("camera", ["fixed", "close"])
 @every_rebuilt
-def test_the_sky_apart_makes_the_same_picture(task, camera):
-    """The scene composed of what is drawn anew and the sky that is kept is MuJoCo's own, to the pixel."""
+def test_images_with_a_cached_sky_equal_mujocos_own(task, camera):
+    """Compare each pixel with MuJoCo's renderer; only moving objects are drawn at each step."""
     env = ActuatedEnv(task, "ideal")
     env.reset(seed=0)
     renderer = OffscreenRenderer(env.model, 120, 90, camera)
-    plain = mujoco.Renderer(env.model, 90, 120)
+    reference = mujoco.Renderer(env.model, 90, 120)
     for _ in range(2):
         env.step(env.action_space.sample())
         env.physics.show(env.physics.state)
-        plain.update_scene(env.data, camera)
+        reference.update_scene(env.data, camera)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
-            plain.scene.flags[flag] = False
-        np.testing.assert_array_equal(renderer.render(env.data), plain.render())
+            reference.scene.flags[flag] = False
+        np.testing.assert_array_equal(renderer.render(env.data), reference.render())
     renderer.close()
-    plain.close()
+    reference.close()
 
 
-def test_a_black_thing_is_not_taken_for_the_sky():
+def test_a_black_object_is_not_taken_for_the_sky():
     model = mujoco.MjModel.from_xml_string(BLACK)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -1,4 +1,4 @@
-"""OpenGL contexts that cannot be, or that somebody else ends, frees or inherits; each in a process of its own."""
+"""OpenGL contexts that are unavailable, terminated, freed or inherited; each in its own process."""
 
 import os
 import subprocess
@@ -10,7 +10,8 @@ WITHOUT = """
 import mujoco
 import gymnasium, codrl_mj
 from codrl_mj.physics.offscreen import RenderingUnavailableError
-env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", render_mode="rgb_array", width=64, height=48)
+view = {"render_mode": "rgb_array", "width": 64, "height": 48}
+env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", **view)
 env.reset(seed=0)
 for _ in range(2):
     try:
@@ -24,7 +25,8 @@ import multiprocessing
 import gymnasium, numpy as np, codrl_mj
 
 def made(size):
-    env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", render_mode="rgb_array", width=size, height=48)
+    view = {"render_mode": "rgb_array", "width": size, "height": 48}
+    env = gymnasium.make("codrl_mj/CartPole-v0", actuator="ideal", **view)
     env.reset(seed=0)
     return env, env.render()
 
@@ -40,44 +42,53 @@ one, two = made(64), made(80)
 
 
 def _run(program, **environment):
-    """What a program prints where there is no display."""
-    kept = {
+    """Run a program without a display, and return its output."""
+    environment_without_display = {
         name: value
         for name, value in os.environ.items()
         if name not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")
     }
-    line = [sys.executable, "-c", program]
-    done = subprocess.run(
-        line, env=kept | environment, capture_output=True, text=True, timeout=120, check=False
+    command = [sys.executable, "-c", program]
+    process = subprocess.run(
+        command,
+        env=environment_without_display | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    assert not environment or not done.stderr
-    return done.stdout
+    assert process.returncode == 0, process.stderr
+    assert "Traceback" not in process.stderr
+    assert not environment or not process.stderr
+    return process.stdout
 
 
-def _drawn(program):
+def _printed_words(program):
+    """Return the words that the program prints after the common one."""
     return _run(PROGRAM + program, MUJOCO_GL="egl", SDL_VIDEODRIVER="dummy").split()
 
 
-def test_where_there_can_be_no_image_the_error_says_what_to_do():
-    """In a process that imported mujoco first, so that its backend needs a display, and there is none."""
-    said = _run(WITHOUT)
-    assert said.count("MUJOCO_GL is not set") == 2  # MuJoCo's own second attempt ends the process
-    assert "set MUJOCO_GL=egl before mujoco is first imported" in said
-    assert "apt-get install libegl1" in said
-    assert said.endswith("1.0\n")  # the environment itself goes on
+def test_the_error_without_opengl_has_a_remedy():
+    """Import mujoco first, so that its backend needs a display; there is none."""
+    output = _run(WITHOUT)
+    # MuJoCo's own second attempt would end the process.
+    assert output.count("MUJOCO_GL is not set") == 2
+    assert "set MUJOCO_GL=egl before mujoco is first imported" in output
+    assert "apt-get install libegl1" in output
+    # The environment itself continues.
+    assert output.endswith("1.0\n")
 
 
 @pytest.mark.matrix
-def test_after_the_display_has_ended_environments_close_and_render_again():
+def test_environments_close_and_render_again_after_the_display_was_terminated():
     program = "end_display(); one[0].close(); print(same(*two), same(*one), same(*made(64)))"
-    assert _drawn(program) == ["True"] * 3
-    assert _drawn("end_display()") == []  # at exit
+    assert _printed_words(program) == ["True"] * 3
+    # The contexts are freed at exit.
+    assert _printed_words("end_display()") == []
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
-def test_a_forked_process_renders_what_it_inherited_and_anew_and_none_frees_another_s():
+def test_a_forked_process_renders_inherited_and_new_environments_and_frees_only_its_own():
     program = """
 def child():
     print(same(*one), same(made(64)[0], one[1]), flush=True)
@@ -91,4 +102,4 @@ process.kill()
 one[0].close()
 print(same(*two), same(*two))
 """
-    assert _drawn(program) == ["True", "True", "0", *["True"] * 3]
+    assert _printed_words(program) == ["True", "True", "0", *["True"] * 3]

@@ -1,4 +1,4 @@
-"""Divergence is reported, never hidden; and no actuator parts MuJoCo from Gymnasium's dynamics."""
+"""Divergence is always reported; and MuJoCo agrees with Gymnasium's dynamics for any actuator."""
 
 import ctypes
 import dataclasses
@@ -28,24 +28,26 @@ pytestmark = pytest.mark.filterwarnings(
 
 @pytest.fixture(autouse=True)
 def _logs_of_the_engine(tmp_path, monkeypatch):
-    """The engine writes a log where it works."""
+    """Run each test in its own folder, because the engine writes a log into the present one."""
     monkeypatch.chdir(tmp_path)
 
 
 def _constant_action(env):
+    """Return the largest action."""
     space = env.action_space
     return np.int64(space.n - 1) if hasattr(space, "n") else space.high
 
 
-# -- divergence ---------------------------------------------------------------------------------------------
+# -- divergence -----------------------------------------------------------------------------------
 
 
 @every_task
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("command", ["force", "voltage"])
-def test_a_diverging_simulation_raises_with_task_and_entry_and_is_not_reset(task, physics, command):
+def test_divergence_raises_with_task_and_entry_and_does_not_reset(task, physics, command):
     actuator, options = WILD, {"inner_steps": 1}
-    if command == "voltage":  # a winding too fast for the step: |1 - R dt/L| = 1e4 dt - 1
+    if command == "voltage":
+        # The winding is too fast for the step: |1 - R dt/L| = 1e4 dt - 1.
         actuator = DCMotorActuator(Motor(inductance=1e-4), CurrentLoop(max_voltage=10.0))
         options |= {"action": "voltage"} | (
             {"levels": (-1, 0, 1)} if hasattr(TASKS[task].action_space, "n") else {}
@@ -66,10 +68,11 @@ def test_a_diverging_simulation_raises_with_task_and_entry_and_is_not_reset(task
     assert str(diverged.value).startswith(f"{task}: the simulation diverged at t = ")
     assert any(entry in str(diverged.value) for entry in name)
     if physics == "mujoco":
-        clocks.append(env.data.time)  # never back at 0
+        # The engine must not have reset the time to 0.
+        clocks.append(env.data.time)
         np.testing.assert_allclose(np.diff(clocks), env.task.step_duration, rtol=1e-9)
         assert env.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    # it stays diverged until it is reset, and is as new after that
+    # It stays diverged until it is reset, and then is like a new one.
     with pytest.raises(SimulationDivergedError):
         env.step(action)
     fresh = ActuatedEnv(task, actuator=actuator, physics=physics, allow_unstable=True, **options)
@@ -87,13 +90,12 @@ BEYOND = (np.inf, -np.inf, 1e11, 1e300)
     [
         *((task, "mujoco", value) for task in TASKS for value in (np.nan, *BEYOND)),
         *((task, "analytic", np.nan) for task in REBUILT),
-        *(
-            ("cartpole", "analytic", value) for value in BEYOND
-        ),  # others' equations, Gymnasium's, clip it
+        # Gymnasium's other equations clip such values.
+        *(("cartpole", "analytic", value) for value in BEYOND),
     ],
 )
-def test_a_lost_state_is_reported_at_the_next_step_and_a_reset_helps(task, physics, value):
-    """A wall, a speed limit or a wrapped angle would make it look like any other."""
+def test_an_invalid_state_raises_at_the_next_step_until_a_reset(task, physics, value):
+    """Check states that walls, speed limits or wrapped angles would otherwise hide."""
     env = ActuatedEnv(task, "default", physics)
     action = _constant_action(env)
     for entry in range(len(TASKS[task].state_names)):
@@ -109,38 +111,38 @@ def test_a_lost_state_is_reported_at_the_next_step_and_a_reset_helps(task, physi
 
 @every_task
 @pytest.mark.parametrize("mode", MODES)
-def test_a_lost_environment_is_named_and_the_others_go_on_once_it_is_reset(task, mode):
-    limit = (
-        3 if mode == "NextStep" else 6
-    )  # the others' episodes end in the step that is lost, or at last
+def test_a_diverged_environment_is_named_and_the_others_continue_after_its_reset(task, mode):
+    # The other episodes end in the step of the divergence, or at the end of the test.
+    limit = 3 if mode == "NextStep" else 6
     env, control = (batched(task, 3, mode, max_episode_steps=limit).unwrapped for _ in range(2))
     actions = random_actions(env, np.random.default_rng(0))
-    for one in (env, control):
-        one.reset(seed=0)
-        one.step(actions)
-    lost = env.snapshot()
-    lost["physics"][1] = np.nan
-    env.restore(lost)
-    for _ in range(2):  # until it is reset
+    for each_env in (env, control):
+        each_env.reset(seed=0)
+        each_env.step(actions)
+    lost_state = env.snapshot()
+    lost_state["physics"][1] = np.nan
+    env.restore(lost_state)
+    # The error repeats until the environment is reset.
+    for _ in range(2):
         with pytest.raises(
             SimulationDivergedError,
             match=rf"^{task}: 1 of 3 simulations diverged; environment 1 at t",
         ):
             env.step(actions)
         control.step(actions)
-    for one in (env, control):
-        one.reset(seed=[None, 7, None], options={"reset_mask": np.array([False, True, False])})
+    for each_env in (env, control):
+        each_env.reset(seed=[None, 7, None], options={"reset_mask": np.array([False, True, False])})
     np.testing.assert_array_equal(env.state, control.state)
     for _ in range(3):
         assert_same(env.step(actions), control.step(actions))
 
 
-def test_a_foreign_callback_is_refused_at_the_start_and_at_a_reset(bare_engine):
-    foreign = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(lambda *_: None)
+def test_raises_if_another_callback_is_installed_at_construction_or_reset(bare_engine):
+    other_callback = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(lambda *_: None)
     env = ActuatedVectorEnv(2, "pendulum")
     env.reset(seed=0)
     mujoco.set_mjcb_control(None)
-    mujoco.set_mjcb_control(foreign)
+    mujoco.set_mjcb_control(other_callback)
     with pytest.raises(CallbackInUseError, match="mjcb_control is already set"):
         ActuatedVectorEnv(2, "pendulum")
     with pytest.raises(CallbackInUseError, match="mjcb_control is already set"):
@@ -149,7 +151,7 @@ def test_a_foreign_callback_is_refused_at_the_start_and_at_a_reset(bare_engine):
     assert_same(env.reset(seed=0), ActuatedVectorEnv(2, "pendulum").reset(seed=0))
 
 
-# -- any actuator -------------------------------------------------------------------------------------------
+# -- any actuator ---------------------------------------------------------------------------------
 
 _motors = st.builds(
     Motor,
@@ -182,7 +184,7 @@ _loops = st.builds(
     command=st.sampled_from(["force", "current", "voltage"]),
 )
 def test_both_physics_agree_on_any_actuator_from_any_start(task, motor, loop, seed, command):
-    """Fifty steps under random actions: states relative to their size within 1e-9, chaotic Acrobot's within 1e-6."""
+    """Compare fifty random steps; the tolerance is 1e-9 of the states, 1e-6 for acrobots."""
     actuator, definition = DCMotorActuator(motor, loop), TASKS[task]
     options = {"actuator": actuator, "action": command}
     if command == "voltage":
@@ -197,14 +199,13 @@ def test_both_physics_agree_on_any_actuator_from_any_start(task, motor, loop, se
         simulated = dataclasses.replace(
             actuator, controller=CurrentLoop(kp=0.0, substeps=loop.substeps)
         )
-    assume(
-        spectral_radius(simulated, dt) < 1.0
-    )  # an unstable loop multiplies rounding errors without bound
-    both = [ActuatedEnv(task, physics=physics, **options) for physics in PHYSICS]
-    for env in both:
+    # An unstable loop would multiply rounding errors without bound.
+    assume(spectral_radius(simulated, dt) < 1.0)
+    envs = [ActuatedEnv(task, physics=physics, **options) for physics in PHYSICS]
+    for env in envs:
         env.reset(seed=seed)
-    np.testing.assert_array_equal(*(env.state for env in both))
-    generator, space = np.random.default_rng(seed), both[0].action_space
+    np.testing.assert_array_equal(*(env.state for env in envs))
+    generator, space = np.random.default_rng(seed), envs[0].action_space
     tolerance = 1e-6 if task == "acrobot" else 1e-9
     for step in range(50):
         action = (
@@ -212,8 +213,8 @@ def test_both_physics_agree_on_any_actuator_from_any_start(task, motor, loop, se
             if hasattr(space, "n")
             else generator.uniform(space.low, space.high)
         )
-        results = [env.step(action) for env in both]
-        states = np.array([env.state for env in both])
+        results = [env.step(action) for env in envs]
+        states = np.array([env.state for env in envs])
         scale = max(1.0, np.abs(states).max())
         np.testing.assert_allclose(*states, rtol=0, atol=tolerance * scale, err_msg=f"step {step}")
         signals = np.array([list(map(float, result[-1].values()))[:5] for result in results])

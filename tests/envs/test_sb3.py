@@ -1,4 +1,4 @@
-"""The Stable-Baselines3 face is `DummyVecEnv` of single environments in `Monitor`s, bit for bit."""
+"""The Stable-Baselines3 interface equals `DummyVecEnv` of `Monitor`s, bit for bit."""
 
 import gymnasium
 import numpy as np
@@ -31,7 +31,7 @@ def looped(task, num_envs, **arguments):
 
 
 def sampled(env, steps, seed=0):
-    """Batches of actions, as SB3's algorithms pass them: within the bounds."""
+    """Return batches of actions within the bounds, as the algorithms of Stable-Baselines3 do."""
     generator = np.random.default_rng(seed)
     batches = [random_actions(env.env, generator) for _ in range(steps)]
     space = env.action_space
@@ -43,27 +43,31 @@ def sampled(env, steps, seed=0):
 @every_rebuilt
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("setup", ["ideal", "force", "everything"])
-def test_steps_are_those_of_dummy_environments(task, setup, physics):
-    given = arguments(task, setup, physics) | {"physics": physics, "max_episode_steps": 10}
-    ours, theirs = batched(task, 5, **given), looped(task, 5, **given)
+def test_steps_equal_those_of_dummy_vec_env(task, setup, physics):
+    options = arguments(task, setup, physics) | {"physics": physics, "max_episode_steps": 10}
+    ours, theirs = batched(task, 5, **options), looped(task, 5, **options)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     for env in (ours, theirs):
         env.seed(3)
     ends = 0
-    for seed in range(2):  # a reset in the middle starts the records anew, with other states
+    # The reset in the middle restarts the records, from other states.
+    for seed in range(2):
         assert_same(ours.reset(), theirs.reset())
         assert ours.reset_infos == theirs.reset_infos
         for actions in sampled(ours, 60, seed):
-            (*seen, infos), (*expected, others) = ours.step(actions), theirs.step(actions)
-            assert_same(tuple(seen), tuple(expected))
-            for done, info, other in zip(seen[2], infos, others, strict=True):
+            (*outcome, infos), (*expected, expected_infos) = (
+                ours.step(actions),
+                theirs.step(actions),
+            )
+            assert_same(tuple(outcome), tuple(expected))
+            for done, info, expected_info in zip(outcome[2], infos, expected_infos, strict=True):
                 if not done:
                     assert info == {}
                     continue
                 ends += 1
                 assert info["episode"]["t"] >= 0
-                assert_same(plain(info), plain({name: other[name] for name in info}))
+                assert_same(plain(info), plain({name: expected_info[name] for name in info}))
                 assert info.keys() == {"terminal_observation", "TimeLimit.truncated", "episode"}
     assert ends >= 30
 
@@ -90,17 +94,17 @@ def test_the_wrappers_of_stable_baselines_work_on_it():
             VecMonitor(VecCheckNan(make("pendulum", 3, max_episode_steps=9), raise_exception=True))
         )
         env.seed(1)
-        found = [env.reset()]
+        outputs = [env.reset()]
         returns = []
         for actions in sampled(batched("pendulum", 3), 40):
             observations, rewards, dones, infos = env.step(actions)
-            found += [observations, rewards, dones.astype(float)]
+            outputs += [observations, rewards, dones.astype(float)]
             returns += [
                 (info["episode"]["r"], info["episode"]["l"]) for info in infos if "episode" in info
             ]
-        runs.append((found, returns))
-    for one, other in zip(runs[0][0], runs[1][0], strict=True):
-        np.testing.assert_array_equal(one, other)
+        runs.append((outputs, returns))
+    for values, expected in zip(runs[0][0], runs[1][0], strict=True):
+        np.testing.assert_array_equal(values, expected)
     assert runs[0][1] == runs[1][1]
     assert len(runs[0][1]) == 12
 
@@ -116,12 +120,13 @@ def test_seeds_count_up_and_are_used_once():
     second = env.reset()
     assert not np.array_equal(first, second)
     np.testing.assert_array_equal(second[2], single.reset()[0])
-    env.restore(pending)  # with the seeds that no reset had used yet
+    # The snapshot has the seeds that no reset had used yet.
+    env.restore(pending)
     np.testing.assert_array_equal(env.reset(), first)
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
-def test_an_attribute_is_each_environments_own(physics):
+def test_each_environment_has_its_own_attributes(physics):
     env = batched("pendulum", 2, physics=physics)
     env.reset()
     assert env.get_attr("g") == [10.0, 10.0]
@@ -132,13 +137,14 @@ def test_an_attribute_is_each_environments_own(physics):
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "analytic"])
-def test_options_reach_the_next_reset_and_its_infos_say_what_was_drawn(physics):
+def test_options_apply_to_the_next_reset_whose_infos_have_the_drawn_values(physics):
     env = batched("cartpole", 2, physics=physics, randomize={"motor.resistance": "uniform(0.5, 2)"})
     env.set_options({"low": -1e-6, "high": 1e-6})
     assert np.abs(env.reset()).max() <= 1e-6
-    drawn = [info["randomization"]["motor.resistance"] for info in env.reset_infos]
-    np.testing.assert_array_equal(drawn, env.randomization["motor.resistance"])
-    assert np.abs(env.reset()).max() > 1e-6  # they are used once
+    resistances = [info["randomization"]["motor.resistance"] for info in env.reset_infos]
+    np.testing.assert_array_equal(resistances, env.randomization["motor.resistance"])
+    # The options are used once.
+    assert np.abs(env.reset()).max() > 1e-6
     env.set_options([{"low": -0.1, "high": 0.1}, {}])
     with pytest.raises(ValueError, match="the environments share them: give one mapping"):
         env.reset()
@@ -182,27 +188,27 @@ def test_rendering_shows_the_first_environment(physics):
     np.testing.assert_array_equal(images[0], image)
     assert images[1] is None
     assert env.render_mode == "rgb_array"
-    for one in (env, single):
-        one.close()
+    for each_env in (env, single):
+        each_env.close()
     assert batched("pendulum", 2).render_mode is None
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"env_id": "Pendulum-v1"}, "no MuJoCo model .* take 'pendulum', our task of it"),
+        ({"env_id": "Pendulum-v1"}, "no MuJoCo model .* use 'pendulum', the task of this package"),
         ({"num_envs": 0}, "num_envs = 0"),
         ({"num_envs": 0, "physics": "analytic"}, "num_envs = 0"),
         ({"physics": "newton"}, "unknown physics 'newton'"),
     ],
 )
-def test_bad_arguments_are_refused(arguments, message):
+def test_raises_for_bad_arguments(arguments, message):
     with pytest.raises(ValueError, match=message):
         codrl_mj.make_sb3_vec_env(**{"env_id": "pendulum", **arguments})
 
 
 @pytest.mark.parametrize("name", ["codrl_mj/Pendulum-v0", "pendulum"])
-def test_it_is_a_vec_env_of_the_registered_limit(name):
+def test_the_default_time_limit_is_the_registered_one(name):
     env = codrl_mj.make_sb3_vec_env(name, 2)
     assert isinstance(env, ActuatedVecEnv)
     assert env.num_envs == 2

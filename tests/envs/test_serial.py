@@ -1,4 +1,4 @@
-"""Environments stepped one by one as one: what Gymnasium's loop gives, and what the batched environment offers."""
+"""`SerialVectorEnv` compared with Gymnasium's loop and with the batched environment."""
 
 import gymnasium
 import numpy as np
@@ -15,33 +15,35 @@ from tests.tasks.faces import every_rebuilt
 @every_rebuilt
 @pytest.mark.parametrize("physics", PHYSICS)
 def test_it_is_gymnasiums_loop_and_on_mujoco_the_batched_environment(task, physics):
-    given = arguments(task, "everything", physics) | {"max_episode_steps": 11}
-    ours = SerialVectorEnv(4, task, physics=physics, **given)
-    others = [looped(task, 4, "SameStep", physics=physics, **given)]
-    others += [batched(task, 4, "SameStep", **given)] if physics == "mujoco" else []
-    for other in others:
-        assert assert_equal_episodes(ours, other, 60, masks=False).sum() > 12
-    for mine, his in zip(ours.np_random, others[0].np_random, strict=True):
-        assert mine.random() == his.random()
+    options = arguments(task, "everything", physics) | {"max_episode_steps": 11}
+    ours = SerialVectorEnv(4, task, physics=physics, **options)
+    references = [looped(task, 4, "SameStep", physics=physics, **options)]
+    references += [batched(task, 4, "SameStep", **options)] if physics == "mujoco" else []
+    for reference in references:
+        assert assert_equal_episodes(ours, reference, 60, masks=False).sum() > 12
+    for generator, reference_generator in zip(ours.np_random, references[0].np_random, strict=True):
+        assert generator.random() == reference_generator.random()
     assert isinstance(ours, gymnasium.vector.SyncVectorEnv)
     assert ours.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.SAME_STEP
 
 
 @every_rebuilt
 def test_signals_and_draws_are_those_of_the_batched_environment(task):
-    given = arguments(task, "everything") | {"max_episode_steps": 7}
+    options = arguments(task, "everything") | {"max_episode_steps": 7}
     ours, theirs = (
-        SerialVectorEnv(3, task, **given),
-        batched(task, 3, "SameStep", **given).unwrapped,
+        SerialVectorEnv(3, task, **options),
+        batched(task, 3, "SameStep", **options).unwrapped,
     )
     assert ours.signals is None
-    assert_same(ours.randomization, theirs.randomization)  # nothing yet: NaN
+    # Before the first reset all values are NaN.
+    assert_same(ours.randomization, theirs.randomization)
     ours.reset(seed=2)
     theirs.reset(seed=2)
     for index, actions in enumerate(
         random_actions(ours, np.random.default_rng(index)) for index in range(20)
     ):
-        if index == 5:  # afterwards not all episodes end in the same step
+        # After this reset, the episodes end in different steps.
+        if index == 5:
             mask = {"reset_mask": np.array([True, False, False])}
             assert_same(ours.reset(options=dict(mask)), theirs.reset(options=dict(mask)))
         assert_same(ours.step(actions), theirs.step(actions), f"step {index}")

@@ -1,26 +1,26 @@
-"""The whole state of environments as plain arrays: what it is made of, and whose is refused."""
+"""Snapshots: the whole state of an environment as plain arrays, and refused snapshots."""
 
 import numpy as np
 import pytest
 
 from codrl_mj import Uniform
 from codrl_mj.envs import ActuatedEnv
-from tests.envs.faces import FACES, PHYSICS, arguments, begun, run
+from tests.envs.faces import FACES, PHYSICS, arguments, run, start_episode
 from tests.envs.vectors import assert_same
 from tests.tasks.faces import every_rebuilt
 
 both_physics = pytest.mark.parametrize("physics", PHYSICS)
 
 
-def _begun(face="one", task="cartpole", **given):
-    env = FACES[face](task, **given)
-    begun(env, 0)
+def _started_env(face="one", task="cartpole", **options):
+    env = FACES[face](task, **options)
+    start_episode(env, 0)
     return env
 
 
 @both_physics
-def test_a_snapshot_is_as_small_as_can_be_without_motor_draws_and_disturbances(physics):
-    assert _begun(actuator="ideal", physics=physics).snapshot().keys() == {
+def test_a_minimal_environment_has_a_minimal_snapshot(physics):
+    assert _started_env(actuator="ideal", physics=physics).snapshot().keys() == {
         "task",
         "physics",
         "generator",
@@ -28,21 +28,21 @@ def test_a_snapshot_is_as_small_as_can_be_without_motor_draws_and_disturbances(p
 
 
 @both_physics
-def test_a_wrong_bit_is_seen(physics):
+def test_every_entry_of_a_snapshot_matters(physics):
     """Each entry of a snapshot has an effect on what follows."""
     env = ActuatedEnv("pendulum", physics=physics, **arguments("pendulum", "everything", physics))
     snapshots = []
     for seed in (0, 1):
-        begun(env, seed)
+        start_episode(env, seed)
         run(env, 57 - seed, seed)
         snapshots.append(env.snapshot())
-    snapshot, other = snapshots
+    snapshot, other_snapshot = snapshots
     env.restore(snapshot)
     expected = run(env, 60, seed=1)
     for name in snapshot.keys() - {"task"}:
-        env.restore(snapshot | {name: other[name]})
+        env.restore(snapshot | {name: other_snapshot[name]})
         if name == "rejected":
-            assert env.randomization["rejected"] == other["rejected"]
+            assert env.randomization["rejected"] == other_snapshot["rejected"]
             continue
         with pytest.raises(AssertionError):
             assert_same(run(env, 60, seed=1), expected)
@@ -50,19 +50,19 @@ def test_a_wrong_bit_is_seen(physics):
 
 @every_rebuilt
 def test_the_model_is_restored_to_its_last_number(task):
-    env, other = (ActuatedEnv(task, **arguments(task, "everything")) for _ in range(2))
-    begun(env, 5)
-    begun(other, 99)
-    other.restore(env.snapshot())
-    assert other.actuator == env.actuator
+    env, other_env = (ActuatedEnv(task, **arguments(task, "everything")) for _ in range(2))
+    start_episode(env, 5)
+    start_episode(other_env, 99)
+    other_env.restore(env.snapshot())
+    assert other_env.actuator == env.actuator
     for name in dir(env.model):
         if isinstance(value := getattr(env.model, name), np.ndarray):
-            np.testing.assert_array_equal(getattr(other.model, name), value, err_msg=name)
-    np.testing.assert_array_equal(other.model.opt.gravity, env.model.opt.gravity)
+            np.testing.assert_array_equal(getattr(other_env.model, name), value, err_msg=name)
+    np.testing.assert_array_equal(other_env.model.opt.gravity, env.model.opt.gravity)
 
 
 @pytest.mark.parametrize(
-    ("face", "given", "message"),
+    ("face", "options", "message"),
     [
         (
             "one",
@@ -89,16 +89,16 @@ def test_the_model_is_restored_to_its_last_number(task):
         ("many, NextStep", {"task": "pendulum"}, r"\['physics'\] is of shape "),
     ],
 )
-def test_a_snapshot_of_others_is_refused_and_nothing_changes(face, given, message):
-    env = _begun(face)
+def test_raises_for_a_snapshot_of_another_environment_and_changes_nothing(face, options, message):
+    env = _started_env(face)
     before = env.snapshot()
     with pytest.raises(ValueError, match=rf"^snapshot{message}"):
-        env.restore(_begun(face, **given).snapshot())
+        env.restore(_started_env(face, **options).snapshot())
     assert_same(env.snapshot(), before)
 
 
 @pytest.mark.parametrize(
-    ("face", "entry", "changed", "message"),
+    ("face", "entry", "change", "message"),
     [
         (
             "one",
@@ -118,18 +118,16 @@ def test_a_snapshot_of_others_is_refused_and_nothing_changes(face, given, messag
         ("dm_control", "elapsed", None, "missing"),
     ],
 )
-def test_a_snapshot_with_a_wrong_entry_is_refused_and_nothing_changes(
-    face, entry, changed, message
-):
-    env = _begun(face)
+def test_raises_for_a_snapshot_with_a_wrong_entry_and_changes_nothing(face, entry, change, message):
+    env = _started_env(face)
     before = env.snapshot()
-    wrong = {name: value for name, value in before.items() if name != entry}
+    incomplete = {name: value for name, value in before.items() if name != entry}
     with pytest.raises(ValueError, match=rf"^snapshot\['{entry}'\] is {message}"):
-        env.restore(wrong if changed is None else before | {entry: changed(before[entry])})
+        env.restore(incomplete if change is None else before | {entry: change(before[entry])})
     assert_same(env.snapshot(), before)
 
 
-def test_a_foreign_generator_is_refused():
+def test_raises_for_a_generator_of_another_type():
     env = ActuatedEnv("cartpole")
     env.np_random = np.random.Generator(np.random.MT19937(0))
     with pytest.raises(ValueError, match="np_random is a MT19937: must be a PCG64"):

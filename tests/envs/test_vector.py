@@ -34,25 +34,25 @@ DIFFERENT = [
         resistance=resistance,
         arm_radius=arm,
         torque_constant=constant,
-        max_voltage=top,
+        max_voltage=max_voltage,
     )
-    for inductance, resistance, arm, constant, top in np.random.default_rng(0).uniform(
+    for inductance, resistance, arm, constant, max_voltage in np.random.default_rng(0).uniform(
         0.5, 1.0, (7, 5)
     )
     * (1, 1, 1, 1, 4)
 ]
 
 
-# -- the same episodes --------------------------------------------------------------------------------------
+# -- the same episodes ----------------------------------------------------------------------------
 
 
 @every_rebuilt
 @every_mode
 @pytest.mark.parametrize("setup", SETUPS)
 def test_episodes_are_those_of_single_environments(task, mode, setup):
-    given = arguments(task, setup) | {"max_episode_steps": 11}
-    ours = batched(task, 5, mode, num_threads=1 if mode == "SameStep" else 2, **given)
-    theirs = looped(task, 5, mode, **given)
+    options = arguments(task, setup) | {"max_episode_steps": 11}
+    ours = batched(task, 5, mode, num_threads=1 if mode == "SameStep" else 2, **options)
+    theirs = looped(task, 5, mode, **options)
     assert ours.single_action_space == theirs.single_action_space
     assert ours.single_observation_space == theirs.single_observation_space
     assert (assert_equal_episodes(ours, theirs, 40).sum(axis=1) > 0).all()
@@ -64,7 +64,7 @@ SPREAD = [DCMotorActuator(controller=CurrentLoop(kp=kp, substeps=2)) for kp in (
 
 
 @pytest.mark.parametrize(
-    ("task", "given"),
+    ("task", "options"),
     [
         ("cartpole", {"integrator": "semi-implicit"}),
         ("cartpole", {"center_radius": 0.05, "inner_steps": 4}),
@@ -83,13 +83,13 @@ SPREAD = [DCMotorActuator(controller=CurrentLoop(kp=kp, substeps=2)) for kp in (
         ("pendulum", {"actuator": SPREAD, "randomize": {"motor.inductance": Uniform(0.05, 0.2)}}),
     ],
 )
-def test_so_are_those_of_every_option(task, given):
-    given = {"max_episode_steps": 12, **given}
-    assert_equal_episodes(batched(task, 4, **given), looped(task, 4, **given), 40)
+def test_episodes_with_options_are_those_of_single_environments(task, options):
+    options = {"max_episode_steps": 12, **options}
+    assert_equal_episodes(batched(task, 4, **options), looped(task, 4, **options), 40)
 
 
 @every_rebuilt
-def test_episodes_are_equal_over_the_registered_time_limit_and_end_both_ways(task):
+def test_episodes_are_equal_beyond_the_registered_time_limit(task):
     steps = min(TASKS[task].max_episode_steps + 20, 230)
     arguments = {"max_episode_steps": 60} if task == "acrobot" else {}
     ends = assert_equal_episodes(
@@ -105,20 +105,20 @@ def test_episodes_are_equal_over_the_registered_time_limit_and_end_both_ways(tas
     ("task", "options"),
     [("mountain_car", {"low": 0.4, "high": 0.49}), ("acrobot", {"low": -3.0, "high": 3.0})],
 )
-def test_goals_are_reached_by_some_environments_before_others(task, options):
-    """Starts near the goal, so that these tasks terminate too."""
+def test_environments_reach_the_goal_at_different_times(task, options):
+    """Start near the goal, so that these tasks terminate too."""
     ours, theirs = batched(task, 9, "SameStep"), looped(task, 9, "SameStep")
     resets = [env.reset(seed=0, options=dict(options)) for env in (ours, theirs)]
     assert_same(*resets)
     terminated = np.zeros(9, dtype=int)
     for step in range(25):
         actions = np.full(9, 2)
-        one, other = ours.step(actions), theirs.step(actions)
-        assert_same(one, other, f"step {step}")
-        terminated += one[2]
-        if one[2].any():
+        outcome, expected = ours.step(actions), theirs.step(actions)
+        assert_same(outcome, expected, f"step {step}")
+        terminated += outcome[2]
+        if outcome[2].any():
             assert not np.array_equal(
-                one[4]["final_obs"][np.argmax(one[2])], one[0][np.argmax(one[2])]
+                outcome[4]["final_obs"][np.argmax(outcome[2])], outcome[0][np.argmax(outcome[2])]
             )
     assert 0 < terminated.sum() < 25 * 9
     assert len(np.unique(terminated)) > 1
@@ -131,33 +131,34 @@ def test_each_environment_may_have_its_own_actuator(task, mode):
     ours = batched(task, 7, mode, num_threads=1 if mode == "SameStep" else 2, **arguments)
     assert_equal_episodes(ours, looped(task, 7, mode, **arguments), 30)
     currents = ours.unwrapped.signals["current"]
-    assert len(np.unique(currents)) == 7  # the parameters arrive
+    # All currents differ only if each environment has its own parameters.
+    assert len(np.unique(currents)) == 7
 
 
-def test_an_actuator_in_any_form_is_the_same_for_all_and_for_each(tmp_path):
+def test_actuators_can_be_given_in_any_form_for_all_or_for_each_environment(tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("name: weak\ncontroller: {kp: 0.5}\n")
-    written = ["paper", file, {"name": "weaker", "motor": {"resistance": 2.0}}, str(file)]
-    each = [EnvConfig("pendulum", one).actuator for one in written]
-    assert len(set(each)) == 3
+    forms = ["paper", file, {"name": "weaker", "motor": {"resistance": 2.0}}, str(file)]
+    actuators = [EnvConfig("pendulum", actuator).actuator for actuator in forms]
+    assert len(set(actuators)) == 3
     assert_equal_episodes(
-        batched("pendulum", 4, actuator=written), looped("pendulum", 4, actuator=each), 20
+        batched("pendulum", 4, actuator=forms), looped("pendulum", 4, actuator=actuators), 20
     )
-    for form, one in zip(written, each, strict=True):
+    for form, actuator in zip(forms, actuators, strict=True):
         assert_equal_episodes(
-            batched("pendulum", 2, actuator=form), looped("pendulum", 2, actuator=[one] * 2), 3
+            batched("pendulum", 2, actuator=form), looped("pendulum", 2, actuator=[actuator] * 2), 3
         )
-    serial = make_sb3_vec_env("pendulum", 4, physics="analytic", actuator=written).env
-    assert [one.unwrapped.actuator for one in serial.envs] == each
+    serial = make_sb3_vec_env("pendulum", 4, physics="analytic", actuator=forms).env
+    assert [actuator.unwrapped.actuator for actuator in serial.envs] == actuators
 
 
 @every_rebuilt
 @pytest.mark.parametrize("num_envs", [1, 67])
-def test_one_environment_is_a_batch_and_many_are_as_equal_as_few(task, num_envs):
-    """Compiled array functions take other paths for long arrays than for single numbers."""
-    given = {"actuator": "weaker", "max_episode_steps": 9}
+def test_episodes_do_not_depend_on_the_size_of_a_batch(task, num_envs):
+    """Check sizes for which compiled array functions take other paths than for single numbers."""
+    options = {"actuator": "weaker", "max_episode_steps": 9}
     assert_equal_episodes(
-        batched(task, num_envs, num_threads=2, **given), looped(task, num_envs, **given), 12
+        batched(task, num_envs, num_threads=2, **options), looped(task, num_envs, **options), 12
     )
 
 
@@ -172,7 +173,7 @@ def test_infinite_and_float64_actions_saturate_as_in_a_single_environment(task):
 
 
 @pytest.mark.parametrize("task", matrix_params(["pendulum", "cartpole", "mountain_car"], TASKS))
-def test_resets_take_gymnasiums_options_and_a_mask_leaves_the_others(task):
+def test_resets_accept_gymnasiums_options_and_a_mask_leaves_other_environments(task):
     low, high = (-0.02, 0.03) if task == "cartpole" else (-0.55, -0.45)
     options = {"x_init": 0.3, "y_init": 0.2} if task == "pendulum" else {"low": low, "high": high}
     ours, theirs = batched(task, 6, "Disabled"), looped(task, 6, "Disabled")
@@ -182,15 +183,16 @@ def test_resets_take_gymnasiums_options_and_a_mask_leaves_the_others(task):
         actions = random_actions(ours, generator)
         assert_same(ours.step(actions), theirs.step(actions))
         mask = np.arange(6) % 4 == index % 4
-        kept = ours.unwrapped.state[~mask]
-        given = {"reset_mask": mask, **options}
-        assert_same(ours.reset(options=given), theirs.reset(options=dict(given)))
-        np.testing.assert_array_equal(ours.unwrapped.state[~mask], kept)
-        assert given.keys() == {"reset_mask", *options}  # ours changes nobody's dictionary
+        kept_states = ours.unwrapped.state[~mask]
+        reset_options = {"reset_mask": mask, **options}
+        assert_same(ours.reset(options=reset_options), theirs.reset(options=dict(reset_options)))
+        np.testing.assert_array_equal(ours.unwrapped.state[~mask], kept_states)
+        # The reset must not change the caller's dictionary.
+        assert reset_options.keys() == {"reset_mask", *options}
 
 
 @pytest.mark.parametrize("seed", [5, np.int64(5), [9, 3, 9, None], [None] * 4])
-def test_seeds_in_every_form(seed):
+def test_seeds_are_accepted_in_every_form(seed):
     ours, theirs = batched("cartpole", 4), looped("cartpole", 4)
     for env in (ours, theirs):
         env.reset(seed=[1, 2, 3, 4])
@@ -200,13 +202,13 @@ def test_seeds_in_every_form(seed):
             for env in (ours, theirs)
         )
     )
-    for mine, his in zip(ours.np_random, theirs.np_random, strict=True):
-        assert mine.bit_generator.state == his.bit_generator.state
+    for generator, reference_generator in zip(ours.np_random, theirs.np_random, strict=True):
+        assert generator.bit_generator.state == reference_generator.bit_generator.state
     if isinstance(seed, np.integer):
         np.testing.assert_array_equal(ours.reset(seed=seed)[0], theirs.reset(seed=5)[0])
 
 
-# -- the contract -------------------------------------------------------------------------------------------
+# -- the contract ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", matrix_params(REBUILT, TASKS))
@@ -222,18 +224,18 @@ def test_spaces_spec_and_metadata_are_those_of_gymnasiums_loop(task):
         assert getattr(ours, name) == getattr(theirs, name), name
     assert ours.spec.id == theirs.spec.id == TASKS[task].env_id
     assert ours.spec.kwargs["vectorization_mode"] == "vector_entry_point"
-    modes = ["rgb_array", "rgb_array_list"]  # no window: Gymnasium's wrapper has one for many
+    # There is no window: Gymnasium has a wrapper that makes one for many environments.
+    modes = ["rgb_array", "rgb_array_list"]
     assert ours.metadata == theirs.metadata | {"render_modes": modes}
     assert ours.unwrapped.max_episode_steps == TASKS[task].max_episode_steps
     assert gymnasium.make_vec(ours.spec).num_envs == 3
-    assert (
-        gymnasium.make_vec(TASKS[task].env_id, 2).unwrapped.num_envs == 2
-    )  # the default mode is ours
+    # Without a mode, Gymnasium selects the vector entry point.
+    assert gymnasium.make_vec(TASKS[task].env_id, 2).unwrapped.num_envs == 2
     assert ActuatedVectorEnv.metadata["render_modes"] == modes
 
 
 @every_mode
-def test_the_autoreset_mode_is_in_the_metadata_and_may_be_a_name_or_gymnasiums_own(mode):
+def test_the_autoreset_mode_is_in_the_metadata_and_can_be_a_name_or_an_enum(mode):
     assert batched("pendulum", 2, mode).metadata["autoreset_mode"] is AutoresetMode(mode)
     assert batched("pendulum", 2, AutoresetMode(mode)).metadata["autoreset_mode"] is AutoresetMode(
         mode
@@ -257,15 +259,15 @@ def test_gymnasiums_vector_wrappers_work_on_it():
     assert episodes > 4
 
 
-# -- rendering ----------------------------------------------------------------------------------------------
+# -- rendering ------------------------------------------------------------------------------------
 
 
-def test_rendering_shows_every_environment_and_leaves_the_episode_alone():
+def test_rendering_shows_every_environment_and_does_not_change_the_episode():
     arguments = {"render_mode": "rgb_array", "width": 64, "height": 48}
     env, control = batched("pendulum", 3, **arguments), batched("pendulum", 3)
     singles = [gymnasium.make(TASKS["pendulum"].env_id, **arguments) for _ in range(3)]
-    for one in (env, control):
-        one.reset(seed=1)
+    for each_env in (env, control):
+        each_env.reset(seed=1)
     for row, single in enumerate(singles):
         single.reset(seed=1 + row)
     for _ in range(5):
@@ -284,8 +286,8 @@ def test_rendering_shows_every_environment_and_leaves_the_episode_alone():
     np.testing.assert_array_equal(env.image(1), singles[1].render())
     assert env.image().shape == (48, 64, 3)
     assert env.image().dtype == np.uint8
-    for one in (env, twin, lists, *singles):
-        one.close()
+    for each_env in (env, twin, lists, *singles):
+        each_env.close()
 
 
 def test_without_a_render_mode_there_is_a_warning_and_no_image():
@@ -294,14 +296,19 @@ def test_without_a_render_mode_there_is_a_warning_and_no_image():
 
 
 def test_threads_of_a_shallow_copy_use_its_own_arrays():
-    taken = []
+    rewards = []
     for threads in (1, 2):
-        one = batched("pendulum", 256, num_threads=threads)
-        one.reset(seed=0)
-        one.action_space.seed(0)
-        other = copy.copy(one)
-        other._kernels = None  # it makes its own, of what both share
-        taken.append(
-            [env.step(one.action_space.sample())[1] for _ in range(100) for env in (one, other)]
+        env_copied = batched("pendulum", 256, num_threads=threads)
+        env_copied.reset(seed=0)
+        env_copied.action_space.seed(0)
+        shallow_copy = copy.copy(env_copied)
+        # The copy makes new kernels from the arrays that both share.
+        shallow_copy._kernels = None
+        rewards.append(
+            [
+                stepped_env.step(env_copied.action_space.sample())[1]
+                for _ in range(100)
+                for stepped_env in (env_copied, shallow_copy)
+            ]
         )
-    np.testing.assert_array_equal(*taken)
+    np.testing.assert_array_equal(*rewards)

@@ -1,7 +1,7 @@
-"""Every parameter of the actuator matters to the task: on/off pairs, each side against the chain by hand.
+"""Every parameter of the actuator affects the task: pairs with and without it, against an oracle.
 
-The oracle is the reference motor (`tests.reference`) and Gymnasium's own step: a wire that is
-missing in the environment makes one side of its pair leave the oracle, and both sides alike.
+The oracle is the reference motor (`tests.reference`) and Gymnasium's own step: if a connection is
+missing in the environment, one side of its pair differs from the oracle, and both sides are equal.
 """
 
 import functools
@@ -37,7 +37,7 @@ SUPPLY = {
     "mountain_car": 0.6,
     "mountain_car_continuous": 0.6,
 }
-"""A supply that saturates at times, by task [V]."""
+"""Supply voltage [V] at which each task saturates sometimes."""
 
 TRACE = (
     "desired_force",
@@ -49,7 +49,8 @@ TRACE = (
     "speed",
 )
 
-OFF = {  # feature -> the change that takes it away, and what else both sides of the pair have
+# Parameter -> changes that remove it, and changes that both sides of the pair have.
+OFF = {
     "back_emf_constant": ({"back_emf_constant": 0.0}, {"bemf_compensation": False}),
     "bemf_compensation": ({"bemf_compensation": False}, {"back_emf_constant": 2.0}),
     "max_voltage": ({"max_voltage": np.inf}, {}),
@@ -72,7 +73,7 @@ OFF = {  # feature -> the change that takes it away, and what else both sides of
 
 @functools.cache
 def _episode(task, physics, integrator, actuator):
-    """States, and traces of all integration steps, under random actions: of the environment, and of the oracle."""
+    """Return traces of all integration steps under random actions: environment, and oracle."""
     env, driver = (
         ActuatedEnv(task, actuator, physics, integrator=integrator),
         TASKS[task].reference_env(),
@@ -82,7 +83,7 @@ def _episode(task, physics, integrator, actuator):
     motor, state = MotorSimulation(actuator), env.state
     constants, limit = actuator.motor, actuator.controller.max_voltage
     dt = env.task.step_duration / env.task.motor_inner_steps
-    found, expected = [], []
+    rows, expected = [], []
     for _ in range(STEPS[task]):
         action = env.action_space.sample()
         env.step(action)
@@ -93,15 +94,15 @@ def _episode(task, physics, integrator, actuator):
             reference = desired * constants.arm_radius / constants.torque_constant
             ends = abs(motor.voltage) >= limit, state[SPEED[task]]
             expected.append([desired, delivered, motor.current, reference, motor.voltage, *ends])
-            found.append(row)
+            rows.append(row)
         np.testing.assert_allclose(env.state, state, rtol=0, atol=1e-10)
     assert env.trace_names == TRACE
-    rows, oracle = np.array(found), np.array(expected)
-    np.testing.assert_array_equal(rows[:, 0], oracle[:, 0])
+    results, oracle = np.array(rows), np.array(expected)
+    np.testing.assert_array_equal(results[:, 0], oracle[:, 0])
     np.testing.assert_allclose(
-        rows[:, 1] * constants.arm_radius, constants.torque_constant * rows[:, 2], rtol=1e-12
+        results[:, 1] * constants.arm_radius, constants.torque_constant * results[:, 2], rtol=1e-12
     )
-    return rows, oracle
+    return results, oracle
 
 
 @pytest.mark.parametrize(
@@ -109,16 +110,16 @@ def _episode(task, physics, integrator, actuator):
 )
 @pytest.mark.parametrize("physics", PHYSICS)
 @pytest.mark.parametrize("feature", OFF)
-def test_a_feature_matters_and_is_what_it_should_be_with_and_without(
+def test_a_parameter_has_an_effect_and_matches_the_reference_with_and_without_it(
     task, integrator, physics, feature
 ):
-    without, both = OFF[feature]
-    with_it = changed(FULL, **{"inductance": 0.2, "max_voltage": SUPPLY[task], **both})
+    without, common = OFF[feature]
+    actuator_with = changed(FULL, **{"inductance": 0.2, "max_voltage": SUPPLY[task], **common})
     runs = []
-    for actuator in (with_it, changed(with_it, **without)):
-        found, expected = _episode(task, physics, integrator, actuator)
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-        runs.append(found)
+    for actuator in (actuator_with, changed(actuator_with, **without)):
+        rows, expected = _episode(task, physics, integrator, actuator)
+        np.testing.assert_allclose(rows, expected, rtol=1e-9, atol=1e-9)
+        runs.append(rows)
     differences = np.abs(runs[0] - runs[1])
     assert differences[:, TRACE.index("actual_force")].max() > 1e-3
     assert differences[:, TRACE.index("speed")].max() > 1e-7
@@ -126,7 +127,7 @@ def test_a_feature_matters_and_is_what_it_should_be_with_and_without(
 
 @every_rebuilt
 def test_the_pairs_saturate_at_times(task):
-    """Guards the pair of the supply, and that of the compensation, which saturation alone leaves incomplete."""
+    """Check the pairs of supply and compensation, which need both kinds of steps."""
     actuator = changed(FULL, inductance=0.2, max_voltage=SUPPLY[task])
     rows = _episode(task, "mujoco", TASKS[task].integrators[0], actuator)[0]
     voltages = np.abs(rows[:, TRACE.index("voltage")])

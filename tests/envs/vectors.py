@@ -1,10 +1,11 @@
-"""The vector environment beside Gymnasium's loop over single ones."""
+"""Comparison of the vector environment with Gymnasium's loop over single environments."""
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-import codrl_mj  # noqa: F401 - registers the environments
+# The import registers the environments.
+import codrl_mj  # noqa: F401
 from codrl_mj.envs import ActuatedVectorEnv, SerialVectorEnv
 from codrl_mj.tasks import TASKS
 
@@ -12,14 +13,14 @@ MODES = tuple(mode.value for mode in AutoresetMode)
 
 
 def batched(task, num_envs, mode="NextStep", **arguments):
-    """Ours, as a user makes it."""
+    """Make the batched vector environment by `gymnasium.make_vec`."""
     return gymnasium.make_vec(
         TASKS[task].env_id, num_envs, "vector_entry_point", autoreset_mode=mode, **arguments
     )
 
 
 def looped(task, num_envs, mode="NextStep", **arguments):
-    """Gymnasium's `SyncVectorEnv` of single environments."""
+    """Make Gymnasium's `SyncVectorEnv` of single environments."""
     actuators = arguments.pop("actuator", "default")
     if not isinstance(actuators, list):
         options = {"autoreset_mode": AutoresetMode(mode)}
@@ -27,37 +28,38 @@ def looped(task, num_envs, mode="NextStep", **arguments):
             TASKS[task].env_id, num_envs, "sync", options, actuator=actuators, **arguments
         )
     single = TASKS[task].env_id
-    makers = [
-        lambda one=one: gymnasium.make(single, actuator=one, **arguments) for one in actuators
+    env_functions = [
+        lambda actuator=actuator: gymnasium.make(single, actuator=actuator, **arguments)
+        for actuator in actuators
     ]
-    return SyncVectorEnv(makers, autoreset_mode=mode)
+    return SyncVectorEnv(env_functions, autoreset_mode=mode)
 
 
-def assert_same(ours, theirs, where=""):
-    """Nested dictionaries, tuples and arrays that are equal bit for bit, types and shapes included."""
+def assert_same(ours, theirs, path=""):
+    """Assert that nested results are equal bit for bit, including their types and shapes."""
     if isinstance(theirs, dict):
-        assert isinstance(ours, dict), where
-        assert ours.keys() == theirs.keys(), where
+        assert isinstance(ours, dict), path
+        assert ours.keys() == theirs.keys(), path
         for name in theirs:
-            assert_same(ours[name], theirs[name], f"{where}[{name!r}]")
+            assert_same(ours[name], theirs[name], f"{path}[{name!r}]")
     elif isinstance(theirs, tuple):
-        assert len(ours) == len(theirs), where
-        for index, (one, other) in enumerate(zip(ours, theirs, strict=True)):
-            assert_same(one, other, f"{where}[{index}]")
+        assert len(ours) == len(theirs), path
+        for index, (item, expected_item) in enumerate(zip(ours, theirs, strict=True)):
+            assert_same(item, expected_item, f"{path}[{index}]")
     elif theirs is None:
-        assert ours is None, where
+        assert ours is None, path
     else:
-        assert isinstance(ours, np.ndarray), where
-        assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape), where
+        assert isinstance(ours, np.ndarray), path
+        assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape), path
         if theirs.dtype == object:
-            for index, (one, other) in enumerate(zip(ours, theirs, strict=True)):
-                assert_same(one, other, f"{where}[{index}]")
+            for index, (item, expected_item) in enumerate(zip(ours, theirs, strict=True)):
+                assert_same(item, expected_item, f"{path}[{index}]")
         else:
-            np.testing.assert_array_equal(ours, theirs, err_msg=where)
+            np.testing.assert_array_equal(ours, theirs, err_msg=path)
 
 
 def random_actions(env, generator):
-    """A batch of actions; continuous ones reach half as far again as the bounds."""
+    """Return a batch of actions; continuous ones exceed the bounds by half."""
     space = env.single_action_space
     if isinstance(space, gymnasium.spaces.Discrete):
         return generator.integers(space.n, size=env.num_envs)
@@ -67,10 +69,10 @@ def random_actions(env, generator):
 
 
 def assert_equal_episodes(ours, theirs, steps, seed=0, masks=True):
-    """Step both from the same seed, with resets of some environments now and then.
+    """Step both from the same seed, and reset some environments from time to time.
 
     Returns:
-        How often each environment's episode ended, terminated and truncated: shape (N, 2).
+        Number of episodes of each environment that terminated and that were truncated: (N, 2).
     """
     assert isinstance(ours.unwrapped, ActuatedVectorEnv | SerialVectorEnv)
     generator = np.random.default_rng(seed)
@@ -79,16 +81,16 @@ def assert_equal_episodes(ours, theirs, steps, seed=0, masks=True):
     assert_same(ours.reset(seed=seed), theirs.reset(seed=seed), "reset")
     for step in range(steps):
         actions = random_actions(ours, generator)
-        one, other = ours.step(actions), theirs.step(actions)
-        assert_same(one, other, f"step {step}")
-        ends += np.stack([one[2], one[3]], axis=-1)
+        outcome, expected = ours.step(actions), theirs.step(actions)
+        assert_same(outcome, expected, f"step {step}")
+        ends += np.stack([outcome[2], outcome[3]], axis=-1)
         mask = (
             generator.random(ours.num_envs) < 0.1
             if masks and step % 6 == 5
             else np.zeros(ours.num_envs, dtype=bool)
         )
         if mode == AutoresetMode.DISABLED:
-            mask |= one[2] | one[3]
+            mask |= outcome[2] | outcome[3]
         if mask.any():
             seeds = [
                 None if generator.random() < 0.5 else int(generator.integers(1000)) for _ in mask

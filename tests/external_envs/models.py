@@ -1,4 +1,4 @@
-"""Environments of others, and what their motors are compared with."""
+"""Third-party environments for tests, and comparisons of their episodes."""
 
 import gymnasium as gym
 import mujoco
@@ -23,8 +23,12 @@ ARM = """
 <mujoco>
   <option timestep="0.01"/>
   <worldbody>
-    <body><joint name="shoulder" axis="0 1 0" damping="0.1"/><geom type="capsule" size=".05 .2" mass="1"/>
-      <body pos="0 0 0.5"><joint name="elbow" axis="0 1 0" damping="0.1"/><geom size=".1" mass=".7"/></body>
+    <body>
+      <joint name="shoulder" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" size=".05 .2" mass="1"/>
+      <body pos="0 0 0.5">
+        <joint name="elbow" axis="0 1 0" damping="0.1"/><geom size=".1" mass=".7"/>
+      </body>
     </body>
   </worldbody>
   <actuator>
@@ -33,11 +37,11 @@ ARM = """
   </actuator>
 </mujoco>
 """
-"""A servo, and a plain motor with a gain, whose control has no range."""
+"""Model with a servo, and with a plain motor that has a gain and no control range."""
 
 
 class ArmEnv(MujocoEnv):
-    """Somebody's environment, from a file."""
+    """Third-party environment whose model comes from a file."""
 
     def __init__(self, path, **options):
         """Build the model from the file."""
@@ -54,7 +58,7 @@ class ArmEnv(MujocoEnv):
 
 
 class BareEnv(gym.Env):
-    """Somebody's environment that is none of Gymnasium's, and resets what it knows of."""
+    """Third-party environment that is no `MujocoEnv`, and resets only the state that it knows."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float64)
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float64)
@@ -77,14 +81,14 @@ class BareEnv(gym.Env):
 
 
 def actions(env, steps, seed=0):
-    """Random actions of an environment, shape (steps, n)."""
+    """Return random actions of an environment, shape (steps, n)."""
     space = env.action_space
     draws = np.random.default_rng(seed).uniform(space.low, space.high, (steps, *space.shape))
     return draws.astype(space.dtype)
 
 
 def run(env, inputs, seed=None):
-    """What an environment says of each step, and after each reset: (observation, reward, ends, info)."""
+    """Return (observation, reward, terminated, truncated, info) of every step and reset."""
     rows = [(env.reset(seed=seed)[0], 0.0, False, False, {})] if seed is not None else []
     for action in inputs:
         rows.append(env.step(action))
@@ -93,11 +97,11 @@ def run(env, inputs, seed=None):
     return rows
 
 
-def assert_same(found, expected):
-    """Compare two runs bit for bit; the infos of the first may have more."""
-    assert len(found) == len(expected)
-    for ours, theirs in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(ours[0], theirs[0])
-        assert ours[1:4] == theirs[1:4]
-        for name, value in theirs[4].items():
-            np.testing.assert_array_equal(ours[4][name], value, err_msg=name)
+def assert_same(rows, expected):
+    """Compare two runs bit for bit; the infos of the first may have more entries."""
+    assert len(rows) == len(expected)
+    for row, expected_row in zip(rows, expected, strict=True):
+        np.testing.assert_array_equal(row[0], expected_row[0])
+        assert row[1:4] == expected_row[1:4]
+        for name, value in expected_row[4].items():
+            np.testing.assert_array_equal(row[4][name], value, err_msg=name)

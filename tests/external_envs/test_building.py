@@ -1,4 +1,4 @@
-"""`motors_added`: models that others' code builds get motors, and nothing else is changed."""
+"""`motors_added` adds motors to models that third-party code builds, and changes nothing else."""
 
 import subprocess
 import sys
@@ -10,19 +10,19 @@ import pytest
 
 import codrl_mj
 from codrl_mj.actuators import Lag
-from codrl_mj.external_envs.building import Building
+from codrl_mj.external_envs.building import ModelPatcher
 from tests.external_envs.models import ARM
 
 LOADERS = ("from_xml_path", "from_xml_string")
-PLAIN = {name: vars(mujoco.MjModel)[name] for name in LOADERS}
+ORIGINAL_LOADERS = {name: vars(mujoco.MjModel)[name] for name in LOADERS}
 BALL = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
 ARM_FROM_FILE = "<mujoco><include file='arm.xml'/></mujoco>"
 
 
 @pytest.fixture(autouse=True)
-def _nothing_is_left():
+def _loaders_are_restored():
     yield
-    assert {name: vars(mujoco.MjModel)[name] for name in LOADERS} == PLAIN
+    assert {name: vars(mujoco.MjModel)[name] for name in LOADERS} == ORIGINAL_LOADERS
 
 
 def _families(model):
@@ -32,28 +32,31 @@ def _families(model):
     }
 
 
-def test_models_from_files_text_and_environments_get_motors_inside_and_none_outside(tmp_path):
+def test_models_get_motors_inside_the_block_and_none_outside(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(ARM)
     with codrl_mj.motors_added({"servo": "lag", "elbow": "lag", "b.*": "lag"}):
         models = [mujoco.MjModel.from_xml_path(str(path)), mujoco.MjModel.from_xml_string(xml=ARM)]
         models.append(mujoco.MjModel.from_xml_string(ARM_FROM_FILE, {"arm.xml": ARM.encode()}))
         ball, env = mujoco.MjModel.from_xml_string(BALL), gym.make("HalfCheetah-v5")
-    building = Building({"servo": Lag(0.1)})
-    with building.motorising():  # as composer environments build theirs at every reset
+    patcher = ModelPatcher({"servo": Lag(0.1)})
+    # Composer environments build their model at every reset in this way.
+    with patcher.patch_model_loading():
         assert [_families(mujoco.MjModel.from_xml_string(ARM)) for _ in range(3)] == [
             {"servo": Lag}
         ] * 3
-    assert len(building._met) == 1
+    assert len(patcher._names_of_models) == 1
+    # The exception passes, and the functions are restored.
     with pytest.raises(ZeroDivisionError), codrl_mj.motors_added({"servo": "lag"}):
-        raise ZeroDivisionError  # passes, and everything is as before
+        raise ZeroDivisionError
     assert [_families(model) for model in models] == [{"servo": Lag, "motor": Lag}] * 3
     assert list(codrl_mj.engine.motors(env.unwrapped.model)) == [0, 1, 2]
-    assert ball.nplugin == 0  # without a match it is left alone where others have one
+    # A model without a match stays as it is if another one has a match.
+    assert ball.nplugin == 0
     assert not codrl_mj.engine.motors(mujoco.MjModel.from_xml_string(ARM))
 
 
-def test_of_nested_blocks_the_innermost_counts():
+def test_the_innermost_of_nested_blocks_applies():
     with codrl_mj.motors_added({"servo": "lag"}):
         with codrl_mj.motors_added({"motor": "lag"}):
             inner = mujoco.MjModel.from_xml_string(ARM)
@@ -61,14 +64,14 @@ def test_of_nested_blocks_the_innermost_counts():
     assert (*_families(inner), *_families(outer)) == ("motor", "servo")
 
 
-def test_threads_have_motors_of_their_own():
-    """Each enters before and leaves after another builds: whoever restores too early or too late shows."""
-    barrier, found = threading.Barrier(3), {}
+def test_each_thread_adds_its_own_motors():
+    """Each thread enters its block before, and leaves it after, another thread builds a model."""
+    barrier, families = threading.Barrier(3), {}
 
     def build(name):
         with codrl_mj.motors_added({name: "lag"}):
             barrier.wait()
-            found[name] = _families(mujoco.MjModel.from_xml_string(ARM))
+            families[name] = _families(mujoco.MjModel.from_xml_string(ARM))
             if name == "motor":
                 barrier.wait()
         if name == "servo":
@@ -76,7 +79,7 @@ def test_threads_have_motors_of_their_own():
 
     def build_plain():
         barrier.wait()
-        found["plain"] = _families(mujoco.MjModel.from_xml_string(ARM))
+        families["plain"] = _families(mujoco.MjModel.from_xml_string(ARM))
         barrier.wait()
 
     threads = [threading.Thread(target=build, args=(name,)) for name in ("servo", "motor")]
@@ -85,11 +88,11 @@ def test_threads_have_motors_of_their_own():
         thread.start()
     for thread in threads:
         thread.join()
-    assert found == {"servo": {"servo": Lag}, "motor": {"motor": Lag}, "plain": {}}
+    assert families == {"servo": {"servo": Lag}, "motor": {"motor": Lag}, "plain": {}}
 
 
 @pytest.mark.parametrize(
-    ("actuators", "text"),
+    ("actuators", "message"),
     [
         (
             {"wheel": "lag"},
@@ -99,27 +102,29 @@ def test_threads_have_motors_of_their_own():
         ({".*": {"family": "lag", "delay": 1.0}}, "must be <= 0.08 s"),
     ],
 )
-def test_what_is_wrong_is_said(actuators, text):
-    with pytest.raises(ValueError, match=text), codrl_mj.motors_added(actuators):
+def test_raises_for_wrong_arguments(actuators, message):
+    with pytest.raises(ValueError, match=message), codrl_mj.motors_added(actuators):
         mujoco.MjModel.from_xml_string(ARM)
 
 
-def test_a_block_in_which_nothing_is_built_is_an_error():
+def test_raises_if_no_model_is_built_in_the_block():
     with (
-        pytest.raises(ValueError, match=r"no model was built inside.*codrl_mj.add_motors"),
+        pytest.raises(ValueError, match=r"no model was built in the block.*codrl_mj.add_motors"),
         codrl_mj.motors_added({".*": "lag"}),
     ):
         mujoco.MjSpec.from_string(ARM).compile()
 
 
 @pytest.mark.matrix
-def test_first_use_of_a_drive_builds_nothing_of_ours_with_motors():
-    """Layout checks build a model of their own within the building of the first one: in a process that is new."""
+def test_layout_checks_build_their_models_without_motors():
+    """In a new process, layout checks build a model of their own while the first model is built."""
     code = (
         "import codrl_mj, mujoco\n"
         "with codrl_mj.motors_added({'.*': 'maxon-ec45-flat-50w'}):\n"
         f"    model = mujoco.MjModel.from_xml_string({ARM!r})\n"
         "print(len(codrl_mj.engine.motors(model)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "2\n"
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert process.stdout == "2\n"

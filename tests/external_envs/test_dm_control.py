@@ -14,7 +14,7 @@ IDEAL = {".*": "ideal"}
 DOMAINS = sorted(
     {domain: f"{domain}/{task}" for domain, task in reversed(suite.ALL_TASKS)}.values()
 )
-"""A task of each domain of the suite."""
+"""One task of each domain of the suite."""
 
 
 def _inputs(env, steps):
@@ -24,32 +24,32 @@ def _inputs(env, steps):
     return np.random.default_rng(0).uniform(low, high, (steps, *spec.shape))
 
 
-def _assert_same(ours, plain, steps):
-    for index, action in enumerate([None, *_inputs(plain, steps)]):
-        found, expected = (
-            env.reset() if action is None else env.step(action) for env in (ours, plain)
+def _assert_same(ours, original, steps):
+    for index, action in enumerate([None, *_inputs(original, steps)]):
+        timestep, expected = (
+            env.reset() if action is None else env.step(action) for env in (ours, original)
         )
-        assert found[:3] == expected[:3], index
-        assert found.observation.keys() == expected.observation.keys()
+        assert timestep[:3] == expected[:3], index
+        assert timestep.observation.keys() == expected.observation.keys()
         for name, value in expected.observation.items():
             np.testing.assert_array_equal(
-                found.observation[name], value, err_msg=f"{name}, step {index}"
+                timestep.observation[name], value, err_msg=f"{name}, step {index}"
             )
     return expected
 
 
 @pytest.mark.parametrize("name", matrix_params(("cheetah/run", "cartpole/balance"), DOMAINS))
-def test_ideal_motors_change_no_bit_of_whole_episodes(name):
-    """1000 steps are the suite's longest episodes; shorter ones start again."""
+def test_ideal_motors_do_not_change_whole_episodes(name):
+    """Step 1001 times: 1000 are the suite's longest episodes, and shorter ones start again."""
     ours = codrl_mj.make_dm_control(name, IDEAL, task_kwargs={"random": 1})
-    plain = suite.load(*name.split("/"), task_kwargs={"random": 1})
-    assert len(codrl_mj.engine.motors(ours.mujoco[0])) == plain.physics.model.nactuator > 0
+    original = suite.load(*name.split("/"), task_kwargs={"random": 1})
+    assert len(codrl_mj.engine.motors(ours.mujoco[0])) == original.physics.model.nactuator > 0
     for specification in ("action_spec", "observation_spec", "reward_spec", "discount_spec"):
-        assert getattr(ours, specification)() == getattr(plain, specification)()
-    _assert_same(ours, plain, 1001)
+        assert getattr(ours, specification)() == getattr(original, specification)()
+    _assert_same(ours, original, 1001)
 
 
-ANEW = {
+REBUILT = {
     "reach": lambda: manipulation.load("reach_duplo_features", seed=1),
     "rodent": lambda: basic_rodent_2020.rodent_run_gaps(random_state=np.random.RandomState(1)),
     "humanoid": lambda: basic_cmu_2019.cmu_humanoid_run_walls(
@@ -58,21 +58,21 @@ ANEW = {
 }
 
 
-@pytest.mark.parametrize("name", matrix_params(("reach",), ANEW))
-def test_environments_that_build_their_model_at_every_reset_have_motors_in_each(name):
-    ours, plain = codrl_mj.make_dm_control(ANEW[name], IDEAL), ANEW[name]()
-    assert isinstance(plain, composer.Environment)
+@pytest.mark.parametrize("name", matrix_params(("reach",), REBUILT))
+def test_environments_that_rebuild_their_model_at_resets_have_motors_in_each(name):
+    ours, original = codrl_mj.make_dm_control(REBUILT[name], IDEAL), REBUILT[name]()
+    assert isinstance(original, composer.Environment)
     models = []
     for _ in range(2):
-        _assert_same(ours, plain, 10)
+        _assert_same(ours, original, 10)
         models.append(ours.mujoco[0])
         assert len(codrl_mj.engine.motors(models[-1])) == models[-1].nactuator
         assert len(ours.signals()["actual_force"]) == models[-1].nactuator
     assert models[0] is not models[1]
 
 
-def test_signals_are_those_of_the_forces_that_moved_it_last():
-    """dm_control's order, `mj_step2` before `mj_step1`: the speed after a step is that of the next first force."""
+def test_signals_are_those_of_the_last_completed_step():
+    """Use `mj_step2` before `mj_step1`: the speed after a step determines the next first force."""
     line = TorqueSpeed(stall_torque=1.5, no_load_speed=5.0, max_torque=1.0)
     env = codrl_mj.make_dm_control("cartpole/swingup", {"slide": line}, task_kwargs={"random": 0})
     env.reset()
@@ -113,7 +113,7 @@ def test_noise_differs_between_episodes_and_repeats_with_its_seed():
 MAXON = {".*": "maxon-ec45-flat-50w"}
 
 
-def test_currents_are_commanded_in_amperes():
+def test_current_commands_are_in_amperes():
     motor = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
         {"controller.max_current": 5.0}
     )
@@ -134,44 +134,54 @@ def test_currents_are_commanded_in_amperes():
         _ = env.nothing
 
 
-def test_motors_and_model_are_drawn_at_every_reset_and_initial_states_are_not_touched():
+def test_randomization_does_not_change_the_distribution_of_initial_states():
     draws = {
         ".*": {"motor.resistance": "uniform(0.6, 1.2)"},
         "model.mass.torso": "uniform(0.5, 2.0)",
     }
     arguments = {"task_kwargs": {"random": 3}}
     env = codrl_mj.make_dm_control("cheetah/run", MAXON, randomize=draws, noise_seed=1, **arguments)
-    again = codrl_mj.make_dm_control(
+    same_env = codrl_mj.make_dm_control(
         "cheetah/run", MAXON, randomize=draws, noise_seed=1, **arguments
     )
-    plain = codrl_mj.make_dm_control("cheetah/run", MAXON, **arguments)
-    mass, factors = plain.mujoco[0].body("torso").mass[0], []
+    original = codrl_mj.make_dm_control("cheetah/run", MAXON, **arguments)
+    mass, factors = original.mujoco[0].body("torso").mass[0], []
     for _ in range(3):
-        (one, two), other = (each.reset() for each in (env, again)), plain.reset()
-        np.testing.assert_array_equal(one.observation["position"], two.observation["position"])
-        assert env.randomization == again.randomization
+        (timestep, same_timestep), original_timestep = (
+            (each_env.reset() for each_env in (env, same_env)),
+            original.reset(),
+        )
+        np.testing.assert_array_equal(
+            timestep.observation["position"], same_timestep.observation["position"]
+        )
+        assert env.randomization == same_env.randomization
         factors.append(env.randomization["model.mass.torso"])
         assert env.mujoco[0].body("torso").mass[0] == mass * factors[-1]
         resistance = env.randomization[".*"]["motor.resistance"]
         assert {motor.motor.resistance for motor in env.motors.values()} == {resistance}
-        assert one.observation["position"].shape == other.observation["position"].shape
+        assert (
+            timestep.observation["position"].shape
+            == original_timestep.observation["position"].shape
+        )
     assert len(set(factors)) == 3
     with pytest.raises(
-        ValueError, match="randomize: Environment builds its model anew at every reset"
+        ValueError, match="randomize: Environment builds its model again at every reset"
     ):
         codrl_mj.make_dm_control(
-            ANEW["reach"], IDEAL, randomize={"model.gravity": "uniform(0.9, 1.1)"}
+            REBUILT["reach"], IDEAL, randomize={"model.gravity": "uniform(0.9, 1.1)"}
         )
 
 
 def test_commands_are_delayed_by_whole_environment_steps():
     env = codrl_mj.make_dm_control("cheetah/run", IDEAL, disturbances={"command_delay": 0.02})
     inputs = _inputs(env, 10)
-    for _ in range(2):  # a reset forgets what is on its way
+    # A reset must delete delayed commands.
+    for _ in range(2):
         env.reset()
         for index, action in enumerate(inputs):
             env.step(action)
-            expected = inputs[index - 2] if index >= 2 else np.zeros(6)  # two steps of 0.01 s
+            # The delay is two steps of 0.01 s.
+            expected = inputs[index - 2] if index >= 2 else np.zeros(6)
             np.testing.assert_allclose(env.signals()["desired_force"], expected, rtol=0, atol=1e-15)
 
 
@@ -182,6 +192,6 @@ def test_commands_are_delayed_by_whole_environment_steps():
         ("cheetah/run", {"knee": "lag"}, r"'knee': no actuator has such a name.*bthigh"),
     ],
 )
-def test_what_is_wrong_is_said(environment, actuators, message):
+def test_raises_for_wrong_arguments(environment, actuators, message):
     with pytest.raises(ValueError, match=message):
         codrl_mj.make_dm_control(environment, actuators)

@@ -1,4 +1,4 @@
-"""`make`: motors and models that are drawn at resets, loads and delays, in Gymnasium's environments."""
+"""Randomization, load pulses and delays in Gymnasium's environments with motors."""
 
 import dataclasses
 import functools
@@ -14,45 +14,46 @@ from codrl_mj.catalogue import motor_entry
 from tests.external_envs.models import ARM, ArmEnv, actions, assert_same, run
 from tests.external_envs.test_gymnasium import CHEETAH, IDEAL, MAXON, NOISY
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::UserWarning"
-)  # deprecated attributes in other people's models
+# Third-party models have deprecated attributes.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 DRAWS = {
     ".*": {"motor.resistance": "uniform(0.6, 1.2)", "motor.rotor_inertia": "uniform(1e-5, 3e-5)"}
 }
 
 
-def test_motors_are_drawn_at_every_reset_and_initial_states_are_not_touched():
-    env, plain = codrl_mj.make(CHEETAH, MAXON, randomize=DRAWS), gym.make(CHEETAH)
-    found = []
+def test_randomization_does_not_change_the_initial_states():
+    env, original = codrl_mj.make(CHEETAH, MAXON, randomize=DRAWS), gym.make(CHEETAH)
+    resistances = []
     for seed in (4, None, None, 4):
-        (ours, info), (theirs, _) = env.reset(seed=seed), plain.reset(seed=seed)
+        (ours, info), (theirs, _) = env.reset(seed=seed), original.reset(seed=seed)
         np.testing.assert_array_equal(ours, theirs)
-        drawn = info["randomization"][".*"]
-        assert 0.6 <= drawn["motor.resistance"] <= 1.2
-        assert 1e-5 <= drawn["motor.rotor_inertia"] <= 3e-5
+        values = info["randomization"][".*"]
+        assert 0.6 <= values["motor.resistance"] <= 1.2
+        assert 1e-5 <= values["motor.rotor_inertia"] <= 3e-5
         assert env.randomization == info["randomization"]
         assert {motor.motor.resistance for motor in env.motors.values()} == {
-            drawn["motor.resistance"]
+            values["motor.resistance"]
         }
-        found.append(drawn["motor.resistance"])
-    assert found[0] == found[3]
-    assert len(set(found)) == 3
+        resistances.append(values["motor.resistance"])
+    assert resistances[0] == resistances[3]
+    assert len(set(resistances)) == 3
 
 
-def test_a_drawn_motor_is_the_motor_that_it_would_be_from_the_first():
+def test_a_drawn_motor_equals_one_with_these_values_from_the_start():
     fields = {"motor.rotor_inertia": 3e-5, "motor.coulomb_friction": 0.02, "motor.gear_ratio": 1.5}
-    made = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
+    drawn_motor = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
         fields | {"motor.resistance": 1.1}
     )
     draws = {".*": {name: codrl_mj.Choice([value]) for name, value in fields.items()}}
     draws[".*"]["motor.resistance"] = "choice(1.1)"
-    drawn, first = (
+    randomized_env, reference_env = (
         codrl_mj.make("Hopper-v5", MAXON, randomize=draws),
-        codrl_mj.make("Hopper-v5", {".*": made}),
+        codrl_mj.make("Hopper-v5", {".*": drawn_motor}),
     )
-    inputs = actions(first, 50)
-    for ours, theirs in zip(run(drawn, inputs, seed=0), run(first, inputs, seed=0), strict=True):
+    inputs = actions(reference_env, 50)
+    for ours, theirs in zip(
+        run(randomized_env, inputs, seed=0), run(reference_env, inputs, seed=0), strict=True
+    ):
         np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-9, atol=1e-9)
     for field in (
         "actuator_armature",
@@ -61,29 +62,30 @@ def test_a_drawn_motor_is_the_motor_that_it_would_be_from_the_first():
         "dof_invweight0",
         "dof_M0",
     ):
-        ours, theirs = (getattr(env.unwrapped.model, field) for env in (drawn, first))
+        ours, theirs = (
+            getattr(env.unwrapped.model, field) for env in (randomized_env, reference_env)
+        )
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=0.0, err_msg=field)
 
 
-def test_motors_of_several_families_are_drawn_each_by_its_fields():
+def test_motors_of_several_families_are_randomized_by_their_own_fields():
     actuators = {"b.*": MAXON[".*"], "f.*": "lag"}
     draws = {
         "b.*": {"motor.resistance": "uniform(0.6, 1.2)"},
         "f.*": {"time_constant": "uniform(0.01, 0.02)"},
     }
     env = codrl_mj.make(CHEETAH, actuators, randomize=draws)
-    drawn = env.reset(seed=0)[1]["randomization"]
+    drawn_values = env.reset(seed=0)[1]["randomization"]
     motors = list(env.motors.values())
-    assert {one.motor.resistance for one in motors[:3]} == {*drawn["b.*"].values()}
-    assert {one.time_constant for one in motors[3:]} == {*drawn["f.*"].values()}
+    assert {motor.motor.resistance for motor in motors[:3]} == {*drawn_values["b.*"].values()}
+    assert {motor.time_constant for motor in motors[3:]} == {*drawn_values["f.*"].values()}
     assert list(codrl_mj.engine.motors(env.unwrapped.model).values())[3:] == motors[3:]
-    with pytest.raises(
-        ValueError, match=r"unknown field 'motor\.resistance'"
-    ):  # not of every motor
+    # Not every motor has the field.
+    with pytest.raises(ValueError, match=r"unknown field 'motor\.resistance'"):
         codrl_mj.make(CHEETAH, actuators, randomize={"motor.resistance": "uniform(0.6, 1.2)"})
 
 
-def test_paths_draw_what_patterns_with_their_fields_do():
+def test_paths_and_nested_mappings_draw_the_same():
     fields = {"time_constant": "uniform(0.01, 0.02)"}
     nested = codrl_mj.make(
         "Hopper-v5", {".*": "lag"}, randomize={".*": fields, "model.gravity": "uniform(0.9, 1.1)"}
@@ -96,50 +98,55 @@ def test_paths_draw_what_patterns_with_their_fields_do():
             "model.gravity": "uniform(0.9, 1.1)",
         },
     )
-    one = codrl_mj.make(
+    thigh_env = codrl_mj.make(
         "Hopper-v5",
         {".*": "lag"},
         randomize={f"thigh_joint:{name}": fields[name] for name in fields},
     )
-    drawn, same, alone = (env.reset(seed=1)[1]["randomization"] for env in (nested, flat, one))
-    assert drawn == {".*": {"time_constant": same.pop("time_constant")}, **same}
-    assert alone["thigh_joint"] == drawn[".*"]
+    nested_values, flat_values, thigh_values = (
+        env.reset(seed=1)[1]["randomization"] for env in (nested, flat, thigh_env)
+    )
+    assert nested_values == {
+        ".*": {"time_constant": flat_values.pop("time_constant")},
+        **flat_values,
+    }
+    assert thigh_values["thigh_joint"] == nested_values[".*"]
     assert list(flat.motors.values()) == list(nested.motors.values())
-    assert [motor.time_constant == Lag().time_constant for motor in one.motors.values()] == [
+    assert [motor.time_constant == Lag().time_constant for motor in thigh_env.motors.values()] == [
         False,
         True,
         True,
     ]
 
 
-def _of_the_model(mass, gravity, damping):
+def _model_fields(mass, gravity, damping):
     return {"model.mass.pole": mass, "model.gravity": gravity, "model.damping.hinge": damping}
 
 
-def test_a_model_that_is_drawn_as_it_is_is_as_before():
-    draws = _of_the_model("choice(1.0)", "choice(1.0)", "choice(0.0)")
-    plain, ours = (
+def test_drawing_the_nominal_values_changes_nothing():
+    draws = _model_fields("choice(1.0)", "choice(1.0)", "choice(0.0)")
+    original, ours = (
         gym.make("InvertedPendulum-v5"),
         codrl_mj.make("InvertedPendulum-v5", IDEAL, randomize=draws),
     )
-    inputs = actions(plain, 100)
-    assert_same(run(ours, inputs, seed=0), run(plain, inputs, seed=0))
+    inputs = actions(original, 100)
+    assert_same(run(ours, inputs, seed=0), run(original, inputs, seed=0))
 
 
-def test_a_drawn_model_is_the_model_that_it_would_be_from_the_first():
-    """Built anew by MuJoCo's compiler, which computes all that follows from masses."""
-    draws = _of_the_model("uniform(0.5, 2.0)", "uniform(0.5, 2.0)", "uniform(0.0, 0.3)")
+def test_a_drawn_model_equals_one_compiled_with_these_values():
+    """Compare with a model that MuJoCo compiles, including what it derives from the masses."""
+    draws = _model_fields("uniform(0.5, 2.0)", "uniform(0.5, 2.0)", "uniform(0.0, 0.3)")
     env = codrl_mj.make("InvertedPendulum-v5", IDEAL, randomize=draws)
-    plain = gym.make("InvertedPendulum-v5").unwrapped
+    original = gym.make("InvertedPendulum-v5").unwrapped
     for seed in (1, 2):
-        drawn = env.reset(seed=seed)[1]["randomization"]
-        spec = mujoco.MjSpec.from_file(plain.fullpath)
+        factors = env.reset(seed=seed)[1]["randomization"]
+        spec = mujoco.MjSpec.from_file(original.fullpath)
         (geom,) = spec.body("pole").geoms
-        geom.mass = drawn["model.mass.pole"] * plain.model.body("pole").mass[0]
-        spec.option.gravity = drawn["model.gravity"] * plain.model.opt.gravity
-        spec.joint("hinge").damping[0] += drawn["model.damping.hinge"]
-        expected, found = spec.compile(), env.unwrapped.model
-        np.testing.assert_allclose(found.opt.gravity, expected.opt.gravity, rtol=1e-12)
+        geom.mass = factors["model.mass.pole"] * original.model.body("pole").mass[0]
+        spec.option.gravity = factors["model.gravity"] * original.model.opt.gravity
+        spec.joint("hinge").damping[0] += factors["model.damping.hinge"]
+        expected, model = spec.compile(), env.unwrapped.model
+        np.testing.assert_allclose(model.opt.gravity, expected.opt.gravity, rtol=1e-12)
         for field in (
             "body_mass",
             "body_inertia",
@@ -148,32 +155,32 @@ def test_a_drawn_model_is_the_model_that_it_would_be_from_the_first():
             "dof_M0",
             "dof_damping",
         ):
-            ours, theirs = getattr(found, field), getattr(expected, field)
+            ours, theirs = getattr(model, field), getattr(expected, field)
             np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-15, err_msg=field)
-    assert env.reset(seed=1)[1]["randomization"]["model.gravity"] != drawn["model.gravity"]
+    assert env.reset(seed=1)[1]["randomization"]["model.gravity"] != factors["model.gravity"]
 
 
-def test_load_pulses_act_on_the_motors_joints():
-    """One that lasts for good begins at once: the environment without motors under the same load, bit for bit."""
+def test_load_pulses_act_on_the_joints_of_the_motors():
+    """Compare a permanent pulse with a constant load on the environment without motors."""
     pulses = {"pulse_force": 2.0, "pulse_duration": 1e6, "pulse_interval": 1e-9}
-    env, plain = codrl_mj.make(CHEETAH, IDEAL, disturbances=pulses), gym.make(CHEETAH)
-    dofs = plain.unwrapped.model.jnt_dofadr[plain.unwrapped.model.actuator_trnid[:, 0]]
-    inputs, signs = actions(plain, 5), []
+    env, original = codrl_mj.make(CHEETAH, IDEAL, disturbances=pulses), gym.make(CHEETAH)
+    dofs = original.unwrapped.model.jnt_dofadr[original.unwrapped.model.actuator_trnid[:, 0]]
+    inputs, signs = actions(original, 5), []
     for seed in (0, 1, 0):
-        np.testing.assert_array_equal(env.reset(seed=seed)[0], plain.reset(seed=seed)[0])
+        np.testing.assert_array_equal(env.reset(seed=seed)[0], original.reset(seed=seed)[0])
         for index, action in enumerate(inputs):
             row = env.step(action)
             load = env.unwrapped.data.qfrc_applied.copy()
             if index:
                 np.testing.assert_allclose(np.abs(load[dofs]), 2.0, rtol=1e-12)
             assert np.count_nonzero(load) == len(dofs)
-            plain.unwrapped.data.qfrc_applied[:] = load
-            np.testing.assert_array_equal(row[0], plain.step(action)[0])
+            original.unwrapped.data.qfrc_applied[:] = load
+            np.testing.assert_array_equal(row[0], original.step(action)[0])
         signs.append(tuple(np.sign(load[dofs])))
     assert signs[0] == signs[2] != signs[1]
 
 
-def test_unstable_draws_are_drawn_again():
+def test_unstable_draws_are_repeated():
     loop = dict.fromkeys(("kp",), "uniform(0.1, 20.0)")
     draws = {".*": {f"controller.{name}": text for name, text in loop.items()}}
     stiff = NOISY.replaced({"controller.current_noise": 0.0})
@@ -191,10 +198,12 @@ def test_unstable_draws_are_drawn_again():
 def test_commands_are_delayed_by_whole_environment_steps():
     env = codrl_mj.make(CHEETAH, IDEAL, disturbances={"command_delay": 0.15})
     inputs = actions(env, 20)
-    for _ in range(2):  # a reset forgets what is on its way
+    # A reset must delete delayed commands.
+    for _ in range(2):
         rows = run(env, inputs, seed=0)[1:]
         for index, row in enumerate(rows):
-            expected = inputs[index - 3] if index >= 3 else np.zeros(6)  # three steps of 0.05 s
+            # The delay is three steps of 0.05 s.
+            expected = inputs[index - 3] if index >= 3 else np.zeros(6)
             np.testing.assert_allclose(row[4]["desired_force"], expected, rtol=0, atol=1e-7)
 
 
@@ -207,22 +216,22 @@ SERVO = Servo(
 WEAK = dataclasses.replace(SERVO, loop=ServoLoop(servo_rate=100.0, velocity_gain=0.05))
 
 
-@pytest.mark.parametrize("face", ["gymnasium", "stale"])
+@pytest.mark.parametrize("kind", ["gymnasium", "stale"])
 @pytest.mark.parametrize(
-    ("motors", "action"),
+    ("motors", "command"),
     [
         ({"servo": "ideal", "motor": "ideal"}, "force"),  # the model's own position servo
         ({"servo": SERVO, "motor": WEAK}, "position"),
         ({"servo": SERVO, "motor": "ideal"}, "force"),
     ],
 )
-def test_late_positions_are_held_where_the_episode_starts_and_late_forces_are_zero(
-    tmp_path, motors, action, face
+def test_delayed_positions_start_at_the_initial_state_and_delayed_forces_at_0(
+    tmp_path, motors, command, kind
 ):
-    """As in the environment without delay, whose first actions are the positions at which it starts."""
+    """Compare with an environment without delay that starts with commands to hold its state."""
 
     class Stale(ArmEnv):
-        """Does not bring the data up to date at a reset."""
+        """Environment that does not update the data at a reset."""
 
         def reset_model(self):
             self.data.qpos[:] = self.np_random.uniform(-0.5, 0.5, 2)
@@ -230,18 +239,19 @@ def test_late_positions_are_held_where_the_episode_starts_and_late_forces_are_ze
 
     path = tmp_path / "arm.xml"
     path.write_text(ARM)
-    creator = functools.partial(Stale if face == "stale" else ArmEnv, path)
-    late = codrl_mj.make(
-        creator, motors, action=action, disturbances={"command_delay": 0.02}, max_episode_steps=99
+    creator = functools.partial(Stale if kind == "stale" else ArmEnv, path)
+    delayed_env = codrl_mj.make(
+        creator, motors, action=command, disturbances={"command_delay": 0.02}, max_episode_steps=99
     )
-    plain = codrl_mj.make(creator, motors, action=action, max_episode_steps=99)
+    undelayed_env = codrl_mj.make(creator, motors, action=command, max_episode_steps=99)
     for seed in (3, 4):
-        observation = late.reset(seed=seed)[0]
-        np.testing.assert_array_equal(plain.reset(seed=seed)[0], observation)
-        forced = np.array([False, action == "force"])
-        lengths = observation[:2] * [1.0, 5.0]  # the gear of the second
-        start = np.where(forced, 0.0, lengths)
+        observation = delayed_env.reset(seed=seed)[0]
+        np.testing.assert_array_equal(undelayed_env.reset(seed=seed)[0], observation)
+        is_force = np.array([False, command == "force"])
+        # The second actuator has a gear of 5.
+        lengths = observation[:2] * [1.0, 5.0]
+        start = np.where(is_force, 0.0, lengths)
         rows = [start, start, *(start + 0.1 * np.sin(step) for step in range(6))]
-        for wanted, earlier in zip(rows[2:], rows, strict=False):
-            ours, theirs = late.step(wanted), plain.step(earlier)
+        for action, earlier_action in zip(rows[2:], rows, strict=False):
+            ours, theirs = delayed_env.step(action), undelayed_env.step(earlier_action)
             np.testing.assert_allclose(ours[0], theirs[0], rtol=0, atol=1e-12)

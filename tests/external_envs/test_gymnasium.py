@@ -32,13 +32,13 @@ from tests.add_motors.models import full_state
 from tests.external_envs.models import ARM, V5, ArmEnv, BareEnv, actions, assert_same, run
 from tests.matrix import matrix_params
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::UserWarning"
-)  # deprecated attributes in other people's models
+# Third-party models have deprecated attributes.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 IDEAL, MAXON = {".*": "ideal"}, {".*": "maxon-ec45-flat-50w"}
 BACK, FRONT = ("bthigh", "bshin", "bfoot"), ("fthigh", "fshin", "ffoot")
-KEPT = ("HalfCheetah-v5", "InvertedPendulum-v5")  # several motors and RK4 with an early end: one
-every_v5 = pytest.mark.parametrize("env_id", matrix_params(KEPT, V5))
+# Several motors, and RK4 with one motor and episodes that end early.
+QUICK_IDS = ("HalfCheetah-v5", "InvertedPendulum-v5")
+every_v5 = pytest.mark.parametrize("env_id", matrix_params(QUICK_IDS, V5))
 CHEETAH, ARM_ID, BARE_ID = "HalfCheetah-v5", "ForeignArm-v0", "ForeignBare-v0"
 NOISY = DCMotorActuator(
     Motor(resistance=1.0, inductance=0.05, torque_constant=0.8, back_emf_constant=0.01),
@@ -48,7 +48,7 @@ NOISY = DCMotorActuator(
 
 @pytest.fixture(autouse=True)
 def _registered(tmp_path):
-    """An environment of a servo and a motor, and one that is no `MujocoEnv`."""
+    """Register an environment with a servo and a motor, and one that is no `MujocoEnv`."""
     (tmp_path / "arm.xml").write_text(ARM)
     gym.register(ARM_ID, functools.partial(ArmEnv, tmp_path / "arm.xml"), max_episode_steps=50)
     gym.register(BARE_ID, BareEnv, max_episode_steps=50)
@@ -58,54 +58,51 @@ def _registered(tmp_path):
 
 
 @every_v5
-def test_ideal_motors_change_no_bit_of_whole_episodes_and_no_pixel(env_id):
-    plain, ours = (
+def test_ideal_motors_change_neither_episodes_nor_images(env_id):
+    original, ours = (
         gym.make(env_id, render_mode="rgb_array"),
         codrl_mj.make(env_id, IDEAL, render_mode="rgb_array"),
     )
     assert (ours.observation_space, ours.action_space) == (
-        plain.observation_space,
-        plain.action_space,
+        original.observation_space,
+        original.action_space,
     )
-    inputs = actions(
-        plain, plain.spec.max_episode_steps + 1
-    )  # to the time limit, or over many episodes
-    expected = run(plain, inputs, seed=3)
+    # The steps reach the time limit, or the end of many episodes.
+    inputs = actions(original, original.spec.max_episode_steps + 1)
+    expected = run(original, inputs, seed=3)
     assert any(row[2] or row[3] for row in expected)
     assert_same(run(ours, inputs, seed=3), expected)
-    images = [env.render() for env in (plain, ours)]
+    images = [env.render() for env in (original, ours)]
     assert images[0].std() > 1.0
     np.testing.assert_array_equal(*images)
 
 
-def _complaints(check, env, **options):
+def _warnings_of(check, env, **options):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check(env, **options)
-    said = {str(warning.message).split("\n")[0] for warning in caught}
-    return {
-        text for text in said if "is different from the unwrapped version" not in text
-    }  # names the wrappers
+    messages = {str(warning.message).split("\n")[0] for warning in caught}
+    # One warning names the wrappers, which differ.
+    return {text for text in messages if "is different from the unwrapped version" not in text}
 
 
 @every_v5
 @pytest.mark.parametrize(
     "check", [check_env, check_env_sb3], ids=["gymnasium", "stable_baselines3"]
 )
-def test_the_checkers_say_no_more_than_of_the_environment_without_motors(env_id, check):
-    expected = _complaints(
-        check, gym.make(env_id), skip_render_check=True
-    )  # a window needs a display
+def test_environment_checkers_warn_no_more_than_without_motors(env_id, check):
+    # Rendering in a window would need a display.
+    expected = _warnings_of(check, gym.make(env_id), skip_render_check=True)
     for actuators, options in (
         (IDEAL, {}),
         ({".*": NOISY}, {"observe_actuator": True, "allow_unstable": True}),
     ):
         ours = codrl_mj.make(env_id, actuators, **options)
-        assert _complaints(check, ours, skip_render_check=True) <= expected
+        assert _warnings_of(check, ours, skip_render_check=True) <= expected
 
 
-def test_torque_stays_within_the_torque_speed_line_on_every_joint_at_every_step():
-    """One integration step in each environment step: then the speed that the line is of is known."""
+def test_torque_stays_within_the_torque_speed_line():
+    """Take one integration step per environment step, so that the speed for the line is known."""
     line = TorqueSpeed(stall_torque=0.64, no_load_speed=950.0, max_torque=0.38)
     env = codrl_mj.make(CHEETAH, {".*": line}, frame_skip=1, reset_noise_scale=1.0)
     env.reset(seed=0)
@@ -129,7 +126,7 @@ PULSES = {"pulse_force": 0.5, "pulse_duration": 0.03, "pulse_interval": 0.1}
 
 
 def _everything(env_id):
-    """An environment with all that a snapshot has to remember: noise, draws, delays, a limit of time."""
+    """Make an environment whose snapshot has noise, random values, delays and a time limit."""
     draws = {
         ".*": {
             "motor.resistance": "uniform(0.5, 1.5)",
@@ -148,31 +145,31 @@ def _everything(env_id):
     )
 
 
-@pytest.mark.parametrize(
-    "env_id", matrix_params((*KEPT, "Ant-v5"), V5)
-)  # Ant's rewards come from poses that lag a step
+# The rewards of Ant depend on poses that lag one step behind.
+@pytest.mark.parametrize("env_id", matrix_params((*QUICK_IDS, "Ant-v5"), V5))
 def test_a_snapshot_continues_bit_for_bit_in_a_fresh_environment(env_id):
-    env, other = _everything(env_id), _everything(env_id)
+    env, other_env = _everything(env_id), _everything(env_id)
     inputs = actions(env, 120)
     run(env, inputs[:15], seed=5)
     snapshot = env.snapshot()
     expected = run(env, inputs[15:])
-    other.restore(snapshot)
-    found = run(other, inputs[15:])
-    assert_same(found, expected)
-    for ours, theirs in zip(found, expected, strict=True):
+    other_env.restore(snapshot)
+    rows = run(other_env, inputs[15:])
+    assert_same(rows, expected)
+    for ours, theirs in zip(rows, expected, strict=True):
         assert ours[4].keys() == theirs[4].keys()
-    assert sum(row[3] or row[2] for row in expected) >= 2  # resets were drawn alike too
+    # The resets within the run must have drawn the same values, too.
+    assert sum(row[3] or row[2] for row in expected) >= 2
     env.restore(snapshot)
     assert_same(run(env, inputs[15:]), expected)
     assert all(isinstance(array, np.ndarray) for array in snapshot.values())
 
 
-def test_a_snapshot_of_something_else_is_refused():
-    env, other = codrl_mj.make(CHEETAH, IDEAL), codrl_mj.make(CHEETAH, {".*": "lag"})
+def test_raises_for_a_snapshot_of_another_environment():
+    env, other_env = codrl_mj.make(CHEETAH, IDEAL), codrl_mj.make(CHEETAH, {".*": "lag"})
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"snapshot\['state'\].*must be"):
-        other.restore(env.snapshot())
+        other_env.restore(env.snapshot())
     with pytest.raises(ValueError, match="must be of 'HalfCheetah-v5'"):
         env.restore(
             env.snapshot() | {"environment": np.frombuffer(b"HalfCheetah-v4", dtype=np.uint8)}
@@ -180,7 +177,7 @@ def test_a_snapshot_of_something_else_is_refused():
 
 
 def test_setting_the_state_brings_motors_to_rest():
-    """Each of them then does what it does after a reset to that state."""
+    """Compare with the motors' signals after a reset to that state."""
     env = codrl_mj.make(CHEETAH, {".*": "lag"})
     inputs = actions(env, 20)
     run(env, inputs, seed=0)
@@ -198,7 +195,7 @@ def test_setting_the_state_brings_motors_to_rest():
     ("env_id", "actuator"), [(CHEETAH, NOISY), (CHEETAH, "lag"), (BARE_ID, "lag")]
 )
 def test_resets_bring_motors_to_rest(env_id, actuator):
-    """The engine's own state, motors included, is the same after the same seed, whatever came before."""
+    """Check that the engine's state, with motors, after a seed does not depend on the past."""
     env = codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True)
     inputs, states, runs = actions(env, 50), [], []
     for length in (5, 50):
@@ -209,7 +206,7 @@ def test_resets_bring_motors_to_rest(env_id, actuator):
     assert_same(runs[1][:6], runs[0])
 
 
-def test_every_motor_has_noise_of_its_own_in_every_episode():
+def test_every_motor_has_its_own_noise_in_every_episode():
     env = codrl_mj.make(CHEETAH, {"b.*": NOISY, "f.*": "lag"}, allow_unstable=True)
     views, keys = motor_slots(env.unwrapped.data, env.motors), []
     for seed in (7, None, 7):
@@ -217,11 +214,12 @@ def test_every_motor_has_noise_of_its_own_in_every_episode():
         keys.append([view[1] for view in views.values()])
     assert keys[0] == keys[2]
     assert len({*keys[0][:3], *keys[1][:3]}) == 6
-    assert keys[0][3:] == [0.0] * 3  # which need none
+    # The lag needs no key.
+    assert keys[0][3:] == [0.0] * 3
 
 
-def cheetah(**options):
-    """Somebody's function."""
+def limited_cheetah(**options):
+    """Make a third-party environment by a function."""
     return gym.wrappers.TimeLimit(HalfCheetahEnv(**options), 500)
 
 
@@ -234,25 +232,27 @@ COPIES = {
     "spec": lambda env: gym.make(env.spec),
 }
 FROM_IDS = [(CHEETAH, MAXON, COMMANDED), (CHEETAH, {".*": "lag"}, LIMITED)]
-FROM_FUNCTIONS = [(creator, {".*": "lag"}, DRAWN) for creator in (cheetah, HalfCheetahEnv, BareEnv)]
+FROM_FUNCTIONS = [
+    (creator, {".*": "lag"}, DRAWN) for creator in (limited_cheetah, HalfCheetahEnv, BareEnv)
+]
 
 
 @pytest.mark.parametrize(
-    ("how", "creator", "actuators", "options"),
+    ("method", "creator", "actuators", "options"),
     [
-        *((how, *one) for how in COPIES for one in FROM_IDS),
-        *((how, *one) for how in ("deepcopy", "pickle") for one in FROM_FUNCTIONS),
+        *((method, *case) for method in COPIES for case in FROM_IDS),
+        *((method, *case) for method in ("deepcopy", "pickle") for case in FROM_FUNCTIONS),
     ],
 )
-def test_copies_have_the_motors_and_their_draws(how, creator, actuators, options):
-    """Gymnasium's copies are environments made again."""
+def test_copies_have_the_same_motors_and_randomization(method, creator, actuators, options):
+    """Check copies, which Gymnasium makes by calling the constructor again."""
     env = codrl_mj.make(creator, actuators, **options)
-    other, inputs = COPIES[how](env), actions(env, 10)
+    copied, inputs = COPIES[method](env), actions(env, 10)
     expected = [run(env, inputs, seed) for seed in (1, 2)]
     for seed, rows in zip((1, 2), expected, strict=True):
-        assert_same(run(other, inputs, seed), rows)
+        assert_same(run(copied, inputs, seed), rows)
     assert not np.array_equal(*(np.array([row[0] for row in rows]) for rows in expected))
-    assert other.step(inputs[0])[4]["desired_force"].shape == inputs[0].shape
+    assert copied.step(inputs[0])[4]["desired_force"].shape == inputs[0].shape
     assert copy.deepcopy(env.unwrapped).model.nplugin == len(env.motors)
 
 
@@ -268,7 +268,7 @@ def test_info_has_arrays_for_several_motors_and_numbers_for_one(env_id, count):
             assert (info[name].shape, info[name].dtype) == ((count,), kind)
 
 
-def test_motors_of_several_families_have_nan_for_what_the_others_have():
+def test_signals_that_a_family_lacks_are_nan():
     env = codrl_mj.make(CHEETAH, {"b.*": MAXON[".*"], "f.*": "lag"}, observe_actuator=True)
     observation, *_, info = run(env, actions(env, 5), seed=0)[-1]
     np.testing.assert_array_equal(np.isnan(info["current"]), [False] * 3 + [True] * 3)
@@ -276,9 +276,9 @@ def test_motors_of_several_families_have_nan_for_what_the_others_have():
     assert observation.shape == (17 + 3 * 2,)
 
 
-def test_observations_end_with_what_the_sensors_say():
-    env, plain = codrl_mj.make(CHEETAH, MAXON, observe_actuator=True), gym.make(CHEETAH)
-    space = plain.observation_space
+def test_observations_end_with_the_sensor_values():
+    env, original = codrl_mj.make(CHEETAH, MAXON, observe_actuator=True), gym.make(CHEETAH)
+    space = original.observation_space
     assert env.observation_space.dtype == space.dtype
     np.testing.assert_array_equal(env.observation_space.low, np.append(space.low, [-np.inf] * 12))
     np.testing.assert_array_equal(env.observation_space.high, np.append(space.high, [np.inf] * 12))
@@ -292,7 +292,7 @@ def test_observations_end_with_what_the_sensors_say():
         np.testing.assert_array_equal(observation[18::2], info["reference_current"])
 
 
-def test_currents_are_commanded_in_amperes_up_to_the_motors_limits():
+def test_current_commands_are_in_amperes_up_to_the_motors_limits():
     drives = {
         "b.*": (
             Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
@@ -313,7 +313,7 @@ def test_currents_are_commanded_in_amperes_up_to_the_motors_limits():
         np.testing.assert_allclose(env.unwrapped.data.actuator_force[3:], action[3:], rtol=1e-7)
 
 
-def test_a_current_is_one_whatever_gain_and_arm_stand_before_it_and_whatever_its_limit():
+def test_a_current_command_does_not_depend_on_gain_arm_and_limit():
     fields = {"controller.max_current": 5.0, "motor.gear_ratio": 3.0, "motor.arm_radius": 0.5}
     drive = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(fields)
     env = codrl_mj.make(ARM_ID, {"motor": drive}, action="current", allow_unstable=True)
@@ -324,14 +324,16 @@ def test_a_current_is_one_whatever_gain_and_arm_stand_before_it_and_whatever_its
     assert info["desired_force"] == pytest.approx(
         -0.4 * drive.motor.torque_constant * 3.0 / 0.5, rel=1e-6
     )
-    free = codrl_mj.make(
+    unlimited_env = codrl_mj.make(
         "InvertedPendulum-v5", {".*": NOISY}, action="current", allow_unstable=True
     )
-    of_force = 3.0 * free.unwrapped.model.actuator_gainprm[0, 0] / NOISY.motor.torque_constant
-    np.testing.assert_allclose(free.action_space.high, [of_force], rtol=1e-6)
+    max_current = (
+        3.0 * unlimited_env.unwrapped.model.actuator_gainprm[0, 0] / NOISY.motor.torque_constant
+    )
+    np.testing.assert_allclose(unlimited_env.action_space.high, [max_current], rtol=1e-6)
 
 
-def test_voltages_are_commanded_past_the_loop():
+def test_voltage_commands_bypass_the_current_loop():
     env = codrl_mj.make(CHEETAH, MAXON, action="voltage")
     np.testing.assert_array_equal(env.action_space.high, [24.0] * 6)
     assert set(map(type, env.motors.values())) == {VoltageDrive}
@@ -342,7 +344,7 @@ def test_voltages_are_commanded_past_the_loop():
         np.testing.assert_array_equal(info["desired_force"], info["actual_force"])
 
 
-def test_a_servo_of_ours_is_asked_for_positions():
+def test_a_servo_takes_position_commands():
     env = codrl_mj.make(
         "InvertedPendulum-v5", {".*": Servo()}, action="position", allow_unstable=True
     )
@@ -353,18 +355,18 @@ def test_a_servo_of_ours_is_asked_for_positions():
     assert abs(info["error"] - 0.5) < 0.2 * 0.5 + abs(model.actuator_gear[0, 0] * data.qpos[0])
 
 
-def test_forces_of_an_environment_are_no_motions_of_a_servo():
-    """Else 1 N would be taken for 1 m."""
+def test_raises_if_a_servo_gets_force_commands():
+    """Raise, because 1 N would be taken for 1 m."""
     message = (
-        "action = 'force': '.*': the environment asks its actuators for forces, and a Servo .* must"
-        " be position"
+        "action = 'force': '.*': the environment's actions are forces, but a Servo takes motions;"
+        " must be position"
     )
     with pytest.raises(ValueError, match=message):
         codrl_mj.make("InvertedPendulum-v5", {".*": Servo()}, allow_unstable=True)
 
 
-def test_a_servo_of_the_models_stays_one():
-    """What it asks for, kp*(target - q) - kv*w, is the desired torque."""
+def test_a_position_servo_of_the_model_stays_one():
+    """Check that the desired torque is kp*(target - q) - kv*w."""
     env = codrl_mj.make(
         ARM_ID, {"servo": TorqueSpeed(stall_torque=5.0, no_load_speed=10.0, max_torque=5.0)}
     )
@@ -375,9 +377,9 @@ def test_a_servo_of_the_models_stays_one():
     assert info["saturated"] is True
 
 
-def of_gymnasium(makers, context):
-    """Steps of processes under actions, from the seeds 3 and 4: observations and currents."""
-    vector = AsyncVectorEnv(makers, context=context)
+def gymnasium_steps(env_functions, context):
+    """Yield observations and currents of Gymnasium's processes, from seeds 3 and 4."""
+    vector = AsyncVectorEnv(env_functions, context=context)
     vector.reset(seed=[3, 4])
     for action in (yield):
         observations, *_, infos = vector.step(action)
@@ -385,9 +387,9 @@ def of_gymnasium(makers, context):
     vector.close()
 
 
-def of_stable_baselines3(makers, context):
-    """The same."""
-    vector = SubprocVecEnv(makers, start_method=context)
+def stable_baselines3_steps(env_functions, context):
+    """Yield observations and currents of Stable-Baselines3's processes, as `gymnasium_steps`."""
+    vector = SubprocVecEnv(env_functions, start_method=context)
     vector.seed(3)
     vector.reset()
     for action in (yield):
@@ -397,21 +399,21 @@ def of_stable_baselines3(makers, context):
 
 
 @pytest.mark.parametrize("context", ["fork", pytest.param("spawn", marks=pytest.mark.matrix)])
-@pytest.mark.parametrize("face", [of_gymnasium, of_stable_baselines3])
-def test_environments_in_processes_are_those_of_one(face, context):
+@pytest.mark.parametrize("steps_of", [gymnasium_steps, stable_baselines3_steps])
+def test_environments_in_processes_equal_single_ones(steps_of, context):
     make = functools.partial(
         codrl_mj.make, CHEETAH, {"b.*": NOISY, "f.*": "lag"}, allow_unstable=True
     )
     inputs = np.random.default_rng(0).uniform(-1, 1, (30, 2, 6)).astype(np.float32)
-    singles, steps = [make(), make()], face([make] * 2, context)
+    singles, steps = [make(), make()], steps_of([make] * 2, context)
     for seed, single in zip((3, 4), singles, strict=True):
         single.reset(seed=seed)
     next(steps)
-    found = [steps.send(inputs), *steps]
-    assert len(found) == len(inputs)
-    for (observations, currents), pair in zip(found, inputs, strict=True):
+    results = [steps.send(inputs), *steps]
+    assert len(results) == len(inputs)
+    for (observations, currents), env_actions in zip(results, inputs, strict=True):
         for single, action, observation, current in zip(
-            singles, pair, observations, currents, strict=True
+            singles, env_actions, observations, currents, strict=True
         ):
             expected, *_, info = single.step(action)
             np.testing.assert_array_equal(observation, expected)
@@ -422,7 +424,7 @@ MOTOR = {"motor": MAXON[".*"]}
 
 
 @pytest.mark.parametrize(
-    ("arguments", "text"),
+    ("arguments", "message"),
     [
         ({"actuator": {"knee": "lag"}}, "'knee': no actuator has such a name"),
         (
@@ -431,7 +433,7 @@ MOTOR = {"motor": MAXON[".*"]}
         ),
         (
             {"observe_actuator": True},
-            "the lag actuator has no current to observe, and nothing else; choose another",
+            "the lag actuator has no current and no other signal to observe; choose another",
         ),
         ({"randomize": {"knee": {}}}, "randomize: knee: {} is no distribution"),
         ({"randomize": ["time_constant"]}, "must be FIELD=DISTRIBUTION"),
@@ -480,10 +482,10 @@ MOTOR = {"motor": MAXON[".*"]}
             "randomize: model.gravity: .* has 1 values",
         ),
         ({"disturbances": {"comand_delay": 1}}, "did you mean disturbances.command_delay"),
-        ({"env": BARE_ID, "disturbances": {"command_rate": 1.0}}, "has no dt"),
+        ({"env": BARE_ID, "disturbances": {"command_rate": 1.0}}, "has no `dt`"),
         (
             {"env": ARM_ID, "actuator": MAXON, "action": "current"},
-            r"servo: is no plain motor.*action='force'",
+            r"servo: is not a plain motor.*action='force'",
         ),
         (
             {"env": ARM_ID, "actuator": MOTOR, "action": "current"},
@@ -491,12 +493,12 @@ MOTOR = {"motor": MAXON[".*"]}
         ),
         (
             {"env": "CartPole-v1"},
-            "has no MuJoCo model built from XML, and so no motors: take 'cartpole'",
+            "has no MuJoCo model built from XML, and so no motors: use 'cartpole'",
         ),
     ],
 )
-def test_what_is_wrong_is_said(arguments, text):
-    with pytest.raises(ValueError, match=text):
+def test_raises_for_wrong_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
         codrl_mj.make(
             **{"env": CHEETAH, "actuator": {".*": "lag"}, "allow_unstable": True, **arguments}
         )
@@ -505,16 +507,16 @@ def test_what_is_wrong_is_said(arguments, text):
 @pytest.mark.parametrize(
     "options", [{"action": "current"}, {"disturbances": {"command_delay": 0.05}}]
 )
-def test_an_action_of_another_shape_is_refused(options):
+def test_raises_for_an_action_of_the_wrong_shape(options):
     env = codrl_mj.make(CHEETAH, MAXON, **options)
     env.reset()
     with pytest.raises(ValueError, match=r"action has shape \(1,\): must be \(6,\)"):
         env.step(np.zeros(1, np.float32))
 
 
-def test_a_family_s_class_stands_for_its_defaults():
-    for given in ({".*": TorqueSpeed}, TorqueSpeed):
-        assert EnvConfig("InvertedPendulum-v5", given) == EnvConfig(
+def test_a_family_s_class_selects_an_actuator_with_default_fields():
+    for actuator in ({".*": TorqueSpeed}, TorqueSpeed):
+        assert EnvConfig("InvertedPendulum-v5", actuator) == EnvConfig(
             "InvertedPendulum-v5", {".*": TorqueSpeed()}
         )
-        codrl_mj.make("InvertedPendulum-v5", given).close()
+        codrl_mj.make("InvertedPendulum-v5", actuator).close()

@@ -1,4 +1,4 @@
-"""Robots of other people's in environments: motors that do nothing, and others' beside ours."""
+"""Third-party robots as environments: ideal motors, and motors beside other actuators."""
 
 import functools
 
@@ -14,14 +14,13 @@ from tests.add_motors.models import MENAGERIE
 from tests.external_envs.models import actions, assert_same, run
 from tests.matrix import matrix_params
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::UserWarning"
-)  # deprecated attributes in other people's models
+# Third-party models have deprecated attributes.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 IDEAL = {".*": "ideal"}
 
 
 class Robot(MujocoEnv):
-    """Any model as an environment: its own controls, its state, an end after a second."""
+    """Environment for any model: its own controls and state, and episodes of one second."""
 
     def __init__(self, path, **options):
         """Build the model from the file."""
@@ -40,31 +39,33 @@ class Robot(MujocoEnv):
 
 @pytest.fixture
 def robot():
-    """Registers a model's file, and returns the id."""
+    """Return a function that registers a model's file and returns the id."""
 
-    def registered(path):
+    def register(path):
         gym.register("ForeignRobot-v0", functools.partial(Robot, path))
         return "ForeignRobot-v0"
 
-    yield registered
+    yield register
     gym.registry.pop("ForeignRobot-v0", None)
 
 
 @pytest.mark.parametrize(
     "path", matrix_params(MENAGERIE[5:6], MENAGERIE), ids=lambda path: path.parent.name
 )
-def test_ideal_motors_change_no_bit_of_robots_that_one_can_buy(path, robot):
+def test_ideal_motors_do_not_change_robots_of_the_menagerie(path, robot):
     env_id = robot(path)
-    plain, ours = gym.make(env_id), codrl_mj.make(env_id, IDEAL)
-    assert len(ours.motors) == plain.unwrapped.model.nactuator > 0
-    inputs = actions(plain, 250)
-    assert_same(run(ours, inputs, seed=3), run(plain, inputs, seed=3))
+    original, ours = gym.make(env_id), codrl_mj.make(env_id, IDEAL)
+    assert len(ours.motors) == original.unwrapped.model.nactuator > 0
+    inputs = actions(original, 250)
+    assert_same(run(ours, inputs, seed=3), run(original, inputs, seed=3))
 
 
 BESIDE = """
 <mujoco>
   <extension>
-    <plugin plugin="mujoco.pid"><instance name="pid"><config key="kp" value="9"/></instance></plugin>
+    <plugin plugin="mujoco.pid">
+      <instance name="pid"><config key="kp" value="9"/></instance>
+    </plugin>
   </extension>
   <worldbody>
     <body><joint name="a" axis="0 1 0"/><geom type="capsule" size=".05 .2" mass="1"/>
@@ -82,20 +83,22 @@ BESIDE = """
 """
 
 
-def test_motors_of_ours_stand_beside_a_muscle_and_a_plugin_of_others(robot, tmp_path):
+def test_motors_work_beside_a_muscle_and_another_plugin(robot, tmp_path):
     path = tmp_path / "beside.xml"
     path.write_text(BESIDE)
     env_id = robot(path)
-    plain, ours = gym.make(env_id), codrl_mj.make(env_id, {"ours": "ideal"})
-    inputs = actions(plain, 200)
-    assert_same(run(ours, inputs, seed=0), run(plain, inputs, seed=0))
+    original, ours = gym.make(env_id), codrl_mj.make(env_id, {"ours": "ideal"})
+    inputs = actions(original, 200)
+    assert_same(run(ours, inputs, seed=0), run(original, inputs, seed=0))
     assert list(ours.motors) == [0]
     with pytest.raises(ValueError, match=r"muscle of b: cannot have a motor: .*mjDYN_MUSCLE"):
         codrl_mj.make(env_id, {"muscle": "ideal"})
 
 
 STIFF = DCMotorActuator(Motor(inductance=1e-3), CurrentLoop(kp=1.0))
-NONE = "<mujoco><worldbody><body><joint name='a'/><geom size='1'/></body></worldbody></mujoco>"
+NO_ACTUATORS = (
+    "<mujoco><worldbody><body><joint name='a'/><geom size='1'/></body></worldbody></mujoco>"
+)
 
 
 @pytest.mark.parametrize(
@@ -110,8 +113,8 @@ NONE = "<mujoco><worldbody><body><joint name='a'/><geom size='1'/></body></world
         ),
     ],
 )
-def test_what_is_wrong_is_said(robot, tmp_path, env_id, actuators, message):
-    (tmp_path / "none.xml").write_text(NONE)
+def test_raises_for_wrong_arguments(robot, tmp_path, env_id, actuators, message):
+    (tmp_path / "none.xml").write_text(NO_ACTUATORS)
     robot(tmp_path / "none.xml")
     with pytest.raises((ValueError, gym.error.NameNotFound), match=message):
         codrl_mj.make(env_id, actuators)

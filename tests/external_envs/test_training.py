@@ -1,4 +1,4 @@
-"""Environments of others on the command line and in run folders: described, trained, continued, measured, filmed."""
+"""Third-party environments in files, trainings, evaluations and films."""
 
 import dataclasses
 import json
@@ -27,9 +27,8 @@ from tests.external_envs.models import BareEnv
 from tests.matrix import matrix_params
 from tests.training.interruptions import TERMINATE, crash, differing, interrupt, outcome, resume
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::UserWarning"
-)  # deprecated attributes in other people's models
+# Third-party models have deprecated attributes.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 MAXON = {".*": "maxon-ec45-flat-50w"}
 QUICK = (
     "--agent.hidden 8 --agent.batch-size 16 --agent.learning-starts 40 --evaluation-episodes 1"
@@ -45,14 +44,16 @@ SMALL = SACConfig(
 )
 
 
-def config(env, num_envs=1):
-    often = {"checkpoint_interval": 60, "evaluation_interval": 120, "evaluation_episodes": 1}
-    return TrainConfig(env, SMALL, seed=3, num_envs=num_envs, total_steps=240, **often)
+def train_config(env, num_envs=1):
+    intervals = {"checkpoint_interval": 60, "evaluation_interval": 120, "evaluation_episodes": 1}
+    return TrainConfig(env, SMALL, seed=3, num_envs=num_envs, total_steps=240, **intervals)
 
 
 CASES = {
-    "cheetah": config(EnvConfig("HalfCheetah-v5", MAXON, max_episode_steps=25, **EVERYTHING), 2),
-    "reacher by currents": config(
+    "cheetah": train_config(
+        EnvConfig("HalfCheetah-v5", MAXON, max_episode_steps=25, **EVERYTHING), 2
+    ),
+    "reacher by currents": train_config(
         EnvConfig("Reacher-v5", {"joint.*": "maxon-re65"}, action="current")
     ),
 }
@@ -87,7 +88,7 @@ IDS = {
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
-    """Another folder, without pictures, where environments of somebody's are registered."""
+    """Work in a new folder without pictures, with registered third-party environments."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(history, "save_learning_curve", lambda *_: None)
     for name, creator in IDS.items():
@@ -101,7 +102,7 @@ def elsewhere(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def reacher(tmp_path_factory):
-    """A tiny run of two motors on ideal actuators."""
+    """Return a tiny run of two joints with ideal actuators."""
     out = tmp_path_factory.mktemp("trained") / "reacher"
     assert (
         main(["train", "Reacher-v5", "--total-steps", "150", *QUICK.split(), "--out", str(out)])
@@ -110,35 +111,35 @@ def reacher(tmp_path_factory):
     return out
 
 
-# -- descriptions ---------------------------------------------------------------------------------------------
+# -- descriptions ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_configuration_survives_json(name):
-    whole = json.loads(json.dumps(CASES[name].as_mapping()))
-    assert TrainConfig.from_mapping(whole, whole=True) == CASES[name]
-    assert (
-        TrainConfig.from_mapping({"task": "codrl_mj/Pendulum-v0"}).env.task == "pendulum"
-    )  # an id of ours
+    mapping = json.loads(json.dumps(CASES[name].as_mapping()))
+    assert TrainConfig.from_mapping(mapping, whole=True) == CASES[name]
+    # The Gymnasium id of a built-in task is replaced by its name.
+    assert TrainConfig.from_mapping({"task": "codrl_mj/Pendulum-v0"}).env.task == "pendulum"
 
 
-def test_a_file_says_what_is_behind_what(tmp_path):
+def test_a_file_assigns_actuators_to_patterns(tmp_path):
     text = (
         "env: {task: HalfCheetah-v5, actuator: {b.*: maxon-ec45-flat-50w, f.*: lag}, options:"
         " {frame_skip: 2}}\n"
     )
     (tmp_path / "train.yaml").write_text(text + "agent: {name: sac, gamma: 0.98}\n")
-    found = read_config(tmp_path / "train.yaml")
-    assert found.env.driven == {
+    train_config = read_config(tmp_path / "train.yaml")
+    assert train_config.env.actuators_by_name == {
         "b.*": Drive.of(motor_entry("maxon-ec45-flat-50w").numbers),
         "f.*": Lag(),
     }
-    assert found.env.make().unwrapped.frame_skip == 2
-    assert (found.agent.gamma, found.agent.hidden, found.num_envs) == (
+    assert train_config.env.make().unwrapped.frame_skip == 2
+    # Fields that the file does not name have their defaults.
+    assert (train_config.agent.gamma, train_config.agent.hidden, train_config.num_envs) == (
         0.98,
         (256, 256),
         1,
-    )  # the others as always
+    )
 
 
 @pytest.mark.parametrize(
@@ -159,43 +160,45 @@ def test_a_file_says_what_is_behind_what(tmp_path):
         ({"task": "HalfCheetah-v5", "levels": [1.0]}, "HalfCheetah-v5 has none"),
     ],
 )
-def test_bad_descriptions_are_refused(fields, message):
+def test_raises_for_bad_configurations(fields, message):
     with pytest.raises(ValueError, match=message):
         TrainConfig.from_mapping({"env": fields})
 
 
-def test_a_module_of_somebodys_is_not_imported_from_a_run_folder_unasked(tmp_path):
+def test_a_run_folder_imports_modules_only_with_trust(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps({"train": CASES["cheetah"].as_mapping()}))
     text = (
         (tmp_path / "config.json")
         .read_text()
-        .replace("HalfCheetah-v5", "tests.external_envs.nobody:Robot-v0")
+        .replace("HalfCheetah-v5", "tests.external_envs.missing:Robot-v0")
     )
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match="Pass --trust"):
         load_config(tmp_path)
 
 
-# -- training -------------------------------------------------------------------------------------------------
+# -- training -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", matrix_params(["reacher by currents"], CASES))
-def test_an_interrupted_training_comes_to_the_same_result(tmp_path, name):
+def test_an_interrupted_training_gives_the_same_result(tmp_path, name):
     interrupt(CASES[name], tmp_path / "run", 70, TERMINATE)
     interrupt(CASES[name], tmp_path / "run", 70, crash)
-    ours, theirs = (
+    resumed, reference = (
         outcome(resume(CASES[name], tmp_path / run)) for run in ("run", "uninterrupted")
     )
-    assert differing(theirs, ours) == []
+    assert differing(reference, resumed) == []
 
 
-def test_where_nobody_can_set_the_state_a_continued_training_starts_an_episode():
-    tiny = config(EnvConfig("ForeignBare-v0", {".*": "lag"}))
-    interrupt(tiny, Path("run"), 70, crash)  # in the second episode
+def test_a_resumed_training_starts_an_episode_if_the_state_cannot_be_set():
+    tiny = train_config(EnvConfig("ForeignBare-v0", {".*": "lag"}))
+    # The interruption is in the second episode.
+    interrupt(tiny, Path("run"), 70, crash)
     resume(tiny, Path("run"))
     lengths = np.loadtxt("run/episodes.csv", delimiter=",", skiprows=1)[:, 3]
     assert read_run(Path("run")).steps == 240
-    assert set(lengths) == {50.0}  # none was cut
+    # No episode may be cut.
+    assert set(lengths) == {50.0}
 
 
 @pytest.mark.parametrize(
@@ -205,28 +208,30 @@ def test_where_nobody_can_set_the_state_a_continued_training_starts_an_episode()
         ("ForeignOne-v0", PPOConfig(), r"a choice \(Discrete\) that counts from 0"),
     ],
 )
-def test_spaces_that_nobody_learns_in_are_refused(env_id, agent, message):
+def test_raises_for_spaces_that_agents_cannot_use(env_id, agent, message):
     with pytest.raises(ValueError, match=message):
         train(TrainConfig(EnvConfig(env_id), agent, total_steps=8), Path("run"))
 
 
-def test_the_options_of_an_environment_decide_who_can_act_in_it():
-    chosen, options = "ForeignSwitched-v0", {"discrete": True}
-    posed = {"task": chosen, "env": {"options": options}}
-    assert [TrainConfig.from_mapping(posed | one).agent.name for one in ({}, {"agent": "dqn"})] == [
+def test_the_options_of_an_environment_decide_which_agents_fit():
+    env_id, options = "ForeignSwitched-v0", {"discrete": True}
+    mapping = {"task": env_id, "env": {"options": options}}
+    assert [
+        TrainConfig.from_mapping(mapping | agent).agent.name for agent in ({}, {"agent": "dqn"})
+    ] == [
         "ppo",
         "dqn",
     ]
     assert (
         TrainConfig.from_mapping(
-            {"task": chosen, "env": {"options": {"discrete": False}}}
+            {"task": env_id, "env": {"options": {"discrete": False}}}
         ).agent.name
         == "sac"
     )
-    assert TrainConfig.preset(chosen, "dqn", env={"options": options}).env.options == options
-    line = [
+    assert TrainConfig.preset(env_id, "dqn", env={"options": options}).env.options == options
+    command = [
         "train",
-        chosen,
+        env_id,
         "--env.options",
         "discrete=true",
         "--agent",
@@ -236,21 +241,29 @@ def test_the_options_of_an_environment_decide_who_can_act_in_it():
     ]
     assert (
         main(
-            [*line, "--num-envs", "1", "--agent.learning-starts", "4", "--evaluation-episodes", "1"]
+            [
+                *command,
+                "--num-envs",
+                "1",
+                "--agent.learning-starts",
+                "4",
+                "--evaluation-episodes",
+                "1",
+            ]
         )
         == 0
     )
 
 
-# -- measuring ------------------------------------------------------------------------------------------------
+# -- measuring ------------------------------------------------------------------------------------
 
 
-def test_every_integration_step_is_looked_at_nothing_changes_by_it_and_a_file_keeps_it():
-    """The trace, against the sums of a loop over `mj_step` of one's own."""
-    known = EnvConfig("HalfCheetah-v5", MAXON, max_episode_steps=10)
-    policy = RandomPolicy(known.make().action_space, 1)
-    (episode,) = run_episodes(policy, known.make, 1, seed=4)
-    env = known.make()
+def test_an_episode_records_every_integration_step_and_survives_a_file():
+    """Compare the trace with a loop over `mj_step`."""
+    config = EnvConfig("HalfCheetah-v5", MAXON, max_episode_steps=10)
+    policy = RandomPolicy(config.make().action_space, 1)
+    (episode,) = run_episodes(policy, config.make, 1, seed=4)
+    env = config.make()
     env.reset(seed=4)
     model, data = env.unwrapped.model, env.unwrapped.data
     work = np.zeros(6)
@@ -269,59 +282,68 @@ def test_every_integration_step_is_looked_at_nothing_changes_by_it_and_a_file_ke
                 * model.opt.timestep
             )
     np.testing.assert_array_equal(episode.state[-1], np.concatenate([data.qpos, data.qvel]))
-    found = codrl_mj.evaluation.summarize(known.task, [episode]).motors
-    assert list(found) == ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]
-    np.testing.assert_allclose([one["mechanical_work"] for one in found.values()], work, rtol=1e-12)
+    motors = codrl_mj.evaluation.summarize(config.task, [episode]).motors
+    assert list(motors) == ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]
+    np.testing.assert_allclose(
+        [motor["mechanical_work"] for motor in motors.values()], work, rtol=1e-12
+    )
     save_episode(episode, Path("episode.npz"))
-    again = load_episode(Path("episode.npz"))
+    loaded = load_episode(Path("episode.npz"))
     for field in dataclasses.fields(episode):
-        np.testing.assert_equal(getattr(again, field.name), getattr(episode, field.name))
+        np.testing.assert_equal(getattr(loaded, field.name), getattr(episode, field.name))
 
 
-def test_motors_of_several_families_are_measured_by_what_they_have():
-    mixed = EnvConfig("Reacher-v5", {"joint0": "lag", "joint1": "maxon-re65"})
-    found = evaluate(RandomPolicy(mixed.make().action_space, 0), mixed, 2)
-    lag, maxon = found.motors.values()
+def test_motors_of_several_families_have_measures_of_their_own_signals():
+    config = EnvConfig("Reacher-v5", {"joint0": "lag", "joint1": "maxon-re65"})
+    evaluation = evaluate(RandomPolicy(config.make().action_space, 0), config, 2)
+    lag, maxon = evaluation.motors.values()
     assert lag["rms_current"] is None
-    assert maxon["rms_current"] == pytest.approx(found.rms_current)
-    assert maxon["copper_loss"] == pytest.approx(found.copper_loss.mean)
-    assert found.success is None  # Reacher says nothing of it
+    assert maxon["rms_current"] == pytest.approx(evaluation.rms_current)
+    assert maxon["copper_loss"] == pytest.approx(evaluation.copper_loss.mean)
+    # Reacher's info does not contain success.
+    assert evaluation.success is None
 
 
-# -- the command line -----------------------------------------------------------------------------------------
+# -- the command line -----------------------------------------------------------------------------
 
 
-def test_motors_that_are_not_named_stay_what_they_were():
+def test_actuators_that_are_not_named_do_not_change():
     line = "evaluate two --actuators joint0=lag --episodes 1 --out result.json"
-    two = config(EnvConfig("Reacher-v5", {"joint.*": "maxon-re65"}))
-    train(dataclasses.replace(two, total_steps=50), Path("two"), tensorboard=False)
+    config = train_config(EnvConfig("Reacher-v5", {"joint.*": "maxon-re65"}))
+    train(dataclasses.replace(config, total_steps=50), Path("two"), tensorboard=False)
     assert main(line.split()) == 0
     motors = json.loads(Path("result.json").read_text())["motors"]
     assert motors["joint0"]["peak_voltage"] is None
     assert motors["joint1"]["peak_voltage"] > 0.0
 
 
-def test_draws_of_the_model_survive_files_and_flags():
+def test_randomization_survives_files_and_flags():
     env = EnvConfig("Reacher-v5", {".*": "lag"}, randomize={"model.gravity": "uniform(0.9, 1.1)"})
     assert (
-        TrainConfig.from_mapping(json.loads(json.dumps(config(env).as_mapping())), whole=True).env
+        TrainConfig.from_mapping(
+            json.loads(json.dumps(train_config(env).as_mapping())), whole=True
+        ).env
         == env
     )
-    both = ["model.gravity=uniform(0.9, 1.1)", ".*:time_constant=uniform(0.01, 0.02)"]
-    other = EnvConfig("Reacher-v5", {".*": "lag"}, randomize=both)
-    assert other.randomize == tuple(both)
+    paths = ["model.gravity=uniform(0.9, 1.1)", ".*:time_constant=uniform(0.01, 0.02)"]
+    flat_config = EnvConfig("Reacher-v5", {".*": "lag"}, randomize=paths)
+    assert flat_config.randomize == tuple(paths)
     nested = {"model.gravity": "uniform(0.9, 1.1)", ".*": {"time_constant": "uniform(0.01, 0.02)"}}
-    assert EnvConfig("Reacher-v5", {".*": "lag"}, randomize=nested) == other
-    envs = codrl_mj.make_sb3_vec_env(other, 2)
+    assert EnvConfig("Reacher-v5", {".*": "lag"}, randomize=nested) == flat_config
+    envs = codrl_mj.make_sb3_vec_env(flat_config, 2)
     envs.reset()
-    drawn = envs.randomization
-    assert set(drawn) == {"model.gravity", ".*:time_constant", "rejected"}
-    assert drawn["model.gravity"].shape == (2,)
-    train(dataclasses.replace(config(other), total_steps=50), Path("run"), tensorboard=False)
+    drawn_values = envs.randomization
+    assert set(drawn_values) == {"model.gravity", ".*:time_constant", "rejected"}
+    assert drawn_values["model.gravity"].shape == (2,)
+    train(
+        dataclasses.replace(train_config(flat_config), total_steps=50),
+        Path("run"),
+        tensorboard=False,
+    )
     assert main(["evaluate", "run", "--episodes", "1"]) == 0
 
 
-def test_an_environment_without_a_time_limit_needs_one():
+def test_raises_for_an_environment_without_a_time_limit():
     endless = EnvConfig("ForeignEndless-v0", {".*": "lag"})
     with pytest.raises(ValueError, match="registered without a time limit"):
         endless.make()
@@ -343,27 +365,26 @@ def test_a_policy_of_stable_baselines_is_evaluated_by_the_id(capsys):
 
 
 def test_a_run_is_evaluated_on_other_motors(reacher, capsys):
-    assert load_config(reacher).env.driven == {".*": IDEAL}
+    assert load_config(reacher).env.actuators_by_name == {".*": IDEAL}
     line = (
         f"evaluate {reacher} --actuators joint0=maxon-re65 joint1=lag --episodes 2 --out"
         " result.json"
     )
     assert main(line.split()) == 0
-    shown = capsys.readouterr().out
-    assert "motors of reacher" in shown
-    assert "joint1" in shown
+    output = capsys.readouterr().out
+    assert "motors of reacher" in output
+    assert "joint1" in output
     result = json.loads(Path("result.json").read_text())
     assert result["conditions"]["env"]["actuator"]["joint1"] == Lag().as_mapping()
     assert main(["runs", str(reacher.parent)]) == 0
-    listed = capsys.readouterr().out
-    assert "Reacher-v5" in listed
-    assert "ideal" in listed
+    runs_output = capsys.readouterr().out
+    assert "Reacher-v5" in runs_output
+    assert "ideal" in runs_output
 
 
-def test_motors_are_chosen_for_what_a_policy_asked_and_do_it(reacher, capsys):
-    assert (
-        main(["motor", "choose", str(reacher), "--out", "chosen"]) == 1
-    )  # none has all that is asked for in print
+def test_motors_are_chosen_for_the_demand_of_a_policy_and_meet_it(reacher, capsys):
+    # No datasheet contains everything that is needed, hence the exit status 1.
+    assert main(["motor", "choose", str(reacher), "--out", "chosen"]) == 1
     assert "joint1" in capsys.readouterr().out
     chosen = yaml.safe_load(Path("chosen/actuators.yaml").read_text())
     assert list(chosen) == ["joint0", "joint1"]
@@ -375,9 +396,10 @@ def test_motors_are_chosen_for_what_a_policy_asked_and_do_it(reacher, capsys):
     assert all(motor["tracking_percent"] < 5.0 for motor in result["motors"].values())
     with pytest.raises(ValueError, match="must be one of joint0, joint1"):
         demand_of(reacher)
-    asked = demands_of(reacher, episodes=2)["joint0"]
-    assert asked.model_gear == 200.0  # Reacher's: forces are up to 200 times 1
-    assert 1.0 < np.abs(asked.torque).max() <= 200.0
+    demand = demands_of(reacher, episodes=2)["joint0"]
+    # Reacher's forces are up to 200 times 1.
+    assert demand.model_gear == 200.0
+    assert 1.0 < np.abs(demand.torque).max() <= 200.0
 
 
 def test_an_episode_is_filmed_with_the_strip_of_a_motor(reacher, capsys):
@@ -387,9 +409,11 @@ def test_an_episode_is_filmed_with_the_strip_of_a_motor(reacher, capsys):
     )
     assert main(line.split()) == 0
     frames = imageio.mimread("film.gif")
-    assert len(frames) == 26  # 50 steps of 20 ms, at half the rate, and the end
+    # 50 steps of 20 ms at half the rate, and the last state.
+    assert len(frames) == 26
     assert len(load_episode(Path("episode.npz")).reward) == 50
-    assert np.ptp(frames[0][60:120].astype(int)) > 50  # the scene
+    # These rows show the scene.
+    assert np.ptp(frames[0][60:120].astype(int)) > 50
     capsys.readouterr()
     assert main(["render", str(reacher), "--motor", "joint", "--out", "other.gif"]) == 2
     assert "did you mean 'joint1'" in capsys.readouterr().err.replace("joint0", "joint1")
@@ -412,16 +436,18 @@ def test_an_episode_is_filmed_with_the_strip_of_a_motor(reacher, capsys):
         (
             "train CartPole-v1",
             (
-                "CartPole-v1: the environment has no MuJoCo model .*: take 'cartpole', our task of"
-                " it that has"
+                "CartPole-v1: the environment has no MuJoCo model .*: use 'cartpole', the task of"
+                " this package that has motors"
             ),
         ),
         ("motor choose Reacher-v5", "no scripted controller for it; train it"),
     ],
 )
-def test_what_cannot_be_costs_one_line(capfd, line, message):
+def test_errors_of_the_command_line_are_one_line(capfd, line, message):
     assert main([*line.split(), "--out", "run"]) == 2
-    said = [one for one in capfd.readouterr().err.splitlines() if one.startswith("codrl-mj: error")]
-    assert len(said) == 1
-    assert re.search(message, said[0])
+    errors = [
+        text for text in capfd.readouterr().err.splitlines() if text.startswith("codrl-mj: error")
+    ]
+    assert len(errors) == 1
+    assert re.search(message, errors[0])
     assert not Path("run").exists()

@@ -1,1 +1,1 @@
-"""A small project of somebody else's, which edits nothing of codrl_mj: a family, a task, an agent and a physics."""
+"""A third-party project without edits of codrl_mj: a family, a task, an agent and a physics."""

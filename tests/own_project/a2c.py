@@ -1,4 +1,4 @@
-"""An agent of one's own: Stable-Baselines3's A2C, behind the settings that `train` takes."""
+"""A custom agent: Stable-Baselines3's A2C with the settings that `train` accepts."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -17,7 +17,7 @@ class A2CConfig(DeepAgentConfig):
     action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box, spaces.Discrete)
 
     learning_rate: float = real(7e-4, above=0)
-    """RMSProp's step size, > 0."""
+    """Step size of RMSProp, > 0."""
     rollout_steps: int = integer(8, least=1)
     """Steps of each environment between two updates, >= 1."""
 

@@ -1,4 +1,4 @@
-"""A task of one's own: hold a two-link arm with two motors out to the side. Its model is beside it."""
+"""A custom task: hold a two-link arm with two motors out to the side."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,18 +20,18 @@ class Options(NamedTuple):
 
 
 def initial_bounds(options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Hanging, give or take."""
+    """Return bounds of a state in which the arm hangs down."""
     del options
     return np.full(4, -0.1), np.full(4, 0.1)
 
 
 def initial_state(draws: Any) -> tuple[Any, ...]:
-    """The draws themselves."""
+    """Return the draws as the state."""
     return draws[0], draws[1], draws[2], draws[3]
 
 
 def observation(state: Any) -> tuple[Any, ...]:
-    """Sines, cosines and speeds."""
+    """Return cosines and sines of the angles, and the scaled speeds."""
     return (
         np.cos(state[0]),
         np.sin(state[0]),
@@ -43,17 +43,17 @@ def observation(state: Any) -> tuple[Any, ...]:
 
 
 def error(state: Any) -> Any:
-    """How far it is from being stretched out to the side."""
+    """Return the deviation of the hand from the stretched position."""
     return 2.0 - np.sin(-state[0]) - np.cos(state[1])
 
 
 def reward(state: Any, force: Any, next_state: Any, options: Options) -> Any:
-    """Minus the error and the effort of both motors."""
+    """Return the negative sum of the error and the effort of both motors."""
     return -error(next_state) - options.effort_weight * (force[0] * force[0] + force[1] * force[1])
 
 
 def terminated(state: Any) -> Any:
-    """It spins out of control."""
+    """Return True if the arm spins too fast."""
     return np.abs(state[2]) > 50.0
 
 
@@ -84,7 +84,7 @@ TASK = Task(
     attributes={
         "gravity": GRAVITY,
         "upper_mass": mass("upper"),
-        "most": Setting.LARGEST_FORCE,
+        "largest_torques": Setting.LARGEST_FORCE,
         "reach": Fixed(0.9),
     },
 )

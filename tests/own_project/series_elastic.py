@@ -1,4 +1,4 @@
-"""A family of actuators: a spring between rotor and load, with friction in the gear."""
+"""A custom family of actuators: a spring between rotor and load, with friction in the gear."""
 
 import dataclasses
 import math
@@ -17,7 +17,7 @@ class State(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """What can be seen of it."""
+    """Signals of the actuator."""
 
     deflection: float
     friction: float
@@ -27,14 +27,16 @@ class Signals(NamedTuple):
 def advance(
     parameters: Any, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Signals]:
-    """A spring that is wound towards the desired torque, and a bristle that breaks away at the Coulomb torque."""
-    wanted = inputs.desired_torque / parameters.stiffness
-    change = (wanted - state.deflection) * (1.0 - math.exp(-timestep / parameters.winding_time))
+    """Wind a spring towards the desired torque; a bristle models the Coulomb friction."""
+    desired_deflection = inputs.desired_torque / parameters.stiffness
+    change = (desired_deflection - state.deflection) * (
+        1.0 - math.exp(-timestep / parameters.winding_time)
+    )
     limit = parameters.max_speed * timestep
     saturated = 1.0 if abs(change) > limit else 0.0
     deflection = state.deflection + min(max(change, -limit), limit)
-    most = parameters.coulomb / parameters.bristle_stiffness
-    bristle = min(max(state.bristle + inputs.speed * timestep, -most), most)
+    max_deflection = parameters.coulomb / parameters.bristle_stiffness
+    bristle = min(max(state.bristle + inputs.speed * timestep, -max_deflection), max_deflection)
     friction = parameters.bristle_stiffness * bristle
     torque = parameters.stiffness * deflection - friction
     return State(deflection, bristle), torque, Signals(deflection, friction, saturated)
@@ -51,16 +53,16 @@ class SeriesElastic(ActuatorModel):
     advance: ClassVar = staticmethod(advance)
 
     stiffness: float = real(20.0, above=0.0, unit="N*m/rad")
-    """Of the spring [N*m/rad], > 0."""
+    """Stiffness of the spring [N*m/rad], > 0."""
     winding_time: float = real(0.03, above=0.0, unit="s")
-    """Time constant with which it is wound [s], > 0."""
+    """Time constant of winding the spring [s], > 0."""
     max_speed: float = real(4.0, above=0.0, unit="rad/s")
-    """Fastest winding [rad/s], > 0."""
+    """Maximum speed of winding [rad/s], > 0."""
     coulomb: float = real(0.05, above=0.0, unit="N*m")
     """Coulomb friction [N*m], > 0."""
     bristle_stiffness: float = real(5.0, above=0.0, unit="N*m/rad")
-    """Of the bristles [N*m/rad], > 0."""
+    """Stiffness of the bristles [N*m/rad], > 0."""
 
 
 SOFT = SeriesElastic(stiffness=5.0)
-"""One with a soft spring."""
+"""Actuator with a soft spring."""

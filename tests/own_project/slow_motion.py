@@ -1,12 +1,12 @@
-"""A physics of one's own: MuJoCo's, with time running at half its pace."""
+"""A custom physics: MuJoCo's, with time at half the speed."""
 
 from codrl_mj.physics import MujocoPhysics, SimulationConfig
 
 
 class SlowMotion(MujocoPhysics):
-    """As MuJoCo's, with integration steps of half the length."""
+    """MuJoCo's physics with integration steps of half the length."""
 
-    def __init__(self, plant: SimulationConfig) -> None:
-        """Make the simulation, and halve its step."""
-        super().__init__(plant)
+    def __init__(self, simulation: SimulationConfig) -> None:
+        """Create the simulation, and halve its step."""
+        super().__init__(simulation)
         self.model.opt.timestep /= 2

@@ -108,7 +108,7 @@ def record(
     In environments of others the camera `fixed` is their own, and what is seen is kept; our tasks
     are drawn from their states.
     """
-    view, made = env.world.view(env, width, height, None if camera == "fixed" else camera), []
+    view, made = env.source.view(env, width, height, None if camera == "fixed" else camera), []
     if view is None:
         return Panel(env.task, run_episodes(policy, env.make, 1, seed)[0])
 

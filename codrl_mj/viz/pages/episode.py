@@ -341,7 +341,7 @@ def _run_plots(shown: Sequence[Shown]) -> list[Plot]:
         own: Any = {"shared": place if several else None, "tags": (f"run:{place}",)}
         time = np.concatenate([[0.0], one.episode.time])
         counts: dict[str, int] = {}
-        for index, name in enumerate(one.env.world.state_names(one.env)):
+        for index, name in enumerate(one.env.source.state_names(one.env)):
             unit = (re.search(r"\[(.*)\]", name) or [name, "1"])[1]
             count = counts[unit] = counts.get(unit, -1) + 1
             if count < _MOST_STATES:

@@ -354,7 +354,7 @@ def _loop(runs: Sequence[Shown]) -> Markup:
     without: dict[str, None] = {}
     seen: list[Any] = []
     for run in runs:
-        driven = run.env.driven if run.env is not None else {}
+        driven = run.env.actuators_by_name if run.env is not None else {}
         for motor, actuator in driven.items():
             name = (
                 motor

@@ -128,7 +128,7 @@ def motion_of_episode(episode: Episode, env: Any) -> Motion:
         episode: the episode.
         env: the `EnvConfig` that it was recorded in.
     """
-    model, show, camera = env.world.scene(env)
+    model, show, camera = env.source.scene(env)
     return motion(model, episode.state, np.concatenate([[0.0], episode.time]), camera, show)
 
 

@@ -228,8 +228,10 @@ class Browser:
         for (
             pattern,
             actuator,
-        ) in session.config.driven.items():  # a folder for each part of what drives a motor
-            several = f" {pattern}" if len(session.config.driven) > 1 else ""
+        ) in (
+            session.config.actuators_by_name.items()
+        ):  # a folder for each part of what drives a motor
+            several = f" {pattern}" if len(session.config.actuators_by_name) > 1 else ""
             own = actuator.family or type(actuator).__name__
             change, found = (
                 functools.partial(session.set_actuator, pattern),
@@ -276,7 +278,7 @@ class Browser:
             "desired_force": "force, torque at the joint",
             "actual_force": "force, torque at the joint",
         }
-        for actuator in session.config.driven.values():
+        for actuator in session.config.actuators_by_name.values():
             units |= {
                 name: f"{name.split('_')[-1]} [{unit}]"
                 for name, unit in actuator.SIGNAL_UNITS.items()

@@ -242,8 +242,8 @@ class Session:
         self._rebuild(
             lambda: {
                 "actuator": {
-                    **self.config.driven,
-                    pattern: actuator_over(self.config.driven[pattern], value),
+                    **self.config.actuators_by_name,
+                    pattern: actuator_over(self.config.actuators_by_name[pattern], value),
                 }
             }
         )

@@ -285,7 +285,7 @@ def test_states_of_every_kind_of_joint_have_units(monkeypatch):
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     made = SimpleNamespace(unwrapped=SimpleNamespace(model=model), close=lambda: None)
     monkeypatch.setattr(EnvConfig, "make", lambda _: made)
-    names = EnvConfig("Ant-v5").world.state_names(EnvConfig("Ant-v5"))
+    names = EnvConfig("Ant-v5").source.state_names(EnvConfig("Ant-v5"))
     units = [re.search(r"\[(.*)\]", name)[1] for name in names]
     assert units[: model.nq] == ["1"] * 4 + ["m", "rad"] + ["m"] * 3 + ["1"] * 4
     assert units[model.nq :] == ["rad/s"] * 3 + ["m/s", "rad/s"] + ["m/s"] * 3 + ["rad/s"] * 3

@@ -147,7 +147,7 @@ def test_a_policy_for_another_environment_is_refused(motors_added):
 
 
 def test_controls_are_the_fields_with_their_bounds_and_units(motors_added):
-    actuator = motors_added.config.driven[".*"]
+    actuator = motors_added.config.actuators_by_name[".*"]
     found = {one.path: one for one in controls(actuator, 48.0)}
     resistance = found["motor", "resistance"]
     assert resistance.unit == "ohm"

@@ -1,4 +1,4 @@
-"""A world of somebody's own: everything that a task or an environment of Gymnasium's can, without an edit of ours."""
+"""A custom env source can do all that tasks and Gymnasium's environments can."""
 
 import json
 
@@ -9,7 +9,7 @@ import pytest
 import codrl_mj
 from codrl_mj import EnvConfig
 from codrl_mj.__main__ import main
-from codrl_mj.envs.worlds import EnvSource, find_world, world_of
+from codrl_mj.envs.sources import EnvSource, find_source, source_of
 from codrl_mj.training import TrainConfig
 from codrl_mj.viz.view.session import Session
 from tests.envs.rig import RIG, RigEnv
@@ -27,7 +27,7 @@ def run(tmp_path_factory):
     return out
 
 
-def test_a_configuration_of_it_survives_json_and_makes_environments():
+def test_a_configuration_survives_json_and_makes_environments():
     config = EnvConfig(
         NAME,
         {"drive": MOTOR},
@@ -35,15 +35,16 @@ def test_a_configuration_of_it_survives_json_and_makes_environments():
         disturbances={"command_delay": 0.02},
         options={"target": 0.5},
     )
-    assert find_world(NAME) is config.world is RIG
+    assert find_source(NAME) is config.source is RIG
     assert EnvConfig.from_mapping(json.loads(json.dumps(config.as_mapping()))) == config
     with config.make() as env:
         _, info = env.reset(seed=1)
         assert 0.1 <= info["randomization"]["motor.resistance"] <= 0.2
-        env.step(np.ones(1))  # delayed by a step
+        # The command of the first step is delayed by one step.
+        env.step(np.ones(1))
         *_, info = env.step(np.ones(1))
         assert info["current"] != 0.0
-    assert TrainConfig.preset(NAME, "sac", actuator="lag").env.through == "lag"
+    assert TrainConfig.preset(NAME, "sac", actuator="lag").env.actuator_label == "lag"
 
 
 class Nameless(EnvSource):
@@ -65,8 +66,8 @@ class Nameless(EnvSource):
         ),
         (lambda: EnvConfig("tests.envs.rig:Rig"), r"^Rig: must be an instance of it: Rig\(...\)"),
         (
-            lambda: world_of(Nameless()),
-            "Nameless: must have a `name`, a text, which messages call it by",
+            lambda: source_of(Nameless()),
+            "Nameless: must have a `name`, the text that messages use",
         ),
         (
             lambda: codrl_mj.make(RigEnv(), {".*": "lag"}),
@@ -74,15 +75,15 @@ class Nameless(EnvSource):
         ),
     ],
 )
-def test_what_is_no_world_or_what_it_does_not_have_is_refused(call, message):
+def test_raises_for_objects_that_are_no_source_and_for_unsupported_fields(call, message):
     with pytest.raises(ValueError, match=message):
         call()
 
 
-def test_a_world_that_makes_no_environment_is_refused(monkeypatch):
+def test_raises_if_make_returns_no_environment(monkeypatch):
     named = Nameless()
     named.name = "named"
-    assert world_of(named) is named
+    assert source_of(named) is named
     monkeypatch.setattr(type(RIG), "make", lambda *_, **__: 3)
     with pytest.raises(
         ValueError, match=r"tests.envs.rig:RIG: its `make` returned 3: must be a gymnasium.Env"
@@ -90,7 +91,7 @@ def test_a_world_that_makes_no_environment_is_refused(monkeypatch):
         EnvConfig(NAME).make()
 
 
-def test_an_evaluation_keeps_the_time_limit_of_a_world_without_one(monkeypatch):
+def test_evaluation_keeps_the_time_limit_if_the_source_has_none(monkeypatch):
     config = TrainConfig.preset(
         NAME, "sac", env={"max_episode_steps": 9, "options": {"target": 0.5}}
     )
@@ -99,27 +100,27 @@ def test_an_evaluation_keeps_the_time_limit_of_a_world_without_one(monkeypatch):
     assert config.evaluation_env.time_limit == 9
 
 
-def test_a_fault_of_an_environment_s_own_is_not_said_to_be_of_options_that_nobody_gave():
+def test_an_error_inside_an_environment_is_not_blamed_on_options_that_were_not_set():
     gym.register("Broken-v0", lambda **_: len(5), max_episode_steps=5)
     try:
         with pytest.raises(
             ValueError, match=r"^Broken-v0: object of type 'int' has no len"
-        ) as refused:
+        ) as error_info:
             EnvConfig("Broken-v0").make()
-        assert isinstance(refused.value.__cause__, TypeError)
+        assert isinstance(error_info.value.__cause__, TypeError)
     finally:
         gym.registry.pop("Broken-v0")
 
 
-def test_a_long_text_among_the_options_is_no_file():
+def test_a_long_text_in_the_options_is_not_taken_for_a_file():
     assert EnvConfig(NAME, options={"target": "x" * 9000}).code == EnvConfig(NAME).code
 
 
 def test_ideal_motors_change_nothing():
-    plain, made = RigEnv(), EnvConfig(NAME).make()
-    np.testing.assert_array_equal(plain.reset(seed=3)[0], made.reset(seed=3)[0])
+    original, with_motors = RigEnv(), EnvConfig(NAME).make()
+    np.testing.assert_array_equal(original.reset(seed=3)[0], with_motors.reset(seed=3)[0])
     for action in np.random.default_rng(0).uniform(-1, 1, (20, 1)):
-        np.testing.assert_array_equal(plain.step(action)[0], made.step(action)[0])
+        np.testing.assert_array_equal(original.step(action)[0], with_motors.step(action)[0])
 
 
 @pytest.mark.parametrize(
@@ -136,19 +137,19 @@ def test_ideal_motors_change_nothing():
         "train --resume {run} --trust",
     ],
 )
-def test_every_verb_takes_it(run, line):
+def test_every_verb_accepts_a_custom_source(run, line):
     assert main(line.format(run=run, runs=run.parent).split()) == 0
 
 
-def test_a_live_session_runs_it():
+def test_a_live_session_runs_a_custom_source():
     session = Session(EnvConfig(NAME, {"drive": MOTOR}), {})
     session.set_actuator("drive", ("motor", "resistance"), 0.3)
     assert session.problem is None
     assert session.step()
-    assert session.config.driven["drive"].motor.resistance == 0.3
+    assert session.config.actuators_by_name["drive"].motor.resistance == 0.3
 
 
-def test_make_takes_of_a_world_or_task_by_its_place_what_it_says_it_takes():
+def test_make_accepts_options_of_sources_and_tasks_that_are_loaded_by_name():
     with codrl_mj.make(
         NAME, "lag", render_mode="rgb_array", max_episode_steps=7, target=0.5
     ) as env:
@@ -163,8 +164,10 @@ def test_make_takes_of_a_world_or_task_by_its_place_what_it_says_it_takes():
 
 
 @pytest.mark.parametrize(
-    "of", [lambda fields: fields, lambda fields: {"slider": fields}], ids=["all", "by name"]
+    "assign", [lambda fields: fields, lambda fields: {"slider": fields}], ids=["all", "by name"]
 )
-def test_make_takes_an_actuators_fields_for_an_environment_of_others(of):
-    with codrl_mj.make("InvertedPendulum-v5", of({"family": "lag", "time_constant": 0.03})) as env:
-        assert [one.time_constant for one in env.get_wrapper_attr("motors").values()] == [0.03]
+def test_make_accepts_actuator_fields_for_a_third_party_environment(assign):
+    with codrl_mj.make(
+        "InvertedPendulum-v5", assign({"family": "lag", "time_constant": 0.03})
+    ) as env:
+        assert [motor.time_constant for motor in env.get_wrapper_attr("motors").values()] == [0.03]

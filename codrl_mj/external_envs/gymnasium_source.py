@@ -1,4 +1,4 @@
-"""Environments of Gymnasium's, or of anybody's who registers with it, as worlds."""
+"""Gymnasium environments, built-in or registered by other packages, as env sources."""
 
 import contextlib
 import functools
@@ -11,29 +11,29 @@ from typing import Any
 import gymnasium
 from gymnasium import spaces
 
-from codrl_mj.envs.worlds import EnvSource
+from codrl_mj.envs.sources import EnvSource
 from codrl_mj.user_code import load_module
 
 _ID = re.compile(r"(?:[\w.]+:)?(?:[\w-]+/)?[\w.-]+-v\d+")
 
 
 class GymnasiumEnvSource(EnvSource):
-    """The world of one environment of Gymnasium's registry."""
+    """Env source of one environment in Gymnasium's registry."""
 
     def __init__(self, name: str) -> None:
-        """Take its id, such as `HalfCheetah-v5`; of `module:ID` the module is imported first."""
+        """Take an id such as `HalfCheetah-v5`; `module:ID` imports the module first."""
         self.name = name
         if ":" in name:
             load_module(name)
 
     @property
     def reference(self) -> str:
-        """The id."""
+        """Id of the environment."""
         return self.name
 
     @property
     def spec(self) -> gymnasium.envs.registration.EnvSpec:
-        """What Gymnasium knows of it."""
+        """Specification in Gymnasium's registry."""
         try:
             return gymnasium.spec(self.name.rpartition(":")[2])
         except (gymnasium.error.Error, ModuleNotFoundError) as error:
@@ -44,11 +44,11 @@ class GymnasiumEnvSource(EnvSource):
 
     @property
     def time_limit(self) -> int | None:  # type: ignore[override]
-        """That which it was registered with."""
+        """Time limit of the registration [environment steps]; None if there is none."""
         return self.spec.max_episode_steps
 
     def code(self, options: Any) -> set[str | Path]:
-        """Modules of what makes it, and the one that registers it; files among its options."""
+        """Return modules of its class and its registration, and files among its options."""
         modules = getattr(self._creator, "__module__", ""), self.name.rpartition(":")[0]
         return super().code(options) | {name for name in modules if name}
 
@@ -60,10 +60,10 @@ class GymnasiumEnvSource(EnvSource):
         return load_env_creator(entry) if isinstance(entry, str) else entry
 
     def make(self, config: Any, **view: Any) -> Any:
-        """An environment.
+        """Make an environment.
 
         Raises:
-            ValueError: see `codrl_mj.make`; or its episodes need not end.
+            ValueError: see `codrl_mj.make`; or its episodes may never end.
         """
         from codrl_mj.external_envs.environments import make
 
@@ -73,40 +73,41 @@ class GymnasiumEnvSource(EnvSource):
                 " its episodes might never end: give one, in environment steps"
             )
         arguments = {**config.as_arguments(), "disable_env_checker": True, **view}
-        with self._explaining(config):
+        with self._with_name_in_errors(config):
             return make(self.spec.id, arguments.pop("actuator"), **arguments)
 
     def action_space(self, config: Any) -> "spaces.Space[Any]":
-        """Its own actions."""
-        with self._explaining(config):
+        """Return the action space of the environment without motors."""
+        with self._with_name_in_errors(config):
             return _action_space(self.spec.id, json.dumps(config.options))
 
     @contextlib.contextmanager
-    def _explaining(self, config: Any) -> Iterator[None]:
-        """Say whose it is that does not go together in the block."""
+    def _with_name_in_errors(self, config: Any) -> Iterator[None]:
+        """Put the environment's name, or its options, in front of errors in a `with` block."""
         try:
             yield
         except (TypeError, ValueError) as error:
-            asked = isinstance(error, TypeError) and config.options
-            whose = (
+            is_option_error = isinstance(error, TypeError) and config.options
+            subject = (
                 f"options = {config.options!r}: {self.name} does not take them"
-                if asked
+                if is_option_error
                 else self.name
             )
-            raise ValueError(f"{whose}: {error}") from error
+            raise ValueError(f"{subject}: {error}") from error
 
     def view(self, config: Any, width: int, height: int, camera: str | None) -> dict[str, Any]:
-        """In that size [px] and by that camera where Gymnasium's `MujocoEnv` draws them."""
+        """Return arguments for this size [px] and camera if it is a `MujocoEnv` of Gymnasium's."""
         from gymnasium.envs.mujoco import MujocoEnv
 
         if not (isinstance(self._creator, type) and issubclass(self._creator, MujocoEnv)):
             return super().view(config, width, height, camera)  # type: ignore[return-value]
-        chosen = {} if camera is None else {"camera_name": camera}
-        return {"render_mode": "rgb_array", "width": width, "height": height, **chosen}
+        camera_argument = {} if camera is None else {"camera_name": camera}
+        return {"render_mode": "rgb_array", "width": width, "height": height, **camera_argument}
 
 
 @functools.cache
 def _action_space(env_id: str, options: str) -> "spaces.Space[Any]":
+    """Return the action space of an id; options are JSON text, to be hashable for the cache."""
     env = gymnasium.make(env_id, disable_env_checker=True, **json.loads(options))
     space = env.action_space
     env.close()
@@ -114,9 +115,9 @@ def _action_space(env_id: str, options: str) -> "spaces.Space[Any]":
 
 
 def claims(name: str) -> bool:
-    """Whether a name is that of an environment of somebody else's: `HalfCheetah-v5`, `package/Robot-v0`."""
+    """Return True if a name is a third-party id: `HalfCheetah-v5`, `package/Robot-v0`."""
     return _ID.fullmatch(name) is not None
 
 
 find = functools.cache(GymnasiumEnvSource)
-"""The world of an id."""
+"""Function that returns the source of an id; an id is always the same object."""
