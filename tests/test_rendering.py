@@ -20,7 +20,7 @@ from codrl_mj.physics.mjcf import task_model
 from codrl_mj.physics.offscreen import OffscreenRenderer
 from codrl_mj.tasks import TASKS, named_actuator
 from codrl_mj.user_code import asset_path
-from codrl_mj.viz.films.film import Filmed, Panel, film
+from codrl_mj.viz.films.film import FrameRecorder, Panel, film
 from codrl_mj.viz.films.strip import torque_label
 
 WIDTH, HEIGHT = 200, 120
@@ -370,4 +370,4 @@ def test_an_environment_that_does_not_render_images_is_refused_before_its_episod
         contextlib.closing(EnvConfig("pendulum").make()) as env,
         pytest.raises(ValueError, match="'rgb_array' for a film"),
     ):
-        Filmed(env)
+        FrameRecorder(env)

@@ -125,6 +125,8 @@ def main(arguments: list[str] | None = None) -> int:
     with warnings.catch_warnings(), _engine_warnings():
         warnings.showwarning = _show_warning
         words = [word for word in command_line if word != "--traceback"]
+        # `FILES_TRUSTED` is a context variable: a copy of the context keeps it from callers of
+        # `main`.
         return contextvars.copy_context().run(_run, words, "--traceback" in command_line)
 
 
@@ -191,6 +193,7 @@ def _run_verb(verb: Any) -> int:
     if not getattr(verb, "as_json", False):
         result = verb.run()
         return int(result[0] if isinstance(result, tuple) else result)
+    # Tables that the verb prints for people are discarded.
     with contextlib.redirect_stdout(io.StringIO()):
         status, content = verb.run()
     print(json.dumps(_to_json_value(content), indent=2, allow_nan=False))

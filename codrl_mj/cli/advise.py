@@ -82,7 +82,7 @@ class Advise:
         is_studied = self.task in REFERENCE_SPEEDS
         if not is_studied and self.measure is None:
             raise ValueError(
-                f"TASK = {self.task!r}: {did_you_mean(self.task, REFERENCE_SPEEDS)}The study has"
+                f"TASK = {self.task!r}: {did_you_mean(self.task, REFERENCE_SPEEDS)}The study covers"
                 f" {', '.join(REFERENCE_SPEEDS)}; for other tasks and for runs, train and test with"
                 " --measure 5"
             )

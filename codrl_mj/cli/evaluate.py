@@ -122,6 +122,7 @@ def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = Tru
                 _MOTOR_COLUMNS,
             )
     names = list(evaluations)
+    # Three columns of evaluations fit into 80 characters.
     for begin in range(0, len(names), 3):
         _print_details({name: evaluations[name] for name in names[begin : begin + 3]})
 

@@ -412,7 +412,7 @@ class New:
 
 def save_plot(figure: Any, path: Path) -> None:
     """Write a figure to a PNG file and print its path."""
-    from codrl_mj.viz.pages.plots import save
+    from codrl_mj.viz.pages.plots import save_png
 
-    save(figure, path)
+    save_png(figure, path)
     print(f"wrote {path}")

@@ -396,6 +396,8 @@ def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
     from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
     radius, entry = drive.motor.arm_radius, find_entry(name)
+    # The demand is at the joint. Dividing speeds and multiplying torques by the arm radius refers
+    # it to the gear's output.
     torque = radius * (demand.torque + drive.additions.armature * demand.acceleration)
     points = np.column_stack([demand.speed / radius, torque])
     save_plot(torque_speed_diagram(drive, None if entry is None else entry.numbers, points), path)

@@ -123,8 +123,8 @@ class Train:
 
     Example: codrl-mj train cartpole --actuator weaker --env.center-radius 0.1 --out
     runs/through-weaker, and after an interruption codrl-mj train --resume runs/through-weaker.
-    Third-party environments have their Gymnasium ids: codrl-mj train HalfCheetah-v5 --actuators
-    'b.*=maxon-ec45-flat-50w' 'f.*=lag'
+    Other environments go by their Gymnasium ids: codrl-mj train HalfCheetah-v5
+    --actuators 'b.*=maxon-ec45-flat-50w' 'f.*=lag'
     """
 
     config: Path | None = None
@@ -270,6 +270,8 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
         finished = threading.Event()
 
         def update_bars() -> None:
+            # The thread reads the progress files instead of being called by the training, so that
+            # it also shows trainings of other processes.
             while not finished.wait(0.2):
                 show()
 
@@ -279,6 +281,7 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
             yield
         finally:
             finished.set()
+            # One last update shows the final numbers.
             thread.join()
             show()
 

@@ -10,7 +10,7 @@ from codrl_mj.sizing import find_drive, find_entry
 from codrl_mj.viz.pages import page as builder
 from codrl_mj.viz.pages.motor import motor_page
 from codrl_mj.viz.pages.plots import Curve, Plot
-from codrl_mj.viz.pages.report import replays, report
+from codrl_mj.viz.pages.report import replay_parts, report
 from tests.browser.waiting import until
 
 pytestmark = pytest.mark.browser
@@ -22,13 +22,13 @@ AXE = Path(__file__).parents[2] / "node_modules" / "axe-core" / "axe.min.js"
 def pages(tmp_path_factory):
     """A report with something that joins its clock, one of two runs, a motor's page, and names with markup."""
     folder = tmp_path_factory.mktemp("pages")
-    joined = builder.clocked(
+    joined = builder.clocked_part(
         "a replay",
         '<button id="scrub" type="button">scrub</button> <span id="at"></span>',
         """element.querySelector("#scrub").addEventListener("click", () => seek(1.5));
         function setTime(time) { element.querySelector("#at").textContent = time.toFixed(2); }""",
     )
-    report([RUN], folder / "report.html", joined=lambda shown: (*replays(shown), joined))
+    report([RUN], folder / "report.html", extra_parts=lambda shown: (*replay_parts(shown), joined))
     report([RUN, RUN.parent / "cartpole"], folder / "two.html")
     motor_page(
         "qube",

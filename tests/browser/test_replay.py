@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from codrl_mj.viz.replay import SCRIPT, library, motion, replay, write_replay
+from codrl_mj.viz.replay import SCRIPT, library_script, motion, replay_html, write_replay
 from tests.browser.waiting import until
 from tests.viz.replay.test_motion import ARM, positions
 
@@ -27,7 +27,7 @@ def page_file(what, tmp_path_factory):
 
 CLOCKED = """<!DOCTYPE html><title>report</title><link rel="icon" href="data:,">
 <div id="one">{part}</div><div id="other">{part}</div>
-<script>{library}</script>
+<script>{library_script}</script>
 <script>
 const clocks = ["one", "other"].map((id) => {{
   const element = document.getElementById(id), seek = () => {{}};
@@ -132,9 +132,9 @@ def test_it_fits_laptop_and_phone_light_and_dark(page_file, opened, width, schem
 
 
 def test_a_part_of_another_page_follows_its_clock(what, tmp_path, opened):
-    part = replay(what, "arm")
+    part = replay_html(what, "arm")
     path = tmp_path / "report.html"
-    path.write_text(CLOCKED.format(part=part, library=library(), script=SCRIPT))
+    path.write_text(CLOCKED.format(part=part, library_script=library_script(), script=SCRIPT))
     page = opened(path.as_uri())
     for index in (30, 5):
         page.evaluate(f"setAll({float(what.time[index])!r})")

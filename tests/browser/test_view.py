@@ -43,10 +43,15 @@ def shown(browser, page):
 def test_it_simulates_in_real_time_and_is_paused_stepped_and_reset(browser, opened):
     page = opened(browser.url)
     shown(browser, page)
-    until(page, lambda: browser._real == pytest.approx(1.0, abs=0.2) and browser.session.time > 0)
+    until(
+        page,
+        lambda: (
+            browser._real_time_factor == pytest.approx(1.0, abs=0.2) and browser.session.time > 0
+        ),
+    )
     page.get_by_role("button", name="Play or pause").click()
     page.wait_for_selector("text=paused")
-    browser.session.again = (
+    browser.session.auto_reset = (
         False  # an episode that has just ended would begin anew with the next step
     )
     time = browser.session.time
@@ -57,7 +62,7 @@ def test_it_simulates_in_real_time_and_is_paused_stepped_and_reset(browser, open
             browser.session.time == pytest.approx(time + browser.session.recorder.step_duration)
         ),
     )
-    browser.session.again = True
+    browser.session.auto_reset = True
     page.get_by_role("button", name="Reset").click()
     page.wait_for_selector("text=0.00 s")
     page.get_by_role("button", name="Play or pause").click()
@@ -120,7 +125,7 @@ def test_another_policy_acts(browser, opened):
     shown(browser, page)
     page.get_by_label("policy").click()
     page.get_by_role("option", name="zero").click()
-    until(page, lambda: browser.session.chosen == "zero")
+    until(page, lambda: browser.session.policy_name == "zero")
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])

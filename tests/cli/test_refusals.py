@@ -30,7 +30,7 @@ REFUSED = [
         "train pendulm --agent sac",
         "'pendulm': did you mean 'pendulum'? It can be module:NAME of your own",
     ),
-    ("train pendulm", "Gymnasium's goes by its id, such as HalfCheetah-v5"),
+    ("train pendulm", "for an environment of Gymnasium give its id, such as HalfCheetah-v5"),
     ("render pendulm", "no run configuration at pendulm/config.json: did you mean 'pendulum'?"),
     (
         "train CartPole-v1",
@@ -87,7 +87,7 @@ REFUSED = [
     ("render cartpole --out film.avi", "unknown format '.avi'"),
     ("render furuta --trajectory a.csv", "the suffix is '.csv', must be .npz"),
     ("replay furuta --out a.mp4", "the suffix is '.mp4', must be .html"),
-    ("advise re25 Hopper-v5", "knows pendulum, cartpole"),
+    ("advise re25 Hopper-v5", "The study covers pendulum, cartpole"),
     ("advise re25 Hopper-v5", "--measure 5"),
     *(
         (f"{verb} RUN {flag}{value}", f"{text}{flag}{end}")
@@ -209,7 +209,7 @@ def test_what_is_stopped_exits_with_130_and_leaves_nothing(
 ):
     monkeypatch.setattr(f"codrl_mj.{function}", how)
     assert main(line.split()) == 130
-    assert capsys.readouterr().err == "codrl-mj: stopped: the same command begins anew\n"
+    assert capsys.readouterr().err == "codrl-mj: stopped: the same command starts from the beginning\n"
     assert list(tmp_path.iterdir()) == []
 
 

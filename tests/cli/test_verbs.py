@@ -329,10 +329,10 @@ def test_draws_of_the_training_over_another_actuator_are_said(capsys):
     ran(f"train cartpole --env.randomize motor.inductance=uniform(0.09,0.11) {flags} --out drawn")
     capsys.readouterr()
     ran("evaluate drawn --episodes 1 --actuator weak")
-    assert "motor.inductance of weak are drawn as in the training" in capsys.readouterr().err
+    assert "motor.inductance of weak are drawn from the ranges of the training" in capsys.readouterr().err
     ran("evaluate drawn --episodes 1 --actuator weak --env.randomize None")
     ran("evaluate drawn --episodes 1")
-    assert "drawn as in" not in capsys.readouterr().err
+    assert "are drawn from" not in capsys.readouterr().err
 
 
 def test_training_says_first_what_is_assumed_of_the_motor(capsys, monkeypatch):

@@ -364,7 +364,7 @@ def test_a_run_is_exported_as_it_was_trained(tmp_path, capsys):
     assert main(line.split()) == 0
     for flags, names in {"--actuator ideal": "actuator", "--env.action voltage": "action"}.items():
         assert main(["export", "run", *flags.split()]) == 2
-        assert f"{names}: run says what it was trained in" in capsys.readouterr().err.replace(
+        assert f"{names}: the environment that run was trained in" in capsys.readouterr().err.replace(
             "actuator.controller", ""
         )
     assert main(["export", "run", "--episodes", "1"]) == 0

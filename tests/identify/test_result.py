@@ -182,7 +182,7 @@ def test_the_command_line_identifies_and_draws_within_the_intervals(tmp_path, ca
     line, out = f"identify {log} --columns {columns} --known", tmp_path / "motor"
     assert main(f"{line} {known} --out {out} --holdout {wrong}".split()) == 0
     shown = capsys.readouterr().out
-    assert "wrong, which is held out, has errors, and is left out" in shown
+    assert "the held-out log wrong has errors and is left out" in shown
     assert "supply 3 V: the largest of the logs" in shown
     assert "resistance" in shown
     assert "identified" in shown

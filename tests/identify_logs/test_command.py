@@ -59,7 +59,7 @@ def test_errors_are_an_exit_status_and_json(capsys):
 def test_columns_are_proposed_with_the_line_to_type_next(capsys):
     said(capsys, QUBE)
     text = said(capsys, "columns log.csv")
-    assert "to be checked: current: no unit is stated: replace UNIT by A or mA" in text
+    assert "please check: current: no unit is stated: replace UNIT by A or mA" in text
     line = text.splitlines()[-1].removeprefix("codrl-mj identify ")
     assert "current=current:UNIT" in line
     assert line.endswith("--rig free --known load_inertia=0 --out motor")
@@ -80,7 +80,7 @@ def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path, monkeypa
     monkeypatch.setattr("codrl_mj.identify.plan.RATES", (1e3, 5e3))
     text = said(capsys, "plan maxon-ec45-flat-50w --inertia 1e-4 --duration 1 --out plan")
     assert "* play prbs" in text
-    assert "viscous_friction: 0 on the datasheet" in text
+    assert "viscous_friction, which the datasheet gives as 0" in text
     assert (tmp_path / "plan" / "excitation.csv").read_text().startswith("time,voltage\n")
     found = json.loads(said(capsys, "plan maxon-ec45-flat-50w --inertia 1e-4 --duration 1 --json"))
     assert found["best"]["excitation"]["kind"] == "prbs"

@@ -205,7 +205,7 @@ def test_other_software_is_named_and_can_be_accepted(capsys, changes, expected):
 def test_a_finished_run_is_left_alone(capsys):
     before = files()
     do("train --resume run")
-    assert "run is finished already" in capsys.readouterr().out
+    assert "run is already finished" in capsys.readouterr().out
     assert files() == before
 
 

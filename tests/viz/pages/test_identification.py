@@ -73,7 +73,7 @@ def test_the_page_has_fits_statuses_and_advice(found, tmp_path):
         "too wide, <b>",
         "coulomb friction is refused: pass standstill often",
         "viscous friction is rough: hold several speeds",
-        "3 of 4 numbers can be relied on",
+        "3 of 4 parameters are reliable",
         "beware & see",
     ):
         assert said in parsed.text

@@ -9,7 +9,7 @@ import numpy as np
 from codrl_mj.actuators import CurrentLoop, DCMotorActuator, Inputs, Motor, Supply, parameters_type
 from codrl_mj.cli import main
 from codrl_mj.sizing import abilities, explain, find_drive
-from codrl_mj.viz.pages.diagrams import limits, no_load_speed, torque_speed_diagram
+from codrl_mj.viz.pages.diagrams import no_load_speed, torque_range, torque_speed_diagram
 from codrl_mj.viz.pages.motor import _abilities
 from tests.viz.pages.parsed import check_alone
 
@@ -45,7 +45,7 @@ def test_the_diagram_goes_through_stall_and_no_load():
 def test_limits_before_friction_end_at_the_no_load_speed():
     """kT*(V - kE*w)/R is 0 at V/kE."""
     drive = find_drive("quanser-qube-servo-2", max_current=float("inf"))
-    low, high = limits(drive, np.array([0.0, no_load_speed(drive)]))
+    low, high = torque_range(drive, np.array([0.0, no_load_speed(drive)]))
     motor = drive.motor
     assert high[0] == np.float64(motor.torque_constant * drive.voltage_limit / motor.resistance)
     assert abs(high[1]) < 1e-12
@@ -73,4 +73,4 @@ def test_limits_behind_a_supply_are_where_the_motor_settles():
                     parameters, 1e-3, state, Inputs(asked, 0.0, speed, 0.0, 0.0)
                 )
             settled.append(torque)
-        np.testing.assert_allclose(np.ravel(limits(actuator, speeds)), settled, rtol=1e-6)
+        np.testing.assert_allclose(np.ravel(torque_range(actuator, speeds)), settled, rtol=1e-6)

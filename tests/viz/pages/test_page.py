@@ -14,28 +14,32 @@ EVIL = "<img src=http://there/x onerror='x()'> & \"y\""
 
 
 def small(*parts, title="t"):
-    return page.page(title, "k", Markup(""), [page.Section("s", "S", page.joined(parts))])
+    return page.page(title, "k", Markup(""), [page.Section("s", "S", page.join(parts))])
 
 
 def test_names_with_markup_show_as_text_everywhere():
     plot = Plot(EVIL, EVIL, EVIL, (Curve(EVIL, np.arange(3.0), np.arange(3.0)),), clock=True)
     parts = [kind(EVIL) for kind in (page.paragraph, page.note, page.heading)]
     parts += [
-        page.judged(True, EVIL, "p", "verdict"),
+        page.mark_verdict(True, EVIL, "p", "verdict"),
         page.plot(plot),
         page.definitions([(EVIL, EVIL)]),
     ]
     parts += [
-        page.folded(EVIL, page.paragraph("p")),
+        page.details(EVIL, page.paragraph("p")),
         page.table(EVIL, (EVIL, "b"), [(EVIL, EVIL)], cards=True),
     ]
     parts += [
-        page.part("selector", EVIL, "run", [EVIL], None),
-        page.part("film", EVIL, b"film", 20.0, None),
+        page.render_part("selector", EVIL, "run", [EVIL], None),
+        page.render_part("film", EVIL, b"film", 20.0, None),
     ]
-    parts += [page.part("image", b"image", EVIL), page.part("transport", "1", "0.1"), EVIL]
+    parts += [
+        page.render_part("image", b"image", EVIL),
+        page.render_part("transport", "1", "0.1"),
+        EVIL,
+    ]
     text = page.page(
-        EVIL, EVIL, page.paragraph(EVIL), [page.Section("s", EVIL, page.joined(parts), EVIL)]
+        EVIL, EVIL, page.paragraph(EVIL), [page.Section("s", EVIL, page.join(parts), EVIL)]
     )
     parsed = check_alone(text)
     assert "<img src=http" not in text
@@ -45,8 +49,8 @@ def test_names_with_markup_show_as_text_everywhere():
 
 def test_a_page_has_what_it_was_given_and_its_licence():
     text = small(
-        page.part("film", "a film", b"bytes of a film", 25.0, b"poster"),
-        page.part("image", b"picture", "about"),
+        page.render_part("film", "a film", b"bytes of a film", 25.0, b"poster"),
+        page.render_part("image", b"picture", "about"),
     )
     check_alone(text)
     for content in (b"bytes of a film", b"poster", b"picture"):
@@ -80,7 +84,7 @@ def test_tables_have_captions_and_headings():
 
 
 def test_what_joins_the_clock_stands_as_it_is():
-    part = page.clocked(
+    part = page.clocked_part(
         "a replay", "<canvas></canvas>", "function setTime(t) { element.title = t; }"
     )
     assert "<canvas></canvas>" in part
@@ -103,4 +107,4 @@ def test_a_page_is_written_as_html_alone(tmp_path):
      (float("inf"), "∞"), (3, "3"), ("V", "V")],
 )  # fmt: skip
 def test_numbers_are_short(value, text):
-    assert page.number(value) == text
+    assert page.format_number(value) == text

@@ -22,12 +22,12 @@ from codrl_mj.sizing import find_drive
 from codrl_mj.training import load_config
 from codrl_mj.viz.pages import episode as episodes
 from codrl_mj.viz.pages import report as reports
-from codrl_mj.viz.pages.diagrams import held_step
-from codrl_mj.viz.pages.episode import Shown, episode_section, show
+from codrl_mj.viz.pages.diagrams import torque_step_plot
+from codrl_mj.viz.pages.episode import RunEpisode, episode_section, run_and_film
 from codrl_mj.viz.pages.report import report
 from tests.viz.pages.parsed import Parsed, check_alone
 
-RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
+RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 PENDULUM = RUNS / "pendulum"
 MEDIAN = 1_000_001
 """Seed of the lower of the two returns of its evaluation, of the seeds 1000000 and 1000001."""
@@ -91,17 +91,17 @@ def test_the_papers_current_loop_has_its_margins_and_its_step(text):
 
 def test_it_says_which_loops_it_leaves_out_and_why_there_is_none():
     def run(actuators):
-        return Shown("run", SimpleNamespace(driven=actuators), None, None, None, 0)
+        return RunEpisode("run", SimpleNamespace(driven=actuators), None, None, None, 0)
 
     drives = {
         f"m{place}": find_drive("maxon-dcx22l", bandwidth=300.0 + place) for place in range(6)
     }
-    assert "The first 4 of 6 different loops are shown; not those of m4, m5" in str(
+    assert "Only the first 4 of 6 different loops are shown, without those of m4, m5" in str(
         reports._loop([run(drives)])
     )
     said = str(reports._loop([run({"lag": Lag(time_constant=0.1)})]))
     assert "lag: The delivered torque follows the desired one with a time constant" in said
-    assert "There is no current loop in it." in said
+    assert "It has no current loop." in said
     assert "m: assumed, for none is given: supply.voltage = 24 V" in str(
         reports._loop([run({"m": Drive()})])
     )
@@ -116,7 +116,7 @@ def run(tmp_path):
 def of(*runs, **options):
     """The page of runs, read."""
     return check_alone(
-        report(runs, runs[-1].with_name("r.html"), filmed=False, **options).read_text()
+        report(runs, runs[-1].with_name("r.html"), with_film=False, **options).read_text()
     )
 
 
@@ -208,7 +208,7 @@ def test_several_runs_stand_side_by_side(run):
         "checks": checks,
     }
     (run / "certificate.json").write_text(json.dumps(certificate))
-    text = report([PENDULUM, run], run.with_name("r.html"), filmed=False).read_text()
+    text = report([PENDULUM, run], run.with_name("r.html"), with_film=False).read_text()
     parsed = check_alone(text)
     assert {"pendulum: actual", "a<b> & run: actual"} <= curves(text, "Torque at the shaft").keys()
     assert text.count('name="show-run"') == 2
@@ -234,7 +234,7 @@ def test_several_motors_can_be_chosen():
     }
     arrays |= {"first_speeds": np.repeat(one.first_speeds, 2)}
     two = dataclasses.replace(one, actuator=(one.actuator,) * 2, motors=("left", "right"), **arrays)
-    section = str(episode_section([Shown("arm", env, two, None, "none was asked for", 0)]))
+    section = str(episode_section([RunEpisode("arm", env, two, None, "none was asked for", 0)]))
     assert motors_of(section) == [
         (f"{side}: {what}", f"motor:{place}")
         for place, side in enumerate(two.motors)
@@ -247,7 +247,8 @@ def test_several_motors_can_be_chosen():
 def test_an_ideal_actuator_beside_a_motor_has_a_force():
     envs = (EnvConfig("pendulum", name, max_episode_steps=2) for name in ("weak", "ideal"))
     shown = [
-        show(env.actuator.family, env, RandomPolicy("pendulum"), 0, filmed=False) for env in envs
+        run_and_film(env.actuator.family, env, RandomPolicy("pendulum"), 0, with_film=False)
+        for env in envs
     ]
     labels = {one["title"]: one["y"]["label"] for one in Parsed(str(episode_section(shown))).data}
     assert labels["Torque at the shaft"] == "torque [N·m], of the ideal actuator force [N]"
@@ -260,7 +261,9 @@ def test_a_plot_is_shaded_where_its_own_limit_is_met():
     drive = dataclasses.replace(geared, controller=SampledLoop(max_current=0.1))
     env = EnvConfig("pendulum", drive, max_episode_steps=10)
     section = str(
-        episode_section([show("limited", env, RandomPolicy("pendulum"), 0, filmed=False)])
+        episode_section(
+            [run_and_film("limited", env, RandomPolicy("pendulum"), 0, with_film=False)]
+        )
     )
     met = {
         one["title"]: {
@@ -293,7 +296,7 @@ def test_states_of_every_kind_of_joint_have_units(monkeypatch):
 def test_a_step_is_at_each_actuators_own_steps():
     """The oracle: a lag that is exact between its steps approaches 1 as 1 - exp(-t/T)."""
     lag = Lag(time_constant=0.05)
-    plot = held_step({"slow": (lag, 2.0, 0.02), "fast": (lag, 1.0, 0.01)})
+    plot = torque_step_plot({"slow": (lag, 2.0, 0.02), "fast": (lag, 1.0, 0.01)})
     slow, fast, asked = plot.curves
     for curve, step in ((slow, 0.02), (fast, 0.01)):
         assert f"steps of {1e3 * step:g} ms" in curve.label
@@ -307,7 +310,7 @@ def test_motors_of_somebody_elses_robot_are_filmed():
     env = EnvConfig(
         "Reacher-v5", {"joint0": "maxon-ec45-flat-50w", "joint1": "quanser-qube-servo-2"}
     )
-    shown = show("reacher", env, RandomPolicy(env.make().action_space), 0)
+    shown = run_and_film("reacher", env, RandomPolicy(env.make().action_space), 0)
     assert shown.problem is None
     assert 1.0 / shown.episode.time[0] == pytest.approx(50.0)
     assert shown.film.rate == pytest.approx(

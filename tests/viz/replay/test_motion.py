@@ -6,7 +6,7 @@ import pytest
 
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.viz.replay import motion
-from codrl_mj.viz.replay.scene import mesh, shapes, thinned
+from codrl_mj.viz.replay.scene import read_mesh, simplify_mesh, visible_shapes
 
 ARM = """
 <mujoco>
@@ -87,7 +87,9 @@ def test_only_as_many_instants_are_kept_as_are_needed_and_the_last(arm):
 
 def test_shapes_are_what_mujoco_shows(arm):
     found = {
-        arm.geom(one.geom).name or str(one.geom): one for one in shapes(arm) if one.geom is not None
+        arm.geom(one.geom).name or str(one.geom): one
+        for one in visible_shapes(arm)
+        if one.geom is not None
     }
     assert "hidden" not in found
     assert found["floor"].colour == pytest.approx(
@@ -98,11 +100,13 @@ def test_shapes_are_what_mujoco_shows(arm):
     capsule = next(one for one in found.values() if one.kind == "capsule")
     assert capsule.colour == (1, 0, 0, 1)
     assert capsule.size[:2] == pytest.approx((0.05, 0.25))  # half of |(.3, 0, .4)|
-    assert [one.kind for one in shapes(arm) if one.geom is None] == ["ellipsoid"]  # the site
+    assert [one.kind for one in visible_shapes(arm) if one.geom is None] == [
+        "ellipsoid"
+    ]  # the site
 
 
 def test_a_height_field_is_as_high_as_it_says(arm):
-    vertices, triangles = mesh(arm, "hfield", 0)
+    vertices, triangles = read_mesh(arm, "hfield", 0)
     np.testing.assert_allclose(vertices.min(axis=0), [-3, -2, 0])
     np.testing.assert_allclose(vertices.max(axis=0), [3, 2, 5])
     assert len(triangles) == 2 * 2 * 1
@@ -150,7 +154,7 @@ def test_a_thinned_mesh_is_the_same_shape():
             np.stack([beside, beside + 400, corner + 400], 2),
         ]
     ).reshape(-1, 3)
-    few, corners = thinned(vertices, triangles, 4000)
+    few, corners = simplify_mesh(vertices, triangles, 4000)
     assert 1500 < len(corners) <= 4000
     assert corners.max() < len(few)
     np.testing.assert_allclose(np.linalg.norm(few, axis=1), 1.0, atol=0.01)
@@ -158,7 +162,7 @@ def test_a_thinned_mesh_is_the_same_shape():
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(
         4 * np.pi, rel=0.05
     )
-    assert thinned(vertices, triangles, len(triangles))[1] is triangles
+    assert simplify_mesh(vertices, triangles, len(triangles))[1] is triangles
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.cli import main
-from codrl_mj.viz.replay import motion, replay, write_replay
+from codrl_mj.viz.replay import motion, replay_html, write_replay
 from tests.viz.pages.parsed import Parsed, check_alone
 from tests.viz.replay.test_motion import ARM, positions
 
@@ -58,7 +58,7 @@ def test_names_stand_as_text(page):
     model = mujoco.MjModel.from_xml_string(
         ARM.replace('name="ball"', 'name="&lt;/script&gt;&lt;i&gt;"')
     )
-    part = replay(motion(model, positions(model, 3), np.arange(3.0)), '"><i>')
+    part = replay_html(motion(model, positions(model, 3), np.arange(3.0)), '"><i>')
     assert "</script><i>" in content(part)["bodies"]
     assert re.search(r"<i[ >]", part) is None
 

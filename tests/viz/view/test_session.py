@@ -24,7 +24,7 @@ def session(motor=MOTOR, policies=(), **arguments):
         dict(policies),
     )
     made.choose("zero")
-    made.again = False
+    made.auto_reset = False
     return made
 
 
@@ -36,7 +36,7 @@ def motors_added():
 @pytest.mark.parametrize("again", [True, False])
 def test_at_the_time_limit_it_says_so_and_begins_anew_or_goes_on(again):
     made = session("ideal", max_episode_steps=3)
-    made.again = again
+    made.auto_reset = again
     said = [made.step() and made.ended for _ in range(4)]
     assert said[:3] == ["", "", "past the time limit"]
     assert made.time == pytest.approx((1 if again else 4) * made.recorder.step_duration)
@@ -75,7 +75,7 @@ def test_a_setting_goes_into_the_simulation_and_the_motion_goes_on(motors_added)
     motors_added.step()
     before = motors_added.data.qpos.copy(), motors_added.data.qvel.copy()
     motors_added.set_actuator(".*", ("supply", "voltage"), 7.0)
-    assert not motors_added.waits
+    assert not motors_added.is_stopped
     np.testing.assert_array_equal((motors_added.data.qpos, motors_added.data.qvel), before)
     motors_added.choose("random")
     for _ in range(20):
@@ -113,9 +113,9 @@ def test_a_simulation_that_left_the_numbers_waits_for_a_reset_or_another_setting
     assert made.step()
     made.data.qvel[:] = np.nan
     assert not made.step()
-    assert made.waits
+    assert made.is_stopped
     anew(made)
-    assert not made.waits
+    assert not made.is_stopped
     assert (made.time, made.total) == (0.0, 0.0)
     np.testing.assert_array_equal(made.observation, np.append(made.data.qpos, made.data.qvel))
     assert made.step()
@@ -143,7 +143,7 @@ def test_a_policy_for_another_environment_is_refused(motors_added):
     motors_added.policies["wide"] = Wide
     with pytest.raises(ValueError, match="policy wide: its actions"):
         motors_added.choose("wide")
-    assert motors_added.chosen == "zero"
+    assert motors_added.policy_name == "zero"
 
 
 def test_controls_are_the_fields_with_their_bounds_and_units(motors_added):
@@ -163,14 +163,14 @@ def test_controls_are_the_fields_with_their_bounds_and_units(motors_added):
             (one.low, one.high) if None not in (one.low, one.high) else ()
         ):  # both can be set
             holds, *_ = fields[path[-1]].metadata["bound"]
-            assert holds(type(one.value)(one.parsed(end))), path
+            assert holds(type(one.value)(one.from_slider(end))), path
 
 
 def test_an_endless_voltage_ends_at_the_end_of_its_slider():
     voltage = {one.path: one for one in controls(DCMotorActuator(), 48.0)}["supply", "voltage"]
     assert voltage.high == 48.0
-    assert voltage.parsed(48.0) == np.inf
-    assert voltage.parsed(12.0) == 12.0
+    assert voltage.from_slider(48.0) == np.inf
+    assert voltage.from_slider(12.0) == 12.0
     assert ("supply", "voltage") not in [one.path for one in controls(DCMotorActuator())]
 
 
@@ -206,7 +206,7 @@ def test_a_ctrl_c_waits_for_the_end_of_a_step_and_closes_the_server(monkeypatch,
 
 def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("codrl_mj.viz.view.browser.Browser", Shown)
-    run = Path(__file__).parents[1] / "fixtures" / "runs" / "cartpole"
+    run = Path(__file__).parents[2] / "fixtures" / "runs" / "cartpole"
     other = shutil.copytree(run, tmp_path / "other" / "cartpole")
     assert main(["view", str(run), "--policies", str(run), str(other), "--actuator", "weaker"]) == 0
     shown = Shown.seen.pop()
@@ -217,7 +217,7 @@ def test_the_command_line_offers_the_runs_policy_and_those_of_others(monkeypatch
         "other/cartpole",
         "random",
     ]  # none of its actions does nothing
-    assert (list(shown.session.policies), shown.session.chosen) == (names, "last")
+    assert (list(shown.session.policies), shown.session.policy_name) == (names, "last")
     shown.session.choose("other/cartpole")
     assert shown.session.step()
     assert (
