@@ -51,7 +51,7 @@ from tests.tasks.faces import REBUILT
 from tests.validation.test_convergence_checks import RATE, ideal, with_motor
 from tests.validation.test_energy_checks import STEPS, orders
 from tests.validation.test_motor_checks import EVERY
-from tests.viz.pages.parsed import Parsed, check_alone
+from tests.viz.pages.parsed import ParsedPage, check_self_contained
 
 OWN = ("dynamics", "trajectories", "execution")
 
@@ -720,7 +720,7 @@ SAMPLE = Certificate(
 @pytest.mark.matrix
 def test_the_page_is_well_formed_self_contained_and_has_everything(certificate, caught):
     text = page.html(certificate, caught)
-    parsed = check_alone(text)
+    parsed = check_self_contained(text)
     assert set(GROUPS) <= set(parsed.ids)
     words = parsed.text
     for check in certificate.checks:
@@ -734,7 +734,7 @@ def test_the_page_is_well_formed_self_contained_and_has_everything(certificate, 
 
 
 def test_a_failure_is_on_top_and_not_by_colour_alone():
-    words = Parsed(page.html(SAMPLE)).text
+    words = ParsedPage(page.html(SAMPLE)).text
     assert words.index("✗ 1 of 2 checks FAILED") < words.index("Checks of ")
     assert "b <i>" in words
     assert "x < y & z" in words
