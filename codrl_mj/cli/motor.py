@@ -116,9 +116,7 @@ class List:
             whole=columns[:1],
             padding=(0, 0),
         )
-        print_text(
-            "at: nominal voltage. –: not on the datasheet; a missing voltage is taken as 24 V."
-        )
+        print_text("at: nominal voltage. –: not on the datasheet; the voltage is then 24 V.")
         print("codrl-mj motor show NAME gives the source of each number")
         kinds = {name: KINDS.get(OTHER_NAMES.get(name, name)) for name in rows[0]}
         units = ABILITY_UNITS | {
@@ -372,7 +370,10 @@ class Step:
         if self.out is not None:
             from codrl_mj.viz.pages import diagrams
 
-            plots = [*diagrams.small_steps({"": (drive, None)}), *diagrams.recoveries(drive, steps)]
+            plots = [
+                *diagrams.small_step_plots({"": (drive, None)}),
+                *diagrams.recovery_plots(drive, steps),
+            ]
             save_plot(plots, self.out / "step.png")
         content = {"current": amplitude, "settling_time": settled, "overshoot": small.overshoot}
         currents = {name: getattr(steps, name) for name in ("speed", "unreachable", "reachable")}

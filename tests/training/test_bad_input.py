@@ -87,7 +87,7 @@ def refused(capsys, *line):
         ("--agent.gamma 0.5 --num-envs 4", "agent.gamma: 0.99 and 0.5; num_envs: 2 and 4"),
         ("--actuator ideal", "env.actuator.motor.resistance: 1.0 and 'absent'"),
         ("--config other.yaml", "seed: 0 and 9"),
-        ("--agent dqn", "{} is a training of ppo and continues as it began"),
+        ("--agent dqn", "{} is a training of ppo and continues unchanged"),
         ("--settings paper", "leave --agent and --settings out"),
         ("--out elsewhere", "a run continues in its own folder, {}"),
     ],
@@ -149,7 +149,7 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
         ),
         ("evaluate run --task pendulum", "run was trained for cartpole"),
         ("evaluate run --agent dqn", "run was trained by ppo: leave --agent out"),
-        ("evaluate alone", "name its task with --task"),
+        ("evaluate alone", "name it with --task"),
         ("evaluate alone --task pendulum", "observation_space: the policy was trained with Box"),
         ("evaluate alone --task cartpole --which best", "leave --which out"),
         # a zip does not say what it is, and is loaded only on trust
@@ -159,7 +159,7 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
             "Pass --trust if that author is you",
         ),
         ("evaluate nowhere.zip --task cartpole --agent ppo", "no model at nowhere.zip"),
-        ("evaluate model.zip --agent ppo --trust", "name its task with --task"),
+        ("evaluate model.zip --agent ppo --trust", "name it with --task"),
         ("evaluate model.zip --task cartpole --trust", "name it with --agent"),
         ("evaluate model.zip --task cartpole --agent dqn --trust", "is not a model of dqn"),
         (
@@ -168,7 +168,7 @@ def test_what_contradicts_a_run_is_named(capsys, run, flags, expected):
         ),
         (
             "evaluate model.zip --task cartpole --which best",
-            "no run folder and holds one policy alone",
+            "no run folder and has a single policy",
         ),
     ],
 )
