@@ -17,7 +17,7 @@ from codrl_mj.actuators import Drive, GearMotor, Lag, SampledLoop, Supply, Torqu
 from codrl_mj.cli import main
 from codrl_mj.study.bench import BLOCKED, on_bench
 from codrl_mj.tasks import PAPER_TASKS, named_actuator
-from codrl_mj.viz.pages.plots import Curve, Plot, save
+from codrl_mj.viz.pages.plots import Curve, Plot, save_png
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -130,7 +130,7 @@ def actuators(out: Path) -> None:
     ]
     ideal = Curve("ideal", times, np.full_like(times, asked), reference=True, dashed=True)
     title = "4 N·m asked for, on a joint that is free to turn"
-    save(Plot(title, "time [s]", "torque at the joint [N·m]", (*curves, ideal)), out, (7.0, 3.8))
+    save_png(Plot(title, "time [s]", "torque at the joint [N·m]", (*curves, ideal)), out, (7.0, 3.8))
     smaller(out, out)
 
 
@@ -153,7 +153,7 @@ def actuators_in_numbers(out: Path) -> None:
                 Curve(name, times, np.concatenate([[0.0], torques]) / float(task.max_forces[0]))
             )
         plots.append(Plot(task.name, "time [s]", "share of the largest force", tuple(curves)))
-    save(plots, out)
+    save_png(plots, out)
     smaller(out, out)
 
 

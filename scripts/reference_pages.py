@@ -56,11 +56,11 @@ ALONE = {
     "viz.pages": (
         *(
             "report.report",
-            "report.replays",
+            "report.replay_parts",
             "motor.motor_page",
             "identification.identification_page",
         ),
-        *("certificate.write", "page.clocked"),
+        *("certificate.write", "page.clocked_part"),
     ),
     "runs": (
         *(

@@ -195,5 +195,5 @@ def test_the_message_on_an_unknown_module_keeps_its_name():
     error = ModuleNotFoundError("No module named 'nothing_such'", name="nothing_such")
     assert (
         extras.missing_module_message(error)
-        == "No module named 'nothing_such': install what provides it"
+        == "No module named 'nothing_such': install the package that provides it"
     )

@@ -1,4 +1,4 @@
-"""What the pages tell a reader to type works as it stands: Python, commands, links."""
+"""Python, commands and links of the pages work as they are printed."""
 
 import contextlib
 import csv
@@ -28,21 +28,21 @@ PAGES = {
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     if "results" not in path.parts and ("reference" not in path.parts or path.name == "python.md")
 }
-"""What is written by hand; `make docs` writes the other pages of the reference, from the code."""
+"""Pages written by hand. `make docs` generates the other pages of the reference from the code."""
 NOT_CLONED = {"docs/reference/settings.md", "docs/reference/command_line.md"}
-"""What it writes: such pages are in no clone."""
+"""Generated pages, which are not in a clone."""
 TUTORIALS = {"docs/tutorial_log_to_policy.md", "docs/tutorial_datasheet_to_board.md"}
-"""Pages whose commands have tests of their own, which follow them."""
-OF_THEIR_OWN = ("own_robot", "training", "other_agents", "randomization")
-ELSEWHERE = {"README.md", *TUTORIALS, *(f"docs/{name}.md" for name in OF_THEIR_OWN)}
-"""Pages whose Python has tests of its own, which look at what comes out."""
+"""Pages whose commands have their own tests."""
+TESTED_SEPARATELY = ("own_robot", "training", "other_agents", "randomization")
+WITH_OTHER_TESTS = {"README.md", *TUTORIALS, *(f"docs/{name}.md" for name in TESTED_SEPARATELY)}
+"""Pages whose Python has its own tests, which check the results."""
 WITH_PYTHON = [
-    name for name, text in PAGES.items() if "```python" in text and name not in ELSEWHERE
+    name for name, text in PAGES.items() if "```python" in text and name not in WITH_OTHER_TESTS
 ]
-LONG = {
+SLOW_PAGES = {
     f"docs/{name}.md" for name in ("actuators", "foreign", "identify", "motors", "see", "studies")
 }
-"""What takes more than three seconds even so."""
+"""Pages that take more than three seconds even in short form."""
 COMMANDS = [
     pytest.param(
         name, command.replace("\\\n", ""), marks=pytest.mark.matrix if name != "README.md" else []
@@ -50,13 +50,13 @@ COMMANDS = [
     for name, text in PAGES.items()
     if name not in TUTORIALS
     for command in re.findall(r"^(?:\$ )?codrl-mj ((?:.*\\\n)*.*)$", text, re.MULTILINE)
-    if not re.search(r"\b(?:NAME|LOG|RUN)\b", command)  # a form, not an example
+    if not re.search(r"\b(?:NAME|LOG|RUN)\b", command)  # a template, not an example
 ]
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A run folder, after one rollout."""
+    """Return a run folder after one rollout."""
     out = tmp_path_factory.mktemp("runs") / "mine"
     agent = PPOConfig(rollout_steps=64, batch_size=64, epochs=1)
     train(
@@ -69,8 +69,8 @@ def trained(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def folder_of_a_reader(trained, tmp_path, monkeypatch):
-    """An empty folder, but for the files that pages speak of."""
+def reader_folder(trained, tmp_path, monkeypatch):
+    """Run each test in a folder with only the files that the pages mention."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     Path("examples").symlink_to(ROOT / "examples")
@@ -83,20 +83,20 @@ def folder_of_a_reader(trained, tmp_path, monkeypatch):
         ("my_gearbox.py", "actuators", "python\n(import dataclasses\n.*?)"),
     ):
         Path(file).write_text(re.search(f"```{block}```", PAGES[f"docs/{page}.md"], re.DOTALL)[1])
-    for own in (ROOT / "examples/own_robot").glob("ball*"):
-        shutil.copy(own, ".")
+    for name in (ROOT / "examples/own_robot").glob("ball*"):
+        shutil.copy(name, ".")
     Path("motor").mkdir()
     Path("motor/actuator.yaml").write_text("family: lag")
     Path("runs").mkdir()
     for run in ("mine", "through"):
         Path("runs", run).symlink_to(trained)
     yield
-    for own in ("my_gearbox", "ball_and_beam"):
-        sys.modules.pop(own, None)
+    for name in ("my_gearbox", "ball_and_beam"):
+        sys.modules.pop(name, None)
 
 
 @pytest.mark.parametrize(
-    "page", matrix_params([name for name in WITH_PYTHON if name not in LONG], WITH_PYTHON)
+    "page", matrix_params([name for name in WITH_PYTHON if name not in SLOW_PAGES], WITH_PYTHON)
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_the_python_of_a_page_runs(page, monkeypatch):
@@ -106,14 +106,15 @@ def test_the_python_of_a_page_runs(page, monkeypatch):
     namespace = {}
     for block in re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL):
         block = block.replace("episodes=100", "episodes=1")  # what takes a reader minutes
-        exec(compile(block, page, "exec"), namespace)  # one after the other, as a reader would
+        # Blocks run one after the other in one namespace, as a reader would run them.
+        exec(compile(block, page, "exec"), namespace)
     for name in ("env", "envs"):
         if name in namespace and hasattr(namespace[name], "close"):
             namespace[name].close()
 
 
 @pytest.mark.parametrize(("page", "command"), COMMANDS)
-def test_a_command_of_a_page_is_understood(page, command, monkeypatch):
+def test_a_command_of_a_page_is_parsed(page, command, monkeypatch):
     parsed = []
     for verb in map(cli.find_verb, cli.VERBS):
         monkeypatch.setattr(verb, "run", lambda self: parsed.append(self) or 0)
@@ -129,20 +130,23 @@ SHORTER = {
     "report": "--no-film",
     "validate": "--quick",
 }
-"""Verb -> flags with which a command takes seconds."""
+"""Verb -> flags that shorten a command to seconds."""
 NEEDING_MORE = (
     r"identify|data |view|validate (--model|--mutations|--out)|validate"
     r" *(#.*)?$|.*policies/theirs|.*model.zip"
     "|board run|.*--backend ray|.*motor/actuator.yaml" + ("" if shutil.which("cc") else "|board")
 )
-"""Commands that need logs, a browser, a cluster, a compiler, others' files or minutes: they are only parsed."""
+"""Commands that need logs, a browser, a cluster, a compiler, third-party files or minutes: they are
+only parsed.
+"""
 RUNNER = """
 import json, runpy, sys
 from gymnasium.envs.registration import registry
 from codrl_mj.tasks import TASKS
 paths, ours = list(sys.path), set(TASKS)
 for line in json.load(sys.stdin):
-    sys.argv, sys.path[:] = [sys.argv[0], *line], paths  # nothing is left of the command before but what is compiled
+    # Undo the effects of the previous command, except compiled code.
+    sys.argv, sys.path[:] = [sys.argv[0], *line], paths
     for own in ("my_gearbox", "my_module", "ball_and_beam"):
         sys.modules.pop(own, None)
     for own in set(TASKS) - ours:
@@ -153,7 +157,9 @@ for line in json.load(sys.stdin):
         if done.code:
             sys.exit(f"exit {done.code}: {line}")
 """
-"""Runs command lines by the console script as a shell would, but in one process: numba compiles for all once."""
+"""Program that runs command lines like a shell, but in one process, so that numba compiles only
+once.
+"""
 
 
 def shortened(command):
@@ -167,17 +173,17 @@ def shortened(command):
 
 
 RUN_ALL = {
-    page: [command for name, command in (one.values for one in COMMANDS) if name == page]
-    for page in dict.fromkeys(one.values[0] for one in COMMANDS)
+    page: [command for name, command in (param.values for param in COMMANDS) if name == page]
+    for page in dict.fromkeys(param.values[0] for param in COMMANDS)
 }
 RUN = {
-    page: [one for one in lines if not re.match(NEEDING_MORE, one)]
+    page: [line for line in lines if not re.match(NEEDING_MORE, line)]
     for page, lines in RUN_ALL.items()
 }
 
 
-def test_a_family_from_the_folder_of_a_reader_is_trained_through(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "path", [place for place in sys.path if place != str(tmp_path)])
+def test_a_family_in_the_readers_folder_can_be_trained(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path != str(tmp_path)])
     for command in RUN["docs/actuators.md"]:
         assert cli.main(shortened(command)) == 0
 
@@ -185,7 +191,7 @@ def test_a_family_from_the_folder_of_a_reader_is_trained_through(tmp_path, monke
 @pytest.mark.matrix
 @pytest.mark.parametrize("page", [page for page, lines in RUN.items() if lines])
 def test_the_commands_of_a_page_run_as_typed(page, trained, tmp_path):
-    """By the console script, in a folder that has what the page says to write, and the runs that it does not make."""
+    """Run the console script in a folder with the page's files and the runs that it uses."""
     text = " ".join(RUN[page])
     for run in set(re.findall(r"runs/\w+", text)) - set(re.findall(r"--out (runs/\w+)", text)):
         path = tmp_path / run
@@ -199,7 +205,7 @@ def test_the_commands_of_a_page_run_as_typed(page, trained, tmp_path):
             shutil.copy(file, tmp_path)
     shutil.copy(tmp_path / "ball_and_beam.py", tmp_path / "my_module.py")
     program = Path(sys.executable).with_name("codrl-mj")
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-P", "-c", f"import sys; sys.argv = [{str(program)!r}]{RUNNER}"],
         input=json.dumps([shortened(command) for command in RUN[page]]),
         capture_output=True,
@@ -207,10 +213,10 @@ def test_the_commands_of_a_page_run_as_typed(page, trained, tmp_path):
         timeout=500,
         check=False,
     )
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-2000:]
 
 
-def test_the_python_of_the_first_page_prints_what_a_weak_loop_does(capsys):
+def test_the_python_of_the_readme_prints_the_signals_of_a_weak_loop(capsys):
     (block,) = re.findall(r"```python\n(.*?)```", PAGES["README.md"], re.DOTALL)
     namespace = {}
     exec(compile(block, "README.md", "exec"), namespace)
@@ -225,8 +231,8 @@ def test_the_python_of_the_first_page_prints_what_a_weak_loop_does(capsys):
 
 
 @pytest.mark.matrix
-def test_the_first_page_identifies_a_motor_as_typed(tmp_path):
-    """From logs of a motor on its own, whose columns have the names of that line."""
+def test_the_readme_identifies_a_motor_as_typed(tmp_path):
+    """Use logs of a motor without a load, with the column names of the command."""
     program = [str(Path(sys.executable).with_name("codrl-mj"))]
     simulate = shlex.split(
         "identify simulate maxon-ec45-flat-50w --kind prbs --amplitude 4 --duration 2 --inertia"
@@ -244,16 +250,16 @@ def test_the_first_page_identifies_a_motor_as_typed(tmp_path):
             header = re.sub(rf"\b{name}\b", column, header)
         log.write_text(f"{header}\n{rows}")
     (line,) = [command for command in RUN_ALL["README.md"] if command.startswith("identify")]
-    done = subprocess.run(
+    result = subprocess.run(
         [*program, *shlex.split(line)], capture_output=True, text=True, timeout=300, check=False
     )
-    assert done.returncode == 0, done.stderr
-    assert "not to be used" not in done.stdout
+    assert result.returncode == 0, result.stderr
+    assert "not to be used" not in result.stdout
     assert (tmp_path / "motor" / "actuator.yaml").is_file()
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_a_page_links_to_what_exists(page):
+def test_all_links_of_a_page_exist(page):
     for link in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", PAGES[page]):
         if not link.startswith("http"):
             target = (ROOT / page).parent / link
@@ -262,10 +268,10 @@ def test_a_page_links_to_what_exists(page):
 
 
 TEXTS = ("*.py", "*.toml", "*.xml", "*.jinja", "*.md", "*.html", "*.js", "*.yml", "Makefile")
-"""What may name a page: messages, help, docstrings, generated files."""
+"""Files that may name a page: messages, help, docstrings, generated files."""
 
 
-def test_every_page_that_code_assets_and_help_name_is_in_a_clone():
+def test_every_page_named_by_code_is_in_a_clone():
     folders = [ROOT / name for name in ("codrl_mj", "assets", "examples", "scripts")]
     files = [file for folder in folders for kind in TEXTS for file in folder.rglob(kind)]
     files += [
@@ -283,7 +289,7 @@ def test_every_page_that_code_assets_and_help_name_is_in_a_clone():
         assert page not in NOT_CLONED, f"{file} names {page}"
 
 
-def test_the_file_of_upright_tolerances_has_the_pendulum_s_own():
+def test_the_table_of_upright_tolerances_has_the_pendulums():
     with (ROOT / "docs/upright_tolerances.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     angle, speed, page = (
@@ -297,7 +303,7 @@ def test_the_file_of_upright_tolerances_has_the_pendulum_s_own():
     assert len(rows) == 13
 
 
-def test_of_the_papers_statements_as_many_are_confirmed_as_the_results_say():
+def test_the_readme_counts_confirmed_statements_as_the_results_do():
     results = ROOT / "docs" / "results"
     with (results / "reproduction" / "claims.csv").open(newline="") as file:
         rows = [
@@ -305,11 +311,13 @@ def test_of_the_papers_statements_as_many_are_confirmed_as_the_results_say():
             for row in csv.DictReader(file)
             if row["source"] == "paper" and row["counted"] == "yes"
         ]
-    sure, near = (sum(row["verdict"] == one for row in rows) for one in ("confirmed", "compatible"))
-    said = (
+    sure, near = (
+        sum(row["verdict"] == verdict for row in rows) for verdict in ("confirmed", "compatible")
+    )
+    sentence = (
         f"{len(rows)} statements {sure} are confirmed, and {near}, read off one run, compatible"
         " with ours."
     )
-    assert said in PAGES["README.md"].replace("\n", " ")
+    assert sentence in PAGES["README.md"].replace("\n", " ")
     counted = f"**Of {len(rows)} statements: {sure} confirmed, {near} compatible, "
     assert counted in (results / "reproduction.md").read_text()

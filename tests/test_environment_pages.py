@@ -1,4 +1,4 @@
-"""The environments' pages: that they are what the code says, and that what they say is what the code does."""
+"""Pages of the environments agree with the code."""
 
 import dataclasses
 import inspect
@@ -32,7 +32,7 @@ SECTIONS = (
     "Arguments",
 )
 MORE = {"furuta": ("What to expect", "Where the numbers come from")}
-"""What only one task's page has, at its end."""
+"""Task -> sections that only its page has, at its end."""
 
 every_task = pytest.mark.parametrize("task", TASKS)
 
@@ -43,7 +43,7 @@ def _section(task, title):
 
 
 def _table(text):
-    """The cells of the rows of the first Markdown table, without its head."""
+    """Return the cells of the first Markdown table, without its header."""
     rows = [line for line in text.splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows[2:]]
 
@@ -52,10 +52,10 @@ def _facts(task):
     return {row[0]: row[1] for row in _table((FOLDER / f"{task}.md").read_text())}
 
 
-# -- the pages are the code's -------------------------------------------------------------------------------
+# -- generated pages ------------------------------------------------------------------------------
 
 
-def test_the_pages_are_what_the_code_says_and_there_are_no_others():
+def test_the_pages_are_generated_from_the_code_and_complete():
     pages = environment_pages.pages()
     assert pages.keys() == {"README.md", "arguments.md"} | {f"{task}.md" for task in TASKS}
     assert {path.name for path in FOLDER.glob("*.md")} == pages.keys()
@@ -85,12 +85,12 @@ def test_make_docs_writes_them(tmp_path):
 
 def test_the_index_links_to_every_page():
     links = dict(re.findall(r"\[(.*?)\]\((.*?)\)", (FOLDER / "README.md").read_text()))
-    own = {task.env_id.removeprefix("codrl_mj/"): f"{name}.md" for name, task in TASKS.items()}
-    assert links == own | {"the same arguments": "arguments.md"}
+    expected = {task.env_id.removeprefix("codrl_mj/"): f"{name}.md" for name, task in TASKS.items()}
+    assert links == expected | {"the same arguments": "arguments.md"}
 
 
 @every_task
-def test_every_page_begins_with_a_film_of_some_seconds_and_has_the_same_sections(task):
+def test_every_page_has_a_short_film_and_the_same_sections(task):
     assert set(page_pictures_tasks.SCENES) == set(TASKS)
     page = (FOLDER / f"{task}.md").read_text()
     assert re.findall(r"^## (.*)$", page, re.MULTILINE) == [*SECTIONS, *MORE.get(task, ())]
@@ -99,15 +99,15 @@ def test_every_page_begins_with_a_film_of_some_seconds_and_has_the_same_sections
     assert (FOLDER / shown).stat().st_size < 400_000
     with Image.open(FOLDER / shown) as film:
         assert 240 <= film.width <= 320
-        lasting = []
-        for at in range(film.n_frames):
-            film.seek(at)
+        durations = []
+        for frame in range(film.n_frames):
+            film.seek(frame)
             film.load()
-            lasting.append(film.info["duration"])
-    assert 2000 < sum(lasting[:-1]) < 4000  # ms, and the last one stands still
+            durations.append(film.info["duration"])
+    assert 2000 < sum(durations[:-1]) < 4000  # ms, and the last one stands still
 
 
-def test_an_argument_that_nobody_documents_is_noticed(monkeypatch):
+def test_an_undocumented_argument_is_refused(monkeypatch):
     def fewer(self, task, actuator="paper"):  # noqa: D417
         """Build.
 
@@ -120,11 +120,11 @@ def test_an_argument_that_nobody_documents_is_noticed(monkeypatch):
         environment_pages.common_arguments()
 
 
-# -- what they say is what the code does --------------------------------------------------------------------
+# -- content --------------------------------------------------------------------------------------
 
 
 @every_task
-def test_every_argument_is_in_the_page_with_its_default_and_the_tasks_own_options_too(task):
+def test_every_argument_and_option_is_in_the_page_with_its_default(task):
     rows = {
         row[0].strip("`"): row[1].strip("`")
         for row in _table((FOLDER / "arguments.md").read_text())
@@ -155,7 +155,7 @@ def _number(text):
 
 
 @every_task
-def test_the_observation_table_is_the_space(task):
+def test_the_observation_table_agrees_with_the_space(task):
     rows, space = _table(_section(task, "Observation space")), TASKS[task].observation_space
     assert [int(row[0]) for row in rows] == list(range(space.shape[0]))
     assert [row[1].split("`")[1] for row in rows] == list(TASKS[task].observation_names)
@@ -195,7 +195,7 @@ def test_the_time_limit_is_the_registered_one_and_gymnasiums(task):
 
 
 @every_task
-def test_the_integration_steps_are_those_of_the_environment(task):
+def test_the_number_of_integration_steps_is_that_of_the_environment(task):
     facts = _facts(task)
     with_motor, without = map(int, re.findall(r"\d+", facts["integration steps in it"]))
     for actuator, count in (("default", with_motor), ("ideal", without)):

@@ -30,7 +30,7 @@ from codrl_mj.fields import real
 from codrl_mj.physics import trace_names
 from codrl_mj.tasks import TASKS, named_actuator
 from codrl_mj.viz.films import strip
-from codrl_mj.viz.pages.episode import Shown, _lines, _motor_plots
+from codrl_mj.viz.pages.episode import RunEpisode, _motor_series, _motor_plots
 
 TRACE = trace_names(DCMotorActuator)
 ROW = ("actual_force", "current", "voltage", "speed", "saturated")
@@ -302,8 +302,8 @@ def test_an_angle_that_is_asked_for_is_no_torque_that_could_be_missed():
     error = asked - episode.trace["actual_force"][:, 1]
     assert result.tracking_rms == pytest.approx(math.sqrt(np.mean(error**2)), rel=1e-12)
     assert result.motors["joint1"]["tracking_rms"] == result.tracking_rms
-    shown = [Shown("run", env, episode, None, None, 3)]
-    plots = {plot.title: plot for plot in _motor_plots(_lines(shown, list(episode.motors)))}
+    shown = [RunEpisode("run", env, episode, None, None, 3)]
+    plots = {plot.title: plot for plot in _motor_plots(_motor_series(shown, list(episode.motors)))}
     for title, name in (
         ("Torque at the shaft", "desired"),
         ("Error: desired less actual", "desired less actual"),
@@ -322,7 +322,7 @@ def test_an_angle_that_is_asked_for_is_no_torque_that_could_be_missed():
         is None
     )
     plots = _motor_plots(
-        _lines([Shown("run", alone, episode, None, None, 3)], list(episode.motors))
+        _motor_series([RunEpisode("run", alone, episode, None, None, 3)], list(episode.motors))
     )
     assert "Error: desired less actual" not in [plot.title for plot in plots]
 

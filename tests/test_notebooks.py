@@ -1,4 +1,4 @@
-"""The notebooks in examples/ run from top to bottom, are kept with their pictures, and stay small."""
+"""Notebooks in examples/ run from top to bottom, are stored with their output, and stay small."""
 
 import json
 from pathlib import Path
@@ -11,19 +11,19 @@ SHORT = {
     'preset("furuta", "ppo", seed=0)': 'preset("furuta", "ppo", seed=0, total_steps=4096)',
     "40_000": "4096",
 }
-"""What takes a reader a minute -> what takes a test seconds."""
+"""Code that takes a minute -> its short form for the tests."""
 
 
 def cells_of(path):
     return json.loads(path.read_text())["cells"]
 
 
-def test_there_are_three():
+def test_there_are_three_notebooks():
     assert len(NOTEBOOKS) == 3
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_is_kept_as_it_ran_and_small(path):
+def test_a_notebook_is_stored_with_its_output_and_small(path):
     code = [cell for cell in cells_of(path) if cell["cell_type"] == "code"]
     assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
     shown = [output for cell in code for output in cell["outputs"]]
@@ -34,7 +34,7 @@ def test_a_notebook_is_kept_as_it_ran_and_small(path):
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_links_to_what_exists(path):
+def test_all_links_of_a_notebook_exist(path):
     text = "".join(
         "".join(cell["source"]) for cell in cells_of(path) if cell["cell_type"] == "markdown"
     )
@@ -47,7 +47,7 @@ def test_a_notebook_links_to_what_exists(path):
 @pytest.mark.matrix
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(path, tmp_path, monkeypatch):
-    """With fewer steps of training, in a kernel of its own."""
+    """Run with fewer training steps, in a new kernel."""
     nbformat = pytest.importorskip("nbformat")
     client = pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")

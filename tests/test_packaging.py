@@ -1,4 +1,4 @@
-"""The wheel has all that a user needs, and works without the checkout; what is published is as an index wants it."""
+"""The wheel is complete and works without the checkout, and an index accepts it."""
 
 import os
 import re
@@ -38,11 +38,14 @@ pytestmark = pytest.mark.matrix
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """A folder with the source distribution, and the wheel that is built from it, as `python -m build` does."""
+    """Return a folder with the source distribution and the wheel that is built from it.
+
+    Both are built by `python -m build`.
+    """
     out = tmp_path_factory.mktemp("built")
     build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(REPOSITORY)]
-    done = subprocess.run(build, capture_output=True, text=True, timeout=240, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    result = subprocess.run(build, capture_output=True, text=True, timeout=240, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
     return out
 
 
@@ -54,7 +57,10 @@ def wheel(built):
 
 @pytest.fixture(scope="module")
 def program(wheel, tmp_path_factory):
-    """Runs a program of an environment that has the wheel, and of this one only what the wheel depends on."""
+    """Return a function that runs a program of an environment with the wheel and its dependencies.
+
+    The dependencies are those of this environment.
+    """
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, symlinks=True)
     programs = folder / ("Scripts" if os.name == "nt" else "bin")
@@ -71,23 +77,25 @@ def program(wheel, tmp_path_factory):
         wheel.filename,
     ]
     subprocess.run(install, check=True, timeout=240)
-    where = "import sysconfig; print(sysconfig.get_path('purelib'))"
-    own = Path(
+    query = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    site_packages = Path(
         subprocess.run(
-            [python, "-c", where], capture_output=True, text=True, check=True
+            [python, "-c", query], capture_output=True, text=True, check=True
         ).stdout.strip()
     )
     paths = [path for path in sys.path if Path(path).name == "site-packages"]
-    (own / "dependencies.pth").write_text("\n".join([*site.getsitepackages(), *paths]))
+    (site_packages / "dependencies.pth").write_text("\n".join([*site.getsitepackages(), *paths]))
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
     def run(name, *arguments, cwd):
         words = [programs / name, *arguments]
-        done = subprocess.run(
+        result = subprocess.run(
             words, cwd=cwd, env=clean, capture_output=True, text=True, timeout=300, check=False
         )
-        assert done.returncode == 0, f"{arguments}: {done.stdout[-1000:]}{done.stderr[-1000:]}"
-        return done.stdout
+        assert result.returncode == 0, (
+            f"{arguments}: {result.stdout[-1000:]}{result.stderr[-1000:]}"
+        )
+        return result.stdout
 
     run.folder = folder
     return run
@@ -95,7 +103,7 @@ def program(wheel, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def metadata(wheel):
-    """Its lines that say what it is."""
+    """Return the lines of the wheel's metadata."""
     (name,) = (name for name in wheel.namelist() if name.endswith("METADATA"))
     return wheel.read(name).decode().splitlines()
 
@@ -104,10 +112,10 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
     names = set(wheel.namelist())
     package, assets = REPOSITORY / "codrl_mj", REPOSITORY / "assets"
 
-    def of_ours(pattern, least):
-        found = {path.relative_to(REPOSITORY).as_posix() for path in package.glob(pattern)}
-        assert len(found) >= least
-        return found
+    def source_files(pattern, min_files):
+        files = {path.relative_to(REPOSITORY).as_posix() for path in package.glob(pattern)}
+        assert len(files) >= min_files
+        return files
 
     models = {
         f"codrl_mj/_assets/{path.relative_to(assets).as_posix()}"
@@ -129,10 +137,10 @@ def test_the_wheel_has_every_module_model_and_the_type_marker(wheel):
     }
     others = {
         "codrl_mj/py.typed",
-        *(f"codrl_mj/_assets/study/{one}/runs.csv" for one in ("actuators", "insurance")),
+        *(f"codrl_mj/_assets/study/{study}/runs.csv" for study in ("actuators", "insurance")),
     }
-    settings = of_ours("rl_zoo3/*.yml", 5) | of_ours("agents/presets/*.toml", 6)
-    assert names >= of_ours("**/*.py", 30) | models | settings | pages | others
+    settings = source_files("rl_zoo3/*.yml", 5) | source_files("agents/presets/*.toml", 6)
+    assert names >= source_files("**/*.py", 30) | models | settings | pages | others
     assert not [name for name in names if name.startswith(("tests", "scripts", "assets", "docs"))]
 
 
@@ -160,7 +168,7 @@ def test_the_training_and_rendering_libraries_are_extras(metadata):
     }
 
 
-def test_the_wheel_alone_steps_and_draws_every_task(program, tmp_path):
+def test_the_wheel_steps_and_renders_every_task(program, tmp_path):
     first, has_evidence, *tasks = program("python", "-c", USE, cwd=tmp_path).splitlines()
     assert Path(first).is_relative_to(program.folder)
     assert has_evidence == "True"
@@ -189,18 +197,18 @@ def test_the_source_distribution_has_what_the_checkout_has(built):
     assert not [name for name in names if name.startswith((".venv", "runs", "build"))]
 
 
-def test_an_index_would_take_both(built):
+def test_an_index_accepts_both_distributions(built):
     pytest.importorskip("twine")
     files = sorted(map(str, built.iterdir()))
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-m", "twine", "check", "--strict", *files], capture_output=True, text=True
     )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count("PASSED") == 2
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert result.stdout.count("PASSED") == 2
 
 
-def test_the_readme_works_with_the_wheel_alone(program, tmp_path):
-    """Its Python, and its commands with fewer steps, by the program that the wheel installed."""
+def test_the_readme_works_with_only_the_wheel(program, tmp_path):
+    """Run its Python, and shortened forms of its commands, with the installed program."""
     (block,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
     assert program("python", "-c", block, cwd=tmp_path).split()[0] == "10.0"
     for command in RUN["README.md"]:

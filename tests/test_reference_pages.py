@@ -1,4 +1,4 @@
-"""The pages that are written from the code have all of it: every verb, every public name, every field."""
+"""Generated reference pages are complete: every verb, every public name, every field."""
 
 import dataclasses
 import importlib
@@ -21,7 +21,7 @@ ROOT = Path(__file__).parent.parent
 
 @pytest.fixture(scope="module")
 def pages():
-    """Path below docs/reference -> text."""
+    """Return path below docs/reference -> text."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COLUMNS", "100")
         return reference_pages.pages()
@@ -30,9 +30,8 @@ def pages():
 def test_every_verb_has_a_page_with_its_help(pages):
     for verb in {name.split()[0] for name in cli.VERBS}:
         assert f"usage: codrl-mj {verb}" in pages[f"command_line/{verb}.md"]
-        assert not re.search(
-            r"type: ignore|noqa", pages[f"command_line/{verb}.md"]
-        )  # for want of a docstring
+        # A verb without a docstring would show the comments of its source.
+        assert not re.search(r"type: ignore|noqa", pages[f"command_line/{verb}.md"])
         assert re.search(
             rf"`{verb}`\]\(command_line/{verb}.md\) \| \w.+\.? \|", pages["command_line.md"]
         )
@@ -40,15 +39,20 @@ def test_every_verb_has_a_page_with_its_help(pages):
     assert "## motor feasible" in pages["command_line/motor.md"]
 
 
-def test_every_room_with_public_names_has_a_page_with_each_of_them(pages):
-    inits = Path(codrl_mj.__file__).parent.glob("*/__init__.py")
-    rooms = {"disturbances"} | {path.parent.name for path in inits if "__all__" in path.read_text()}
-    assert rooms == set(reference_pages.ROOMS)
-    for room in rooms:
-        text = pages[f"rooms/{room}.md"]
-        for name in importlib.import_module(f"codrl_mj.{room}").__all__:
+def test_every_package_with_public_names_has_a_page_with_each_of_them(pages):
+    root = Path(codrl_mj.__file__).parent
+    inits = [*root.glob("*/__init__.py"), *root.glob("viz/*/__init__.py")]
+    packages = {"disturbances"} | {
+        ".".join(path.parent.relative_to(root).parts)
+        for path in inits
+        if "__all__" in path.read_text()
+    }
+    assert packages == set(reference_pages.ROOMS)
+    for package in packages:
+        text = pages[f"rooms/{package}.md"]
+        for name in importlib.import_module(f"codrl_mj.{package}").__all__:
             assert re.search(rf"^(::: codrl_mj\.\S+\.|\| `){name}\b", text, re.MULTILINE), (
-                room,
+                package,
                 name,
             )
 
@@ -59,7 +63,7 @@ def test_every_public_name_of_the_package_is_on_the_first_page():
         assert re.search(rf"^::: codrl_mj\.\S*\.{name}$", text, re.MULTILINE), name
 
 
-def test_every_field_of_a_setting_has_what_it_is(pages):
+def test_every_field_of_a_setting_is_described(pages):
     text = pages["settings.md"]
     for kind in (EnvConfig, TrainConfig, Task):
         for field in dataclasses.fields(kind):
@@ -78,22 +82,22 @@ def test_every_field_of_a_setting_has_what_it_is(pages):
 def test_the_site_has_every_page_in_its_navigation(pages):
     nav = tomllib.loads((ROOT / "zensical.toml").read_text())["project"]["nav"]
 
-    def listed(entry):
+    def paths_of(entry):
         if isinstance(entry, str):
             return [entry]
         return [
             path
-            for one in (entry.values() if isinstance(entry, dict) else entry)
-            for path in listed(one)
+            for item in (entry.values() if isinstance(entry, dict) else entry)
+            for path in paths_of(item)
         ]
 
-    paths = listed(nav)
+    paths = paths_of(nav)
     assert len(paths) == len(set(paths))
     assert {f"reference/{name}" for name in pages} < set(paths)
-    kept = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
+    checked_in = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
     parts = {
         f"results/{name}_conclusions.md" for name in ("actuators", "insurance", "reproduction")
     }
-    assert kept - set(paths) <= parts
+    assert checked_in - set(paths) <= parts
     ignored = {f"reference/{name}" for name in pages}
-    assert set(paths) - ignored <= kept
+    assert set(paths) - ignored <= checked_in

@@ -1,4 +1,4 @@
-"""The programs in `scripts/`: short ones by the public interface, the demonstration, the benchmark and the soak."""
+"""Programs in `scripts/`: short ones, the demonstration, the benchmark and the soak test."""
 
 import json
 import re
@@ -22,7 +22,7 @@ SCRIPTS = Path(__file__).parent.parent / "scripts"
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
+def empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
@@ -31,11 +31,11 @@ def command(name, *arguments):
 
 
 def run(name, *arguments, status=0):
-    """What a program prints, or what it says when it ends with another status."""
-    done = subprocess.run(command(name, *arguments), capture_output=True, text=True, timeout=300)
-    assert done.returncode == status, done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
-    return done.stderr if status else done.stdout
+    """Return the output of a program, or its errors if another status is expected."""
+    result = subprocess.run(command(name, *arguments), capture_output=True, text=True, timeout=300)
+    assert result.returncode == status, result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
+    return result.stderr if status else result.stdout
 
 
 def test_a_training_and_its_rollouts(tmp_path):
@@ -97,15 +97,15 @@ def test_the_worked_examples(tmp_path):
 def test_from_a_bench_log_to_a_policy(tmp_path):
     printed = run("bench_to_policy.py", "--seeds", 1, "--total-steps", 300, "--out", tmp_path)
     numbers = r"(\w+): \S+ \[(\S+), (\S+)\] .*identified; real (\d\S+)"
-    found = {name: tuple(map(float, rest)) for name, *rest in re.findall(numbers, printed)}
+    intervals = {name: tuple(map(float, values)) for name, *values in re.findall(numbers, printed)}
     assert {
         "resistance",
         "inductance",
         "back_emf_constant",
         "coulomb_friction",
         "rotor_inertia",
-    } <= found.keys()
-    assert all(low <= real <= high for low, high, real in found.values())
+    } <= intervals.keys()
+    assert all(low <= real <= high for low, high, real in intervals.values())
     config = load_config(tmp_path / "identified-0")
     assert len(config.env.randomize) >= 5
     assert printed.splitlines()[-1].startswith("| identified |")
@@ -119,14 +119,15 @@ DEMO = "demo.py", "--seed", 4, "--total-steps", 2048, "--episodes", 2, "--out"
 
 @pytest.fixture(scope="module")
 def demonstrated(tmp_path_factory):
-    """The folder of a demonstration that was stopped while it trained and then run again, and what was printed."""
+    """Return folder and output of a demonstration that was killed in training and run again."""
     out = tmp_path_factory.mktemp("demo") / "out"
     with subprocess.Popen(command(*DEMO, out), stdout=subprocess.PIPE) as killed:
         while not (out / RUNS[1] / "progress.csv").exists():
             assert killed.poll() is None
             time.sleep(0.05)
         killed.kill()
-        killed.communicate(timeout=20)  # its processes hold the pipe too: none outlives it
+        # The child processes hold the pipe too, so that this waits for all of them.
+        killed.communicate(timeout=20)
     return out, run(*DEMO, out)
 
 
@@ -148,7 +149,7 @@ def test_the_demonstration_leaves_two_runs_and_a_film(demonstrated):
     assert height > 360
 
 
-def test_the_demonstration_prints_the_validation_and_all_four_results_and_where_to_look(
+def test_the_demonstration_prints_the_validation_the_four_results_and_its_files(
     demonstrated,
 ):
     out, text = demonstrated
@@ -173,33 +174,35 @@ def test_a_second_demonstration_reuses_the_trainings(demonstrated):
 
 
 @pytest.mark.parametrize(
-    ("group", "least", "own"),
+    ("group", "min_members", "num_ours"),
     [
         ("vector: mountain_car_continuous", 3, 2),
         ("single: pendulum", 3, 2),
         ("engine: pendulum", 4, 0),
     ],
 )
-def test_a_group_of_the_benchmark_is_measured_against_its_first_member(group, least, own, tmp_path):
+def test_a_group_of_the_benchmark_is_measured_against_its_first_member(
+    group, min_members, num_ours, tmp_path
+):
     out = tmp_path / "bench.json"
     printed = run("benchmark.py", "--duration", 0.02, "--turns", 2, "--only", group, "--out", out)
     content = json.loads(out.read_text())
     assert content["results"].keys() == {group}
     members = content["results"][group]
-    assert len(members) >= least
-    assert sum(name.startswith("ours") for name in members) == own
+    assert len(members) >= min_members
+    assert sum(name.startswith("ours") for name in members) == num_ours
     assert next(iter(members.values()))["ratio"] == [1.0, 1.0, 1.0]
     for name, numbers in members.items():
         for median, lowest, highest in numbers.values():
             assert 0 < lowest <= median <= highest, name
-    # what is not installed is skipped, and named
+    # Libraries that are not installed are skipped, and named in the output.
     for library in ("envpool", "electric_motor"):
-        here = any(library.split("_")[-1] in name.lower() for name in members)
-        wanted = group.startswith({"envpool": "vector", "electric_motor": "single"}[library])
-        assert not wanted or here or f"skipped: {library}" in printed
+        is_installed = any(library.split("_")[-1] in name.lower() for name in members)
+        is_expected = group.startswith({"envpool": "vector", "electric_motor": "single"}[library])
+        assert not is_expected or is_installed or f"skipped: {library}" in printed
 
 
-def test_a_short_soak_finds_nothing_wrong_on_one_and_two_threads():
+def test_a_short_soak_test_passes_on_one_and_two_threads():
     printed = run("soak.py", "--task", "cartpole", "--num-envs", 64, "--steps", 6400)
     assert "FAIL" not in printed
     assert printed.count("ok  ") == 5
@@ -210,7 +213,7 @@ def test_bad_arguments_are_refused(script, flag):
     assert f"{flag} 0: must be >= 1" in run(script, flag, 0, status=2)
 
 
-def test_what_is_measured_anew_takes_the_place_of_what_was(tmp_path):
+def test_new_measurements_replace_the_old_ones(tmp_path):
     def group(ours):
         return {"Gymnasium's": {"steps_per_second": [5e4] * 3, "ratio": [1.0] * 3}, "ours": ours}
 
@@ -220,10 +223,10 @@ def test_what_is_measured_anew_takes_the_place_of_what_was(tmp_path):
     benchmark.publish({"single: pendulum": first, "chains": first}, rows, page)
     second = group({"steps_per_second": [1.5e5] * 3, "ratio": [3.0, 2.5, 3.5]})
     benchmark.publish({"single: pendulum": second}, rows, page)
-    told = [tuple(row.values()) for row in read_csv(rows)]
-    assert ("single: pendulum", "ours", "150000", "3.000", "2.500", "3.500") in told
-    assert ("chains", "ours", "100000", "2.000", "1.800", "4.000") in told
-    assert len(told) == 4
+    rows_read = [tuple(row.values()) for row in read_csv(rows)]
+    assert ("single: pendulum", "ours", "150000", "3.000", "2.500", "3.500") in rows_read
+    assert ("chains", "ours", "100000", "2.000", "1.800", "4.000") in rows_read
+    assert len(rows_read) == 4
     before, _, tables = page.read_text().partition(benchmark.WRITTEN)
     assert before == "# Mine\n\n"
     assert "| ours | 150,000 | 3.00 |" in tables

@@ -43,7 +43,7 @@ def test_a_row_has_the_most_telling_measures(results):
         f" {result.saturated_percent:.1f} % {result.peak_voltage:.1f} V"
         f" {result.energy_drawn.mean:.3g} J"
     )
-    assert "3 episodes a row" in lines[0]
+    assert "3 episodes per row" in lines[0]
 
 
 def test_what_an_ideal_actuator_does_not_have_is_a_dash(results):

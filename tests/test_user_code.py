@@ -14,7 +14,7 @@ import pytest
 import codrl_mj
 from codrl_mj.actuators import resolve
 from codrl_mj.cli import find_verb, main
-from codrl_mj.cli.environments import environment
+from codrl_mj.cli.environments import build_env_config
 from codrl_mj.engine import load_family
 from codrl_mj.engine.families import compiled_observe
 from codrl_mj.envs.config import EnvConfig
@@ -263,7 +263,7 @@ def test_an_actuator_file_names_modules_only_with_trust(tmp_path, monkeypatch, c
     monkeypatch.syspath_prepend(tmp_path)
 
     def make_environment(verb):
-        return int(environment(verb, "cartpole", verb.actuator_name, EnvConfig("cartpole")) is None)
+        return int(build_env_config(verb, "cartpole", verb.actuator_name, EnvConfig("cartpole")) is None)
 
     monkeypatch.setattr(find_verb("evaluate"), "run", make_environment)
     Path("third_party.py").write_text(

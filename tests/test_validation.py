@@ -51,7 +51,7 @@ from tests.tasks.faces import REBUILT
 from tests.validation.test_convergence_checks import RATE, ideal, with_motor
 from tests.validation.test_energy_checks import STEPS, orders
 from tests.validation.test_motor_checks import EVERY
-from tests.viz.pages.parsed import Parsed, check_alone
+from tests.viz.pages.parsed import ParsedPage, check_self_contained
 
 SHORT_GROUPS = ("dynamics", "trajectories", "execution")
 
@@ -739,7 +739,7 @@ SAMPLE = Certificate(
 @pytest.mark.matrix
 def test_page_is_well_formed_self_contained_and_complete(certificate, caught):
     text = page.html(certificate, caught)
-    parsed = check_alone(text)
+    parsed = check_self_contained(text)
     assert set(GROUPS) <= set(parsed.ids)
     words = parsed.text
     for check in certificate.checks:
@@ -753,7 +753,7 @@ def test_page_is_well_formed_self_contained_and_complete(certificate, caught):
 
 
 def test_failure_is_at_the_top_and_marked_by_more_than_color():
-    words = Parsed(page.html(SAMPLE)).text
+    words = ParsedPage(page.html(SAMPLE)).text
     assert words.index("✗ 1 of 2 checks FAILED") < words.index("Checks of ")
     assert "b <i>" in words
     assert "x < y & z" in words

@@ -1,4 +1,4 @@
-"""The command line: parses, calls the package, prints. Nothing imports it."""
+"""Command line: parses the words, calls the package, prints the result. No module imports it."""
 
 import contextlib
 import contextvars
@@ -23,30 +23,33 @@ import mujoco
 
 import codrl_mj
 from codrl_mj.cli.extras import missing_module_message
-from codrl_mj.cli.parsing import parse, understood
+from codrl_mj.cli.parsing import normalize_arguments, parse
 from codrl_mj.runs.files import check_file, check_page, check_writable
 from codrl_mj.user_code import FILES_TRUSTED
 
-SAYS: dict[str, tuple[str, str]] = {
-    # verb, or the word before several: what it does in a sentence, and an example
+VERB_HELP: dict[str, tuple[str, str]] = {
+    # A verb, or the first word of a group of verbs: one sentence, and an example.
     "train": ("Train an agent through an actuator.", "cartpole --actuator weaker"),
     "evaluate": ("Measure a policy on any actuator.", "runs/mine --actuator lag"),
     "runs": ("List the runs of a folder, or compare some.", "runs --sort return"),
     "render": ("Film one episode.", "runs/mine --out balance.mp4"),
-    "replay": ("Write one episode as a page in three dimensions.", "runs/mine --out balance.html"),
-    "view": ("Watch a simulation live in a browser, and set its motor.", "cartpole"),
+    "replay": ("Write one episode as a web page in 3D.", "runs/mine --out balance.html"),
+    "view": ("Watch a simulation live in a browser, and change its motor.", "cartpole"),
     "report": ("Write a report of a run as one HTML file.", "runs/mine --out mine.html"),
-    "motor": ("List off-the-shelf motors, look at one, design its loop, choose one.", "list"),
-    "advise": ("Say whether to train through an actuator or do something else.", "weak pendulum"),
+    "motor": ("List off-the-shelf motors, show one, design its loop, choose one.", "list"),
+    "advise": (
+        "Advise whether to train through an actuator or do something else.",
+        "weak pendulum",
+    ),
     "identify": ("Identify a motor from its bench logs.", "check swing.csv --columns time=t:s"),
     "data": (
-        "List or fetch measurements of real motors that others have published.",
+        "List or download published measurements of real motors.",
         "dfki_pendulum",
     ),
-    "cache": ("Show or clear the compiled code that is kept on disk.", "--clear"),
-    "export": ("Take a policy out: ONNX, and all that it assumes.", "runs/mine --out mine"),
-    "board": ("Run the exported C as a controller, or check its log.", "test mine"),
-    "validate": ("Certify that the port is right.", "cartpole --out certificate"),
+    "cache": ("Show or clear the cache of compiled code.", "--clear"),
+    "export": ("Export a policy as ONNX and C, with all its assumptions.", "runs/mine --out mine"),
+    "board": ("Run exported C code as a controller, or check its log.", "test mine"),
+    "validate": ("Certify that the port to MuJoCo is correct.", "cartpole --out certificate"),
 }
 VERBS = {
     "train": "train:Train",
@@ -78,26 +81,25 @@ VERBS = {
     "board run": "deploy:RunBoard",
     "validate": "validate:Validate",
 }
-"""The words of every verb -> its module, which is imported when it is called, and its class."""
-_ABOUT = (
+"""Words of every verb -> its module, which is imported when the verb is called, and its class."""
+_DESCRIPTION = (
     "Reinforcement learning through a real actuator: classic control in MuJoCo, driven by a motor."
-    " Each verb has its own --help; -h leaves descriptions out; --version; --traceback shows where"
-    " an error arose."
+    " Each verb has its own --help; -h omits the descriptions. --version prints the version;"
+    " --traceback shows where an error arose."
 )
 
 
-_FILES: dict[str, Callable[[Path], None]] = {
+_OUTPUT_FILE_CHECKS: dict[str, Callable[[Path], None]] = {
     **dict.fromkeys(("Evaluate", "Runs", "SimulateLog", "CompareLog", "RunBoard"), check_file),
     **dict.fromkeys(("Replay", "Report"), check_page),
-    "Render": lambda path: check_writable(
-        path.parent
-    ),  # a film or a folder, which it checks itself
+    # The file of `render` may also be a folder of frames, which `check_film` checks itself.
+    "Render": lambda path: check_writable(path.parent),
 }
-"""Verbs whose `--out` is a file and no folder -> its check."""
+"""Verbs whose `--out` is a file instead of a folder -> the check of that path."""
 
 
 def find_verb(name: str) -> Any:
-    """The class of a verb."""
+    """Return the class of a verb."""
     module, _, kind = VERBS[name].partition(":")
     return getattr(importlib.import_module(f"codrl_mj.cli.{module}"), kind)
 
@@ -106,122 +108,141 @@ def main(arguments: list[str] | None = None) -> int:
     """Run `codrl-mj`.
 
     Args:
-        arguments: the command line without the program's name; None takes the process's.
+        arguments: the command line without the program's name; None: that of the process.
 
     Returns:
-        Exit status: 0, 1 when a validation fails, 2 for bad input and whatever else fails, 130
-        after Ctrl-C, 141 if
-            nobody reads on, 143 after SIGTERM.
+        Exit status: 0; 1 if a validation fails; 2 for bad input and all other errors; 130 after
+            Ctrl-C; 141 if the reader of the output has closed it; 143 after SIGTERM.
     """
-    if signal.getsignal(signal.SIGINT) is codrl_mj._exit_on_interrupt:
+    # While the package was imported, Ctrl-C ended the process with one line. From here on it raises
+    # KeyboardInterrupt, so that a training can write its checkpoint.
+    if signal.getsignal(signal.SIGINT) is codrl_mj._stopped_early:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    given = sys.argv[1:] if arguments is None else arguments
-    if given[:1] == ["--version"]:
+    command_line = sys.argv[1:] if arguments is None else arguments
+    if command_line[:1] == ["--version"]:
         print(f"codrl-mj {codrl_mj.__version__}")
         return 0
     with warnings.catch_warnings(), _engine_warnings():
         warnings.showwarning = _show_each_once()
-        words = [word for word in given if word != "--traceback"]
-        return contextvars.copy_context().run(_run, words, "--traceback" in given)
+        words = [word for word in command_line if word != "--traceback"]
+        # `FILES_TRUSTED` is a context variable: a copy of the context keeps it from callers of
+        # `main`.
+        return contextvars.copy_context().run(_run, words, "--traceback" in command_line)
 
 
 def _run(arguments: list[str], traced: bool) -> int:
     try:
         FILES_TRUSTED.set("--trust" in arguments)
-        words = understood(arguments)
-        name = next((one for one in (" ".join(words[:2]), *words[:1]) if one in VERBS), None)
+        words = normalize_arguments(arguments)
+        name = next(
+            (candidate for candidate in (" ".join(words[:2]), *words[:1]) if candidate in VERBS),
+            None,
+        )
         if name is None:
-            _help(words)
+            _print_help(words)
         rest = words[1 + name.count(" ") :]
-        kind = find_verb(name)  # or the one that it makes for a line on which its flags depend
+        # The flags of some verbs depend on other words of the line (agent, task, actuator). Such a
+        # class builds the dataclass for that line in `for_line`.
+        kind = find_verb(name)
         verb = parse(
             kind.for_line(rest) if hasattr(kind, "for_line") else kind, f"codrl-mj {name}", rest
         )
         _check_outputs(verb)
-        return _answer(verb)
-    except BrokenPipeError:  # whoever read the output has enough of it, such as head
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # what is left is flushed at exit
+        return _run_verb(verb)
+    except BrokenPipeError:
+        # The reader of the output, such as `head`, has closed it. Python flushes stdout at exit and
+        # would print an error, so the rest goes to /dev/null.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except (Exception, KeyboardInterrupt) as error:
-        if (
-            stopped_by := getattr(error, "signal_number", None)
-        ) is not None:  # of a TrainingStoppedError
+        # Only a `TrainingStoppedError` has a signal number; it has written a checkpoint already.
+        if (stopped_by := getattr(error, "signal_number", None)) is not None:
             print(f"codrl-mj: {error}", file=sys.stderr)
             return int(128 + stopped_by)
         if traced:
             traceback.print_exc()
-        if _interrupted(error):
-            again = "goes on where it was" if arguments[:1] == ["advise"] else "begins anew"
-            told = isinstance(error, KeyboardInterrupt) and str(error)
-            print(f"codrl-mj: {told or f'stopped: the same command {again}'}", file=sys.stderr)
+        if _is_interrupt(error):
+            effect = "continues" if arguments[:1] == ["advise"] else "starts from the beginning"
+            message = isinstance(error, KeyboardInterrupt) and str(error)
+            print(f"codrl-mj: {message or f'stopped: the same command {effect}'}", file=sys.stderr)
             return 130
-        print(f"codrl-mj: error: {_sentence(error)}", file=sys.stderr)
+        print(f"codrl-mj: error: {_format_error(error)}", file=sys.stderr)
         return 2
 
 
-def _help(words: Sequence[str]) -> NoReturn:
-    """Say what verbs there are, all or those that begin with the first word; SystemExit."""
-    about, group = _ABOUT, words[0] if words[:1] and words[0] in SAYS else ""
-    helped = {
-        name: f"{says}\n\nExample: codrl-mj {name} {line}" for name, (says, line) in SAYS.items()
+def _print_help(words: Sequence[str]) -> NoReturn:
+    """Print the help of all verbs, or of the group that the first word names, and exit."""
+    description, group = _DESCRIPTION, words[0] if words[:1] and words[0] in VERB_HELP else ""
+    descriptions = {
+        name: f"{sentence}\n\nExample: codrl-mj {name} {example}"
+        for name, (sentence, example) in VERB_HELP.items()
     }
     if group:
-        about = helped[group]
-        helped = {
+        description = descriptions[group]
+        descriptions = {
             name.split()[1]: find_verb(name).__doc__
             for name in VERBS
             if name.startswith(f"{group} ")
         }
-    parse(helped, f"codrl-mj {group}".strip(), words[1:] if group else words, about)
+    parse(descriptions, f"codrl-mj {group}".strip(), words[1:] if group else words, description)
     raise SystemExit
 
 
-def _answer(verb: Any) -> int:
-    """Run a verb. With --json nothing is printed but what it returns beside its exit status."""
+def _run_verb(verb: Any) -> int:
+    """Run a verb; with --json, print only the content that it returns beside its exit status."""
     if not getattr(verb, "as_json", False):
-        done = verb.run()
-        return int(done[0] if isinstance(done, tuple) else done)
+        result = verb.run()
+        return int(result[0] if isinstance(result, tuple) else result)
+    # Tables that the verb prints for people are discarded.
     with contextlib.redirect_stdout(io.StringIO()):
         status, content = verb.run()
-    print(json.dumps(_plain(content), indent=2, allow_nan=False))
+    print(json.dumps(_to_json_value(content), indent=2, allow_nan=False))
     return int(status)
 
 
-def _plain(content: Any) -> Any:
-    """As JSON has it: what has names as a mapping; null for numbers that are not finite, which it has no word for."""
-    for how in ("as_mapping", "summary", "_asdict"):
-        if hasattr(content, how):
-            return _plain(getattr(content, how)())
+def _to_json_value(content: Any) -> Any:
+    """Convert a value to JSON types: objects become mappings, numbers that are not finite null.
+
+    JSON has no number for NaN and infinity.
+    """
+    for method in ("as_mapping", "summary", "_asdict"):
+        if hasattr(content, method):
+            return _to_json_value(getattr(content, method)())
     if isinstance(content, Mapping) or dataclasses.is_dataclass(content):
-        named = content if isinstance(content, Mapping) else vars(content)
-        return {str(name): _plain(value) for name, value in named.items()}
+        fields = content if isinstance(content, Mapping) else vars(content)
+        return {str(name): _to_json_value(value) for name, value in fields.items()}
     if isinstance(content, list | tuple):
-        return [_plain(value) for value in content]
+        return [_to_json_value(value) for value in content]
     if isinstance(content, float):
         return float(content) if math.isfinite(content) else None
     return str(content) if isinstance(content, Path) else content
 
 
 def _check_outputs(verb: Any) -> None:
-    """Refuse what cannot be written before anything is computed."""
+    """Raise an error before anything is computed if an output path cannot be written."""
     kind = type(verb).__name__
-    checks = {"out": _FILES.get(kind, check_writable), "html": check_page, "trajectory": check_file}
+    checks = {
+        "out": _OUTPUT_FILE_CHECKS.get(kind, check_writable),
+        "html": check_page,
+        "trajectory": check_file,
+    }
     for name, check in checks.items():
         if (path := getattr(verb, name, None)) is not None:
             check(path)
 
 
-def _interrupted(error: BaseException | None) -> bool:
-    """Whether Ctrl-C is what an error comes from: libraries that are just imported turn it into errors of their own."""
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Return True if an error was caused by Ctrl-C.
+
+    Libraries that are being imported turn a KeyboardInterrupt into errors of their own.
+    """
     return error is not None and (
-        isinstance(error, KeyboardInterrupt) or _interrupted(error.__context__)
+        isinstance(error, KeyboardInterrupt) or _is_interrupt(error.__context__)
     )
 
 
-def _sentence(error: BaseException) -> str:
-    """What is wrong, in one line."""
+def _format_error(error: BaseException) -> str:
+    """Return the message of an error as one line."""
     text = " ".join(str(error).split())
     if isinstance(error, ModuleNotFoundError):
         return missing_module_message(error)
@@ -236,16 +257,19 @@ def _sentence(error: BaseException) -> str:
 
 @contextlib.contextmanager
 def _engine_warnings() -> Iterator[None]:
-    """Show MuJoCo's warnings as ours, each kind once, for it would write MUJOCO_LOG.TXT; not if somebody else has them.
+    """Print MuJoCo's warnings as ours, each kind once; otherwise it would write MUJOCO_LOG.TXT.
 
-    That a simulation diverged is left out, which ends in an error, and what Gymnasium's model of a
-    cheetah is old in.
+    A handler that the user has installed is left in place. Two warnings are not shown: that a
+    simulation diverged, which ends in an error anyway, and that Gymnasium's cheetah model uses a
+    deprecated attribute.
     """
-    shown = {"Nan, Inf or huge value in ", "compiler attribute 'settotalmass' is deprecated"}
+    seen_kinds = {"Nan, Inf or huge value in ", "compiler attribute 'settotalmass' is deprecated"}
 
     def show(text: str) -> None:
-        if not any(text.startswith(kind) for kind in shown):
-            shown.add(re.split(r"\d", text)[0])
+        if not any(text.startswith(prefix) for prefix in seen_kinds):
+            # Warnings of one kind differ in numbers such as the time: the text before the first
+            # digit identifies the kind.
+            seen_kinds.add(re.split(r"\d", text)[0])
             _show_warning(f"MuJoCo: {text}")
 
     if mujoco.get_mju_user_warning() is None:

@@ -7,29 +7,30 @@ from typing import Annotated, Any
 import tyro
 
 from codrl_mj.cli.parsing import AsJson, Trust
-from codrl_mj.cli.terminal import print_table, say
+from codrl_mj.cli.terminal import print_table, print_text
 from codrl_mj.fields import did_you_mean
 
 _DELIVERED = {
-    # field of Delivery: what it is, unit, digits
+    # field of Delivery: (label, unit, number format)
     "lag": ("lag, as a first-order time constant", "policy steps", ".3g"),
     "dead_time": ("dead time", "policy steps", ".3g"),
-    "at_rest": ("delivered of the largest force, at rest", "", ".0%"),
-    "at_speed": ("delivered of it at the reference speed", "", ".0%"),
+    "at_rest": ("delivered share of the largest force, at rest", "", ".0%"),
+    "at_speed": ("delivered share of it, at the reference speed", "", ".0%"),
     "friction": ("friction", "largest force", ".3g"),
     "noise": ("noise of the force", "largest force", ".3g"),
-    "unasked": ("force while nothing is asked for", "largest force", ".3g"),
+    "unasked": ("force at a command of zero", "largest force", ".3g"),
 }
 
 
 @dataclasses.dataclass(frozen=True)
 class Advise:
-    """Say what to do about an actuator: train on ideal forces, tune, randomise, train through it, or buy another.
+    """Advise what to do about an actuator: train on ideal forces, tune, randomize, or replace it.
 
-    A bench measures how late, how much and how noisily the actuator delivers the task's largest
-    force; the study's results say what policies lose by that (docs/advise.md). --measure trains
-    some, on ideal forces, on random actuators and through it, and tests them on it, which takes
-    minutes; killed, it goes on where it was.
+    A bench test measures the delay, the size and the noise of the force that the actuator delivers
+    when it is commanded the task's largest force. The study's results tell how much policies lose
+    by that (docs/advise.md). --measure trains policies on ideal forces, on random actuators and
+    through this actuator, and tests them on it, which takes minutes. If it is interrupted, the same
+    command continues.
 
     Example: codrl-mj advise maxon-ec45-flat-50w pendulum --gear-ratio 20, or codrl-mj advise paper
     cartpole --measure 5
@@ -40,9 +41,9 @@ class Advise:
         tyro.conf.arg(
             metavar="ACTUATOR",
             help=(
-                "A motor of the catalogue (codrl-mj motor list), a variation of the paper's (paper,"
-                " weak ...), a file with the fields of an actuator or a datasheet, or module:NAME"
-                " of your own."
+                "A motor of the catalogue (codrl-mj motor list), a variant of the paper's motor"
+                " (paper, weak ...), a file with the fields of an actuator or a datasheet, or your"
+                " own as module:NAME."
             ),
         ),
     ]
@@ -51,114 +52,118 @@ class Advise:
         tyro.conf.arg(
             metavar="TASK",
             help=(
-                "One of the study's tasks, such as pendulum; with --measure also a task of your own"
-                " (module:NAME), an environment (HalfCheetah-v5), or the folder of a run, whose"
-                " environment, agent and budget are taken."
+                "One of the study's tasks, such as pendulum; with --measure also a custom task"
+                " (module:NAME), an environment (HalfCheetah-v5), or a run folder, whose"
+                " environment, agent and training length are used."
             ),
         ),
     ]
     gear_ratio: float | None = None
-    """Turns of the rotor for a turn of the joint, or radians for a metre; the motor's own unless given."""
+    """Turns of the rotor per turn of the joint, or radians per meter; default: the motor's own."""
     voltage: float | None = None
-    """Voltage of the supply [V]; the motor's nominal one unless given."""
+    """Voltage of the supply [V]; default: the motor's nominal voltage."""
     measure: int | None = None
-    """Train so many policies of either kind, at least 2, and test them on it."""
+    """Number of policies to train in each way, at least 2, and to test on the actuator."""
     root: Path = Path("runs/advise")
     """Folder of the run folders of --measure."""
     jobs: int = -1
-    """Trainings at once; -1 for one on each CPU."""
+    """Number of trainings at the same time; -1: one for each CPU."""
     evidence: Path | None = None
-    """The study's runs.csv, unless that of the installation is meant."""
+    """The study's runs.csv; default: the installed one."""
     trust: Trust = False
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
-        """Print the doses, what is known of what can be done, and the verdict last."""
+        """Print the severities, the known remedies, and the verdict last."""
         from codrl_mj.study.advice import advise
         from codrl_mj.study.doses import REFERENCE_SPEEDS, posed
         from codrl_mj.study.evidence import Evidence
 
-        known = self.task in REFERENCE_SPEEDS
-        if not known and self.measure is None:
+        is_studied = self.task in REFERENCE_SPEEDS
+        if not is_studied and self.measure is None:
             raise ValueError(
-                f"TASK = {self.task!r}: {did_you_mean(self.task, REFERENCE_SPEEDS)}The study knows"
-                f" {', '.join(REFERENCE_SPEEDS)}; for any other, and for a run, train and test:"
+                f"TASK = {self.task!r}: {did_you_mean(self.task, REFERENCE_SPEEDS)}The study covers"
+                f" {', '.join(REFERENCE_SPEEDS)}; for other tasks and for runs, train and test with"
                 " --measure 5"
             )
         if self.measure is not None and self.measure < 2:
-            raise ValueError(f"--measure {self.measure}: must be >= 2, or there is no interval")
-        named: Any = self.actuator
+            raise ValueError(f"--measure {self.measure}: must be >= 2, to have an interval")
+        actuator_spec: Any = self.actuator
         if self.gear_ratio is not None or self.voltage is not None:
             motor = {} if self.gear_ratio is None else {"motor": {"gear_ratio": self.gear_ratio}}
             supply = {} if self.voltage is None else {"supply": {"voltage": self.voltage}}
-            named = {"name": self.actuator, **motor, **supply}
-        found = None
-        if known:
+            actuator_spec = {"name": self.actuator, **motor, **supply}
+        advice = None
+        if is_studied:
             try:
-                actuator = posed(self.task, named).actuator
+                actuator = posed(self.task, actuator_spec).actuator
             except ValueError as error:
-                given = {"--gear-ratio": self.gear_ratio, "--voltage": self.voltage}
-                about = ", ".join(flag for flag, value in given.items() if value is not None)
-                raise ValueError(f"{about}: {error}" if about else str(error)) from error
-            found = advise(actuator, self.task, Evidence.read(*filter(None, [self.evidence])))
-            _print(self.actuator, found)
-            say(actuator.assumed)
+                overrides = {"--gear-ratio": self.gear_ratio, "--voltage": self.voltage}
+                flags = ", ".join(flag for flag, value in overrides.items() if value is not None)
+                raise ValueError(f"{flags}: {error}" if flags else str(error)) from error
+            advice = advise(actuator, self.task, Evidence.read(*filter(None, [self.evidence])))
+            _print_advice(self.actuator, advice)
+            print_text(actuator.assumed)
         measured = None
         if self.measure is not None:
             from codrl_mj.study.advice import decide, measurement
             from codrl_mj.study.parallel import Workers
             from codrl_mj.study.program import compute
 
-            asked = measurement(named, self.task, self.measure, self.root, trust=self.trust)
-            compute(asked.grid, Workers(self.jobs))
-            options = asked.judged(asked.grid.collect())
+            # The run folders below --root hold the finished trainings: a second call computes only
+            # the missing ones.
+            measurement_plan = measurement(
+                actuator_spec, self.task, self.measure, self.root, trust=self.trust
+            )
+            compute(measurement_plan.grid, Workers(self.jobs))
+            options = measurement_plan.judged(measurement_plan.grid.collect())
             measured = {"options": options, "verdict": decide(options)}
             _print_options(
                 f"Measured: {self.measure} policies of either kind, 50 episodes each", options
             )
             more = " by more policies (--measure)" * (measured["verdict"] == "measure it")
-            say(f"measured: {measured['verdict']}{more}")
+            print_text(f"measured: {measured['verdict']}{more}")
         units = {name: unit or "1" for name, (_, unit, _) in _DELIVERED.items()} | {
             "loss": "share of the task's span"
         }
-        return 0, {"units": units, "advice": found, "measured": measured}
+        return 0, {"units": units, "advice": advice, "measured": measured}
 
 
-def _print(name: str, found: Any) -> None:
+def _print_advice(name: str, advice: Any) -> None:
     from codrl_mj.study.doses import AXES
 
-    columns = "what it does to the largest force", "value", "unit"
+    columns = "effect on the largest force", "value", "unit"
     rows: list[tuple[Any, ...]] = [
-        (title, format(getattr(found.found, field), digits), unit)
-        for field, (title, unit, digits) in _DELIVERED.items()
+        (label, format(getattr(advice.found, field), digits), unit)
+        for field, (label, unit, digits) in _DELIVERED.items()
     ]
-    print_table(f"{name} on {found.task}, on the bench", columns, rows, right=("value",))
-    if found.losses:
+    print_table(f"{name} on {advice.task}, on the bench", columns, rows, right=("value",))
+    if advice.losses:
         rows = []
-        for one in found.losses:
-            unit = AXES[one.axis].unit.rpartition("[")[2].removesuffix("]").removeprefix("missing ")
-            tested = ", ".join(dose.removeprefix(f"{one.axis} ") for dose in one.between)
-            lost = _lost(one.outcome, "at least " * one.beyond)
-            rows.append((one.axis, f"{one.dose:.3g}", unit, *lost, tested))
-        title = (
-            "What policies lose by it that were trained on ideal forces [shares of the task's span]"
-        )
+        for loss in advice.losses:
+            unit = (
+                AXES[loss.axis].unit.rpartition("[")[2].removesuffix("]").removeprefix("missing ")
+            )
+            tested = ", ".join(dose.removeprefix(f"{loss.axis} ") for dose in loss.between)
+            cells = _loss_cells(loss.outcome, "at least " * loss.beyond)
+            rows.append((loss.axis, f"{loss.dose:.3g}", unit, *cells, tested))
+        label = "Losses of policies that were trained on ideal forces [shares of the task's span]"
         print_table(
-            title,
-            ("by", "dose", "unit", *_LOST, "tested at"),
+            label,
+            ("effect", "severity", "unit", *_LOSS_COLUMNS, "tested at"),
             rows,
-            right=("dose", *_LOST),
-            whole=_LOST,
+            right=("severity", *_LOSS_COLUMNS),
+            whole=_LOSS_COLUMNS,
         )
-        _print_options("What is known of what can be done", found.options)
-    say(
-        f"{found.verdict}: {found.reason}"
-        if found.verdict
-        else f"no verdict: {found.reason} (--measure 5)"
+        _print_options("Known remedies", advice.options)
+    print_text(
+        f"{advice.verdict}: {advice.reason}"
+        if advice.verdict
+        else f"no verdict: {advice.reason} (--measure 5)"
     )
 
 
-_LOST = "loss", "95 %", "fail", "success\nlost"
+_LOSS_COLUMNS = "loss", "95 %", "fail", "success\nlost"
 
 
 def _print_options(title: str, options: Any) -> None:
@@ -167,14 +172,26 @@ def _print_options(title: str, options: Any) -> None:
     rows = []
     for name in OPTIONS:
         if name in options:
-            told = options[name].most or options[name].least
+            outcome = options[name].most or options[name].least
             rows.append(
-                (name, *(_lost(told, options[name].bound) if told else ("not tested", "", "", "")))
+                (
+                    name,
+                    *(
+                        _loss_cells(outcome, options[name].bound)
+                        if outcome
+                        else ("not tested", "", "", "")
+                    ),
+                )
             )
-    print_table(f"{title} [shares of the task's span]", ("what is done", *_LOST), rows, right=_LOST)
+    print_table(
+        f"{title} [shares of the task's span]",
+        ("remedy", *_LOSS_COLUMNS),
+        rows,
+        right=_LOSS_COLUMNS,
+    )
 
 
-def _lost(outcome: Any, bound: str) -> tuple[str, ...]:
+def _loss_cells(outcome: Any, bound: str) -> tuple[str, ...]:
     mean, low, high = outcome.loss
     count = len(outcome.lost)
     failed = f"{round(outcome.failed * count)} of {count}"

@@ -1,4 +1,4 @@
-"""`codrl-mj export`, `board` and `identify compare`: a policy taken out, run on a board, and what a rig then did."""
+"""`codrl-mj export`, `board` and `identify compare`: policies on boards, and logs of their rigs."""
 
 import dataclasses
 import math
@@ -8,25 +8,31 @@ from typing import Annotated, Any
 import tyro
 
 from codrl_mj.actuators import family_name
-from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, environment, with_environment
-from codrl_mj.cli.parsing import AsJson, Trust, named_numbers
+from codrl_mj.cli.environments import (
+    AS_TRAINED,
+    ActuatorName,
+    build_env_config,
+    with_environment_flags,
+)
+from codrl_mj.cli.parsing import AsJson, Trust, parse_named_numbers
 from codrl_mj.cli.subject import Source, Subject
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import command, differing
 
 Exported = Annotated[
-    tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="What export wrote.")
+    tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="Folder that export wrote.")
 ]
-"""Type of a verb's folder."""
+"""Type of a field for a folder that `export` wrote."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Take a trained policy out of the simulator: as ONNX, as C99, and contract.json with all that it assumes.
+    """Export a trained policy as ONNX and C99, with all its assumptions in contract.json.
 
-    The contract has names, units, order and range of observations and actions, rate, actuator,
-    delays, what to do when late, and 200 observations of episodes with the policy's actions, to be
-    computed again elsewhere (docs/deploy.md).
+    The contract lists names, units, order and range of observations and actions, the rate, the
+    actuator, the delays, and the reaction to missed deadlines. It also holds 200 observations of
+    episodes with the policy's actions, so that other programs can be checked against them
+    (docs/deploy.md).
 
     Example: codrl-mj export runs/furuta-ppo-ideal-0 --out furuta
     """
@@ -36,47 +42,49 @@ class Export:
         tyro.conf.arg(
             metavar="RUN",
             help=(
-                "Run folder; or a folder with a policy alone, or a Stable-Baselines3 zip, which"
-                " take --task and what else they were trained with, such as --env.action voltage."
+                "Run folder; or a folder with only a policy, or a Stable-Baselines3 zip: these need"
+                " --task and the other settings of their training, such as --env.action voltage."
             ),
         ),
     ]
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
     actuator_name: ActuatorName = AS_TRAINED
     out: Path = Path("exported")
-    """Folder to write; it must not exist, or be empty."""
+    """Folder to write; it must be empty or not exist."""
     episodes: int = 5
-    """Episodes that are run for the contract's ranges and golden numbers."""
+    """Number of episodes that are run for the contract's ranges and reference values."""
     seed: int = 0
-    """Seed of the first of them."""
+    """Seed of the first episode; the others count up from it."""
     float64: bool = False
-    """Compute in double in the C, not in float."""
+    """Compute with double instead of float in the C code."""
     limit: tuple[str, ...] = ()
-    """Largest safe size of observations, as arm_velocity=30 arm=1.8: beyond, the command is that
-    for safety. An angle that is observed as cos_arm and sin_arm is called arm.
+    """Largest safe magnitudes of observations, as arm_velocity=30 arm=1.8. Beyond them the board
+    gives the safety command. An angle that is observed as cos_arm and sin_arm is called arm.
     """
     board: str | None = None
-    """What it is to fit: arduino-uno, arduino-due, nucleo-f446re, raspberry-pi-pico or teensy-4.1."""
+    """Board whose memory and speed are checked: arduino-uno, arduino-due, nucleo-f446re,
+    raspberry-pi-pico or teensy-4.1.
+    """
 
-    for_line = classmethod(with_environment)
+    for_line = classmethod(with_environment_flags)
 
     def run(self: Any) -> int:
-        """Write the folder, and say what is in it."""
+        """Write the folder and print its content."""
         from codrl_mj.cli.terminal import print_table
         from codrl_mj.deploy import export, extract_network
 
         subject = self.source.load(self.run_folder)
         env = self._environment(subject)
-        limits = named_numbers("--limit", self.limit, "arm_velocity=30")
-        given = self.out, self.episodes, self.seed, self.float64, self.board, limits
-        contract = export(subject.policy, env, subject.agent, *given)
+        limits = parse_named_numbers("--limit", self.limit, "arm_velocity=30")
+        options = self.out, self.episodes, self.seed, self.float64, self.board, limits
+        contract = export(subject.policy, env, subject.agent, *options)
         rows = [
-            (side, one["name"], one.get("unit") or "?", _bounds(one))
-            for side, several in (
+            (side, entry["name"], entry.get("unit") or "?", _bounds(entry))
+            for side, entries in (
                 ("observation", contract.observations),
                 ("action", contract.actions),
             )
-            for one in several
+            for entry in entries
         ]
         print_table(
             f"{contract.task}, {subject.agent}, {contract.rate:g} Hz",
@@ -85,14 +93,14 @@ class Export:
         )
         weights = extract_network(subject.policy).size
         if contract.controller["loop"] is None and contract.actuators:
-            why = (
+            reason = (
                 f"this policy commands a {env.action}"
                 if env.action != "force"
-                else "the motors differ, or have none"
+                else "the motors have different loops, or none"
             )
-            print(f"no current loop: {why}")
+            print(f"no current loop: {reason}")
         written = f"wrote {self.out}: policy.onnx, contract.json, controller.c ({weights} numbers)"
-        names = env.task, *(family_name(type(one)) for one in env.actuators)
+        names = env.task, *(family_name(type(entry)) for entry in env.actuators)
         print(
             f"{written}; try:"
             f" {command('board', 'test', self.out, trust=any(':' in name for name in names))}"
@@ -100,21 +108,21 @@ class Export:
         return 0
 
     def _environment(self: Any, subject: Subject) -> EnvConfig:
-        """Return the environment of the training: a run says it itself, of a zip the flags do."""
+        """Return the environment of the training: from the run folder, or for a zip from flags."""
         from codrl_mj.training.folder import load_config
 
-        known = (
+        trained_env = (
             subject.env
             if subject.run is None
             else load_config(subject.run, self.source.trust).evaluation_env
         )
-        env = environment(self, subject.env.task, self.actuator_name, known)
+        env = build_env_config(self, subject.env.task, self.actuator_name, trained_env)
         if subject.run is None:
             return env
-        if other := differing(known.as_mapping(), env.as_mapping()):
+        if differing_fields := differing(trained_env.as_mapping(), env.as_mapping()):
             raise ValueError(
-                f"{', '.join(other)}: {subject.run} says what it was trained in, and that is"
-                " exported: leave the flags of the environment out; evaluate and board test take"
+                f"{', '.join(differing_fields)}: the environment that {subject.run} was trained in"
+                " is exported: leave the flags of the environment out; evaluate and board test take"
                 " another --actuator"
             )
         return subject.env
@@ -123,48 +131,50 @@ class Export:
 def _bounds(entry: dict[str, Any]) -> str:
     if "levels" in entry:
         return f"one of {', '.join(f'{level:g}' for level in entry['levels'])}"
-    least, most = entry.get("least"), entry.get("most")
-    return "any" if least is None or most is None else f"{least:g} to {most:g}"
+    low, high = entry.get("least"), entry.get("most")
+    return "any" if low is None or high is None else f"{low:g} to {high:g}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Test:
-    """Run the exported C as the controller of the simulation, frame by frame, and the ONNX model beside it.
+    """Run the exported C code as the controller of the simulation, compared with the ONNX model.
 
-    The C is compiled for this machine, or for a Cortex-M4F that QEMU emulates. The status is 1
-    where fewer than 95 % of the returns are within 1 % of Python's, unless frames are spoilt or the
-    motor is another on purpose.
+    The C code is compiled for this machine, or for a Cortex-M4F that QEMU emulates. The exit status
+    is 1 if fewer than 95 % of the returns are within 1 % of Python's, unless frames are corrupted
+    or the motor is changed on purpose.
 
     Example: codrl-mj board test furuta --target cortex-m4f
     """
 
     folder: Exported
     target: str = "host"
-    """Where the C runs: host, or cortex-m4f."""
+    """Machine that runs the C code: host, or cortex-m4f."""
     episodes: int = 20
     """Episodes, each from its own seed."""
     seed: int = 0
-    """Seed of the first of them."""
+    """Seed of the first episode; the others count up from it."""
     loop: bool = True
-    """Let the C close the motors' current loop too, sample by sample, where it has one."""
+    """Let the C code also close the motors' current loop, sample by sample, if it has one."""
     actuator: str | None = None
-    """Motor in the simulation, by name or file, where it is to be another than the policy's."""
+    """Motor in the simulation, by name or file; default: the policy's."""
     lost: float = 0.0
-    """Share of the frames that never arrive at the board."""
+    """Share of the frames that never reach the board."""
     damaged: float = 0.0
-    """Share of the frames in which a bit flips on the way."""
+    """Share of the frames in which one bit is flipped."""
     late: float = 0.0
-    """Share of the answers that come a period late: the command before holds."""
+    """Share of the answers that arrive one period late: the previous command is held."""
     counts: int = 0
-    """Steps of the encoders in a turn, such as 2048; 0: exact."""
+    """Encoder counts per turn, such as 2048; 0: exact."""
     current_bits: int = 0
-    """Bits of the converter that measures the current, such as 12; 0: exact."""
+    """Resolution [bit] of the converter that measures the current, such as 12; 0: exact."""
     pwm_bits: int = 0
-    """Bits of the bridge's voltages; 0: exact."""
+    """Resolution [bit] of the bridge's voltages; 0: exact."""
     film: Path | None = None
     """Film of the first episode with the board as the controller: .mp4 or .gif."""
     log: Path | None = None
-    """CSV file for what the board saw and did in the first episode; `board check` reads it."""
+    """CSV file for the observations and commands of the board in the first episode; `board check`
+    reads it.
+    """
     trust: Trust = False
 
     def run(self) -> int:
@@ -184,7 +194,7 @@ class Test:
         )
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
             row = bar.add_task(f"on {self.target}", total=self.episodes)
-            given = (
+            options = (
                 self.folder,
                 self.target,
                 self.episodes,
@@ -193,43 +203,44 @@ class Test:
                 self.loop,
                 self.actuator,
             )
-            done = board_test(*given, lambda ended: bar.update(row, completed=ended), self.trust)
-        board, python = done.returns.mean(axis=0)
-        taken = (
-            "not counted here"
-            if done.instructions is None
-            else "{} and {}".format(*done.instructions)
+            result = board_test(
+                *options, lambda ended: bar.update(row, completed=ended), self.trust
+            )
+        board, python = result.returns.mean(axis=0)
+        instructions = (
+            "not counted on this target"
+            if result.instructions is None
+            else "{} and {}".format(*result.instructions)
         )
         rows = [
             ("return on the board, mean", f"{board:.6g}"),
             ("return in Python, mean", f"{python:.6g}"),
-            ("episodes within 1 %", f"{done.num_equal_returns} of {self.episodes}"),
+            ("episodes within 1 %", f"{result.num_equal_returns} of {self.episodes}"),
             (
                 "frames: sent, refused, without an answer",
-                f"{done.frames}, {done.refused}, {done.unanswered}",
+                f"{result.frames}, {result.refused}, {result.unanswered}",
             ),
-            ("observations beyond the limits", f"{done.beyond_limits}"),
-            ("samples of the current loop", f"{done.samples or 'none'}"),
-            ("frames and samples a second", f"{done.rate:.0f}"),
-            ("instructions of a policy step, a sample", taken),
+            ("observations beyond the limits", f"{result.beyond_limits}"),
+            ("samples of the current loop", f"{result.samples or 'none'}"),
+            ("frames and samples a second", f"{result.rate:.0f}"),
+            ("instructions of a policy step, a sample", instructions),
         ]
         print_table(f"{self.folder} as C on {self.target}", ("", ""), rows)
         if self.log is not None:
-            write_log(self.log, Contract.read(self.folder), done.on_board[0])
+            write_log(self.log, Contract.read(self.folder), result.on_board[0])
             print(f"wrote {self.log}; try: {command('board', 'check', self.folder, self.log)}")
         if self.film is not None:
             from codrl_mj.viz.films.film import film, record
 
             with Board(
                 self.folder, self.target, link, self.seed, self.loop, self.actuator, self.trust
-            ) as driving:
-                env = driving.rig
-                panel = record(driving, env, self.seed, 640, 480)
+            ) as board_policy:
+                env = board_policy.rig
+                panel = record(board_policy, env, self.seed, 640, 480)
             title = f"{env.task} by its C on {self.target}: return {panel.episode.total:.0f}"
             film([dataclasses.replace(panel, title=title)], self.film, 640, 480)
             print(f"wrote {self.film}")
-        return int(
-            done.num_equal_returns < 0.95 * self.episodes
+        return int(result.num_equal_returns < 0.95 * self.episodes
             and link == Link()
             and self.actuator is None
         )
@@ -237,10 +248,10 @@ class Test:
 
 @dataclasses.dataclass(frozen=True)
 class CheckLog:
-    """Hold a log of a controller against the contract: names, order, units, rate, ranges, and every command.
+    """Check a controller's log against the contract: names, order, units, rate, ranges, commands.
 
     The log has comma-separated columns `name:unit`: time:s, the observations in their order, the
-    commands. The status is 1 where commands are not the policy's, or came late.
+    commands. The exit status is 1 if commands differ from the policy's or came late.
 
     Example: codrl-mj board check furuta swing.csv
     """
@@ -248,36 +259,36 @@ class CheckLog:
     folder: Exported
     log: Annotated[
         tyro.conf.Positional[Path],
-        tyro.conf.arg(metavar="LOG.csv", help="What the controller recorded."),
+        tyro.conf.arg(metavar="LOG.csv", help="Log of the controller."),
     ]
 
     def run(self) -> int:
-        """Check it and print a table."""
+        """Check the log and print a table."""
         from codrl_mj.cli.terminal import print_table
         from codrl_mj.deploy import check_log
 
-        found = check_log(self.folder, self.log)
-        outside = ", ".join(f"{name} in {count}" for name, count in found.outside.items() if count)
+        check = check_log(self.folder, self.log)
+        outside = ", ".join(f"{name} in {count}" for name, count in check.outside.items() if count)
         rows = [
-            ("rows; rate", f"{found.rows}; {found.rate:.4g} Hz"),
-            ("came late", str(found.late)),
+            ("rows; rate", f"{check.rows}; {check.rate:.4g} Hz"),
+            ("came late", str(check.late)),
             ("outside of what the policy saw", outside or "none"),
             (
                 "commands that are not the policy's",
-                f"{found.differing}, by {found.worst:.2g} at most",
+                f"{check.differing}, by {check.worst:.2g} at most",
             ),
         ]
         print_table(f"{self.log} by the contract of {self.folder}", ("", ""), rows)
-        return int(found.differing > 0 or found.late > 0)
+        return int(check.differing > 0 or check.late > 0)
 
 
 @dataclasses.dataclass(frozen=True)
 class RunBoard:
-    """Watch a real board at a serial port, or tell it to drive, and log what it says, until any key.
+    """Watch a real board at a serial port, or let it drive, and log its messages until any key.
 
-    It watches unless told to --drive: the board says its observations and which commands it would
-    give. A motor moves only with --drive, which ends by itself when something is wrong, and always
-    ends with the command for safety.
+    Without --drive the board only reports its observations and the commands that it would give. The
+    motor moves only with --drive, which ends by itself on an error, and always ends with the safety
+    command.
 
     Example: codrl-mj board run furuta --port /dev/ttyACM0 --out swing.csv
     """
@@ -286,39 +297,42 @@ class RunBoard:
     port: str
     """Serial port, such as /dev/ttyACM0."""
     out: Path
-    """CSV file for what it says: `board check` and `identify` read it."""
+    """CSV file for the log; `board check` and `identify` read it."""
     drive: bool = False
     """Let the board give its commands to the motor."""
     seconds: float = math.inf
-    """How long at most."""
+    """Maximum duration [s]."""
     baud: int = 115_200
     """Bits a second."""
 
     def run(self) -> int:
-        """Run until a key, and say how it went."""
-        from codrl_mj.cli.terminal import any_key, print_table, say
+        """Run until a key is pressed, and print a summary."""
+        from codrl_mj.cli.terminal import any_key, print_table, print_text
         from codrl_mj.deploy import run_board
 
-        say(f"{'DRIVES' if self.drive else 'watches'} {self.port}; any key ends it")
+        print_text(f"{'DRIVES' if self.drive else 'watches'} {self.port}; any key ends it")
         with any_key() as pressed:
-            given = self.folder, self.port, self.out, self.drive, self.seconds, self.baud
-            done = run_board(*given, ended=pressed)
+            options = self.folder, self.port, self.out, self.drive, self.seconds, self.baud
+            result = run_board(*options, ended=pressed)
         rows = [
-            ("ended", done.reason),
-            ("rows; frames without an answer; late", f"{done.rows}; {done.missed}; {done.late}"),
+            ("ended", result.reason),
+            (
+                "rows; frames without an answer; late",
+                f"{result.rows}; {result.missed}; {result.late}",
+            ),
         ]
         print_table(f"{self.folder} on {self.port}", ("", ""), rows)
         print(f"wrote {self.out}; try: {command('board', 'check', self.folder, self.out)}")
-        return int(done.reason != "requested")
+        return int(result.reason != "requested")
 
 
 @dataclasses.dataclass(frozen=True)
 class CompareLog:
-    """Simulate the commands of a rig's log, and hold what is observed then against what the rig did.
+    """Simulate the commands of a rig's log, and compare the simulated observations with the rig's.
 
-    The simulation begins anew at what was observed after each window. An error far below "if
-    nothing changed" says that the simulation knows the rig; try --actuator with what identify wrote
-    beside the motor of the training.
+    The simulation restarts from the rig's observation after each window. An error far below "if
+    nothing changed" means that the simulation describes the rig. Try --actuator with the file that
+    identify wrote as well as the motor of the training.
 
     Example: codrl-mj identify compare runs/furuta swing.csv --actuator motor/actuator.yaml --out
     compared.png
@@ -328,26 +342,24 @@ class CompareLog:
         tyro.conf.Positional[Path],
         tyro.conf.arg(
             metavar="RUN",
-            help="Run folder, or what export wrote of it: the environment of the training.",
+            help="Run folder, or its export: the environment of the training.",
         ),
     ]
     log: Annotated[
         tyro.conf.Positional[Path],
-        tyro.conf.arg(
-            metavar="LOG.csv", help="What the controller recorded, with columns name:unit."
-        ),
+        tyro.conf.arg(metavar="LOG.csv", help="Log of the controller, with columns name:unit."),
     ]
     actuator: str | None = None
-    """Actuator in the simulation, by name or file; that of the training unless told otherwise."""
+    """Actuator in the simulation, by name or file; default: that of the training."""
     window: float | None = None
-    """Time [s] after which the simulation begins anew; half a second, or ten rows, unless told otherwise."""
+    """Time [s] after which the simulation restarts; default: half a second, or ten rows."""
     out: Path | None = None
-    """PNG file for curves of what was observed and simulated."""
+    """PNG file for curves of the observed and simulated values."""
     trust: Trust = False
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
-        """Compare, print a table, draw."""
+        """Compare, print a table, and draw the curves."""
         from codrl_mj.cli.terminal import print_table
         from codrl_mj.deploy import Contract, compare
         from codrl_mj.deploy.contract import FILE
@@ -355,23 +367,24 @@ class CompareLog:
 
         if self.out is not None and self.out.suffix != ".png":
             raise ValueError(f"--out {self.out}: the suffix must be .png")
-        exported = (self.run_folder / FILE).is_file()
+        is_export = (self.run_folder / FILE).is_file()
         env = (
             Contract.read(self.run_folder).environment(self.trust)
-            if exported
+            if is_export
             else load_config(self.run_folder, self.trust).env
         )
-        found = compare(env, self.log, self.window, self.actuator)
+        comparison = compare(env, self.log, self.window, self.actuator)
         columns = list(
             zip(
-                found.names,
-                found.units,
-                found.errors.tolist(),
-                found.baseline_errors.tolist(),
+                comparison.names,
+                comparison.units,
+                comparison.errors.tolist(),
+                comparison.baseline_errors.tolist(),
                 strict=True,
             )
         )
-        title = f"{self.log.name} through {self.actuator or env.actuator_label}: {len(found.starts)} windows"
+        title = f"{self.log.name} through {self.actuator or env.actuator_label}:"
+            f" {len(comparison.starts)} windows"
         rows = [
             (name, unit or "?", f"{error:.3g}", f"{moved:.3g}")
             for name, unit, error, moved in columns
@@ -379,20 +392,22 @@ class CompareLog:
         heads = "", "unit", "error (RMS)", "if nothing changed"
         print_table(title, heads, rows, right=heads[2:])
         if self.out is not None:
-            _draw(found, self.out)
+            _draw(comparison, self.out)
         keys = ("name", "unit", "error", "if_nothing_changed")
         return 0, [dict(zip(keys, row, strict=True)) for row in columns]
 
 
-def _draw(found: Any, out: Path) -> None:
-    """Logged and simulated curves of every entry, cut where the simulation begins anew."""
+def _draw(comparison: Any, out: Path) -> None:
+    """Draw logged and simulated curves of every entry, with gaps where the simulation restarts."""
     import numpy as np
 
     from codrl_mj.cli.motor import save_plot
     from codrl_mj.viz.pages.plots import Curve, Plot
 
-    cut = found.simulated.copy()
-    cut[found.starts[1:] - 1] = np.nan
+    simulated = comparison.simulated.copy()
+    # A NaN interrupts the line, so that no vertical stroke joins the end of one window to the start
+    # of the next.
+    simulated[comparison.starts[1:] - 1] = np.nan
     save_plot(
         [
             Plot(
@@ -400,11 +415,15 @@ def _draw(found: Any, out: Path) -> None:
                 "time [s]",
                 f"{name} [{unit or '?'}]",
                 (
-                    Curve("on the rig", found.time, found.logged[:, place], reference=True),
-                    Curve("simulated", found.time, cut[:, place]),
+                    Curve(
+                        "on the rig", comparison.time, comparison.logged[:, column], reference=True
+                    ),
+                    Curve("simulated", comparison.time, simulated[:, column]),
                 ),
             )
-            for place, (name, unit) in enumerate(zip(found.names, found.units, strict=True))
+            for column, (name, unit) in enumerate(
+                zip(comparison.names, comparison.units, strict=True)
+            )
         ],
         out,
     )

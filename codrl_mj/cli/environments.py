@@ -1,4 +1,4 @@
-"""The flags of an environment and its actuators, made from the dataclasses that Python uses; and what they describe."""
+"""Flags of an environment and its actuators, generated from the dataclasses of the Python API."""
 
 import argparse
 import dataclasses
@@ -28,30 +28,45 @@ from codrl_mj.runs import CONFIG
 from codrl_mj.user_code import allow_imports_from_files, read_yaml
 
 
-def flags(
-    kind: type, defaults: Any = None, leaving_out: tuple[str, ...] = (), adding: Sequence[Any] = ()
+def flag_dataclass(
+    kind: type,
+    defaults: Any = None,
+    exclude: tuple[str, ...] = (),
+    extra_fields: Sequence[Any] = (),
 ) -> Any:
-    """A dataclass, and those in its fields, without validation, which the verb makes up for, to make flags from.
+    """Return a copy of a dataclass and of its nested ones, without validation, for tyro's flags.
 
-    Without an instance with the defaults all are optional: set over what is known only later.
+    The verb validates the values when it builds the real dataclass. Without `defaults` all fields
+    are optional: they override values that are known only later.
+
+    Args:
+        kind: the dataclass.
+        defaults: an instance with the default values.
+        exclude: names of fields without a flag.
+        extra_fields: further fields, as for `dataclasses.make_dataclass`.
     """
     docs, hints, nested = field_docs(kind), typing.get_type_hints(kind), parts(kind)
     fields: list[Any] = []
-    for name in (field.name for field in dataclasses.fields(kind) if field.name not in leaving_out):
-        hint, value = hints[name], getattr(defaults, name, None)
+    for name in (field.name for field in dataclasses.fields(kind) if field.name not in exclude):
+        annotation, value = hints[name], getattr(defaults, name, None)
         setting: dict[str, Any] = {"help": docs.get(name, "")}
+        # The verbs about motors call these flags --gear-ratio and --voltage: accept the short names
+        # too.
         if name == "gear_ratio" or (kind is Supply and name == "voltage"):
-            setting["aliases"] = (
-                f"--{name.replace('_', '-')}",
-            )  # as the verbs about motors call it
+            setting["aliases"] = (f"--{name.replace('_', '-')}",)
         if name in nested:
-            hint = flags(nested[name], value)
-            value = hint()
+            annotation = flag_dataclass(nested[name], value)
+            value = annotation()
         elif defaults is None:
-            hint, text = hint | None, f"{setting['help']} Default: the named actuator's.".strip()
+            annotation, text = (
+                annotation | None,
+                f"{setting['help']} Default: the named actuator's.".strip(),
+            )
             setting |= {"help": text, "help_behavior_hint": ""}
-        fields.append((name, Annotated[hint, tyro.conf.arg(**setting)], value))
-    return dataclasses.make_dataclass(f"{kind.__name__}Fields", [*fields, *adding], frozen=True)
+        fields.append((name, Annotated[annotation, tyro.conf.arg(**setting)], value))
+    return dataclasses.make_dataclass(
+        f"{kind.__name__}Fields", [*fields, *extra_fields], frozen=True
+    )
 
 
 ActuatorName = Annotated[
@@ -59,12 +74,12 @@ ActuatorName = Annotated[
     tyro.conf.arg(
         name="actuator",
         metavar="NAME",
-        help="What the force goes through. "
+        help="Actuator between the policy's force and the joint. "
         + "; ".join(f"{name}: {description}" for name, (description, _) in NAMED.items())
         + "; a family with its defaults:"
         f" {', '.join(name for name in FAMILIES if name not in NAMED)}; an off-the-shelf motor"
         " (codrl-mj motor list), or a TOML file with its datasheet; a YAML file with the fields"
-        " of an actuator; or module:NAME of your own.",
+        " of an actuator; or your own as module:NAME.",
     ),
 ]
 
@@ -73,34 +88,43 @@ Actuators = Annotated[
     tyro.conf.arg(
         metavar="PATTERN=NAME",
         help=(
-            "What single motors go through, over --actuator: names as there, for the motors whose"
-            " names, or whose joints', the regular expression matches from beginning to end;"
-            " patterns joined by & put one motor behind several actuators of a joint. Or a YAML"
-            " file of patterns and actuators, such as codrl-mj motor choose writes."
+            "Actuators of single motors, which override --actuator and take the same names. The"
+            " regular expression must match the whole name of the motor or of its joint. Patterns"
+            " joined by & put one motor behind several actuators of a joint. Or a YAML file of"
+            " patterns and actuators, as codrl-mj motor choose writes."
         ),
     ),
 ]
 FAMILY = "actuator.family"
-"""Flag that `scan` is asked for besides `actuator`."""
+"""Flag that `scan_flags` reads besides `actuator`."""
 _FAMILY_HELP = (
-    "Another family for the same motor: `servo` makes a motor or datasheet one that is asked for"
-    " positions."
+    "Another family for the same motor: `servo` turns a motor or a datasheet into a servo, whose"
+    " command is a position."
 )
 AS_TRAINED, AS_CONFIGURED = "as-trained", "as-configured"
-"""Instead of a name: the actuator that the policy was trained on; that of the configuration file or run."""
+"""Values of --actuator that are no names: the actuator of the policy's training, and the actuator
+of the configuration file or run.
+"""
 
 
 def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: str) -> list[Any]:
-    """Flags for an environment: single fields over its actuators, all else that its world has, and its options.
+    """Return dataclass fields for the flags of an environment: actuators, settings, options.
 
-    The family of what `--actuator` names, or `--actuator.family`, has the fields, of the ideal one
-    a current loop, to be refused. What cannot be made is refused here: its flags would be unknown.
-    `environment` reads what `dataclasses.make_dataclass` makes; `chosen` is what `scan` found of
-    the two.
+    The flags of single actuator fields are those of the family that `--actuator` or
+    `--actuator.family` names. The ideal family gets those of a current loop, so that each of them
+    is refused with a clear message. An actuator that cannot be built raises here, because its flags
+    would be unknown.
+
+    Args:
+        defaults: configuration with the default values.
+        chosen: the two flags, as `scan_flags` returns them.
+        task: the environment's name.
     """
-    world, every = defaults.source, (field.name for field in dataclasses.fields(EnvConfig))
-    without = tuple(
-        one for one in every if one not in world.fields or one in ("task", "actuator", "options")
+    world, all_names = defaults.source, (field.name for field in dataclasses.fields(EnvConfig))
+    excluded = tuple(
+        name
+        for name in all_names
+        if name not in world.fields or name in ("task", "actuator", "options")
     )
     options = [
         (
@@ -113,111 +137,140 @@ def environment_fields(defaults: EnvConfig, chosen: argparse.Namespace, task: st
         )
         for option, hint, text, value in world.option_flags(defaults)
     ]
-    env, family = flags(EnvConfig, defaults, without, options), type(defaults.actuators[0])
-    name, wanted = chosen.actuator, getattr(chosen, FAMILY)
-    if name not in (None, AS_TRAINED, AS_CONFIGURED):
+    env_flags, family = (
+        flag_dataclass(EnvConfig, defaults, excluded, options),
+        type(defaults.actuators[0]),
+    )
+    actuator, family_name = chosen.actuator, getattr(chosen, FAMILY)
+    if actuator not in (None, AS_TRAINED, AS_CONFIGURED):
         try:
-            family = type(EnvConfig(task, name).actuators[0])
+            family = type(EnvConfig(task, actuator).actuators[0])
         except ValueError as error:
-            several = f"; a file of patterns and actuators goes by --actuators {name}"
+            remedy = f"; for a file of patterns and actuators use --actuators {actuator}"
             raise ValueError(
-                f"{error}{several if str(name).endswith(('.yaml', '.yml')) else ''}"
+                f"{error}{remedy if str(actuator).endswith(('.yaml', '.yml')) else ''}"
             ) from None
-    family = family if wanted is None else find_family(wanted)
-    as_family = (
+    family = family if family_name is None else find_family(family_name)
+    family_field = (
         "family",
         Annotated[
             str | None, tyro.conf.arg(metavar="FAMILY", help=_FAMILY_HELP, help_behavior_hint="")
         ],
         None,
     )
-    over = flags(DCMotorActuator if issubclass(family, Ideal) else family, adding=[as_family])
+    # The ideal actuator has no fields. Flags of a current loop let `actuator_over` explain why each
+    # of them is refused.
+    actuator_flags = flag_dataclass(
+        DCMotorActuator if issubclass(family, Ideal) else family, extra_fields=[family_field]
+    )
     return [
         ("actuators", Actuators, ()),
         (
             "actuator_fields",
-            Annotated[over, tyro.conf.arg(name="actuator", help="Single fields over it.")],
-            over(),
+            Annotated[
+                actuator_flags,
+                tyro.conf.arg(
+                    name="actuator", help="Single fields, which override the named actuator."
+                ),
+            ],
+            actuator_flags(),
         ),
-        ("env", Annotated[env, tyro.conf.arg(help="The environment.")], env()),
+        ("env", Annotated[env_flags, tyro.conf.arg(help="The environment.")], env_flags()),
     ]
 
 
-def scan(arguments: Sequence[str], *names: str) -> argparse.Namespace:
-    """The values of some flags, None where they are not there, `task`, `options`, `trust`: what decides on others."""
+def scan_flags(arguments: Sequence[str], *flag_names: str) -> argparse.Namespace:
+    """Return the values of some flags, without parsing the others; None for those that are absent.
+
+    Added are `task`, `options` and `trust`. Other flags and their defaults depend on these values.
+    """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for name in (*names, "task"):
+    for name in (*flag_names, "task"):
         parser.add_argument(f"--{name}")
     parser.add_argument("--env.options", dest="options", nargs="*")
     parser.add_argument("--trust", action="store_true")
     try:
         chosen, _ = parser.parse_known_args(arguments)
-    except argparse.ArgumentError:  # a flag without its value: the real parser says so better
-        chosen = argparse.Namespace(**dict.fromkeys((*names, "task", "options")), trust=False)
-    behind = itertools.pairwise(["", *arguments])
+    # A flag without its value. The real parser raises a better message for it later.
+    except argparse.ArgumentError:
+        chosen = argparse.Namespace(**dict.fromkeys((*flag_names, "task", "options")), trust=False)
+    word_pairs = itertools.pairwise(["", *arguments])
     chosen.task = chosen.task or next(
-        (word for flag, word in behind if is_source_name(word) and not flag.startswith("--")), None
+        (word for flag, word in word_pairs if is_source_name(word) and not flag.startswith("--")), None
     )
     return chosen
 
 
-def with_environment(verb: Any, arguments: Sequence[str]) -> Any:
-    """A verb about a run, with flags for environment and actuator: those of the first run that the line names."""
+def with_environment_flags(verb: Any, arguments: Sequence[str]) -> Any:
+    """Return a verb about a run with flags for environment and actuator.
+
+    Their defaults are those of the first run folder that the line names.
+    """
     from codrl_mj.training.folder import load_config
 
-    chosen = scan(arguments, "actuator", FAMILY)
-    known = EnvConfig("cartpole", DCMotorActuator())
+    chosen = scan_flags(arguments, "actuator", FAMILY)
+    defaults = EnvConfig("cartpole", DCMotorActuator())
     run = next((run for run in map(Path, arguments) if (run / CONFIG).is_file()), None)
     if run is not None:
-        known = load_config(run, chosen.trust).evaluation_env
+        defaults = load_config(run, chosen.trust).evaluation_env
     elif chosen.task is not None:
-        known = EnvConfig(chosen.task, DCMotorActuator())
-    fields = environment_fields(known, chosen, known.task)
-    made: Any = dataclasses.make_dataclass(verb.__name__, fields, bases=(verb,), frozen=True)
-    made.__doc__, made.line = verb.__doc__, tuple(arguments)
-    return made
+        defaults = EnvConfig(chosen.task, DCMotorActuator())
+    fields = environment_fields(defaults, chosen, defaults.task)
+    extended_verb: Any = dataclasses.make_dataclass(
+        verb.__name__, fields, bases=(verb,), frozen=True
+    )
+    extended_verb.__doc__, extended_verb.line = verb.__doc__, tuple(arguments)
+    return extended_verb
 
 
-def environment(verb: Any, task: str, name: str, known: EnvConfig) -> EnvConfig:
-    """The environment that a verb's flags, those of `environment_fields`, describe; `known` has their defaults."""
-    as_known = name in (AS_TRAINED, AS_CONFIGURED)
+def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> EnvConfig:
+    """Return the environment that a verb's flags describe; `known` has the default values.
+
+    The flags are those of `environment_fields`.
+    """
+    is_default = name in (AS_TRAINED, AS_CONFIGURED)
     if (
-        not as_known
-        and known.randomize
-        and tuple(verb.env.randomize or ()) == tuple(known.randomize)
+        not is_default
+        and defaults.randomize
+        and tuple(verb.env.randomize or ()) == tuple(defaults.randomize)
     ):
-        drawn = [
-            text.partition("=")[0] for text in known.randomize if not text.startswith("model.")
+        drawn_fields = [
+            text.partition("=")[0] for text in defaults.randomize if not text.startswith("model.")
         ]
-        if drawn:
+        if drawn_fields:
             warnings.warn(
-                f"{', '.join(drawn)} of {name} are drawn as in the training, whatever {name} has"
-                f" there: for {name} as it is add --env.randomize None",
+                f"{', '.join(drawn_fields)} of {name} are drawn from the ranges of the training"
+                f" instead of taken from {name}: for {name} as it is add --env.randomize None",
                 stacklevel=2,
             )
-    world, flags = find_source(task), dict(vars(verb.env))
+    world, env_flags = find_source(task), dict(vars(verb.env))
     names = [field.name for field in dataclasses.fields(EnvConfig) if field.name != "options"]
-    fields = {name: flags.pop(name) for name in names if name in flags}
-    fields |= {part: vars(fields[part]) for part in ("disturbances", "joint") if part in fields}
-    options = world.options_of(flags)
+    fields = {name: env_flags.pop(name) for name in names if name in env_flags}
+    fields |= {
+        nested_part: vars(fields[nested_part])
+        for nested_part in ("disturbances", "joint")
+        if nested_part in fields
+    }
+    options = world.options_of(env_flags)
     patterns = _patterns(verb.actuators)
     fields["randomize"] = _ranges(fields["randomize"], name, patterns)
-    named = known.actuators_by_name if as_known else dict.fromkeys(known.actuators_by_name, name)
-    config = EnvConfig(task, named, options=options)
+    actuators = defaults.actuators_by_name if is_default else dict.fromkeys(defaults.actuators_by_name, name)
+    config = EnvConfig(task, actuators, options=options)
     if patterns:
         config = EnvConfig(task, world.overlaid(config, patterns), options=options)
-    over = _given(verb.actuator_fields)
-    changed = {
-        pattern: actuator_over(one, over) for pattern, one in config.actuators_by_name.items()
+    actuator_fields = _set_fields(verb.actuator_fields)
+    overridden = {
+        pattern: actuator_over(actuator, actuator_fields)
+        for pattern, actuator in config.actuators_by_name.items()
     }
-    return EnvConfig(task, changed, options=options, **fields)
+    return EnvConfig(task, overridden, options=options, **fields)
 
 
 def _patterns(items: Sequence[str]) -> dict[str, Any]:
-    """Pattern -> what is behind these actuators, of PATTERN=NAME and of files."""
+    """Return pattern -> actuator from items PATTERN=NAME and from YAML files."""
     from codrl_mj.engine.specs import resolve_patterns
 
-    found: dict[str, Any] = {}
+    actuators: dict[str, Any] = {}
     for item in items:
         if "=" not in item and Path(item).suffix in (".yaml", ".yml", ".json"):
             try:
@@ -225,42 +278,41 @@ def _patterns(items: Sequence[str]) -> dict[str, Any]:
                 if not isinstance(content, Mapping):
                     raise ValueError("must be a mapping of patterns to actuators")
                 with allow_imports_from_files():
-                    found |= resolve_patterns(content, f"the file {item}")
+                    actuators |= resolve_patterns(content, f"the file {item}")
             except ValueError as error:
                 raise ValueError(f"--actuators {item}: {error}") from None
         else:
-            pattern, equals, name = item.rpartition(
-                "="
-            )  # the last: a regular expression may have its own
+            # Split at the last equals sign: a regular expression may contain others.
+            pattern, equals, name = item.rpartition("=")
             if not equals or not pattern:
                 raise ValueError(f"--actuators {item}: must be PATTERN=NAME, or a YAML file")
-            found[pattern] = name
-    return found
+            actuators[pattern] = name
+    return actuators
 
 
 def _ranges(randomize: Any, actuator: str, patterns: Mapping[str, Any]) -> Any:
-    """What `--env.randomize` says, `identified` replaced by the intervals that the actuators' files have."""
+    """Return `--env.randomize` with `identified` replaced by the intervals of actuator files."""
     if randomize is None or "identified" not in randomize:
         return randomize
-    others = [one for one in randomize if one != "identified"]
-    named = {one.partition("=")[0].strip() for one in others}
-    for before, one in [(f"{pattern}:", str(one)) for pattern, one in patterns.items()] or [
+    specs = [spec for spec in randomize if spec != "identified"]
+    spec_names = {spec.partition("=")[0].strip() for spec in specs}
+    for prefix, spec in [(f"{pattern}:", str(spec)) for pattern, spec in patterns.items()] or [
         ("", actuator)
     ]:
-        if Path(one).suffix not in (".yaml", ".yml", ".json"):
+        if Path(spec).suffix not in (".yaml", ".yml", ".json"):
             raise ValueError(
                 "--env.randomize identified: draws within the intervals of a file; --actuator is"
-                f" {one!r}, must be one that `codrl-mj identify` wrote"
+                f" {spec!r}, must be one that `codrl-mj identify` wrote"
             )
-        ranges = {f"{before}{name}": text for name, text in identified_ranges(one).items()}
-        others += [f"{name}={text}" for name, text in ranges.items() if name not in named]
-    return tuple(others)
+        ranges = {f"{prefix}{name}": text for name, text in identified_ranges(spec).items()}
+        specs += [f"{name}={text}" for name, text in ranges.items() if name not in spec_names]
+    return tuple(specs)
 
 
-def _given(fields: Any) -> dict[str, Any]:
-    """What was set, nested."""
+def _set_fields(fields: Any) -> dict[str, Any]:
+    """Return the fields of a nested dataclass that are not None, as nested mappings."""
     return {
-        name: _given(value) if dataclasses.is_dataclass(value) else value
+        name: _set_fields(value) if dataclasses.is_dataclass(value) else value
         for name, value in vars(fields).items()
         if value is not None
     }

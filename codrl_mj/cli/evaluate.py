@@ -1,4 +1,4 @@
-"""`codrl-mj evaluate`, and the tables of what is measured, for a terminal of 80 columns or more."""
+"""`codrl-mj evaluate`, and tables of its measures for terminals of 80 columns or more."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -7,10 +7,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, environment, with_environment
+from codrl_mj.cli.environments import (
+    AS_TRAINED,
+    ActuatorName,
+    build_env_config,
+    with_environment_flags,
+)
 from codrl_mj.cli.parsing import AsJson
 from codrl_mj.cli.subject import Source
-from codrl_mj.cli.terminal import number, print_table, progress_bar
+from codrl_mj.cli.terminal import format_number, print_table, progress_bar
 from codrl_mj.evaluation import MEASURES, Evaluation, evaluate
 from codrl_mj.evaluation.measures import Interval, Quartiles
 from codrl_mj.runs import told_apart
@@ -19,10 +24,10 @@ from codrl_mj.runs.files import write_json
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
-    """Measure a trained policy on any actuator: return, success, torque tracking, voltage, energy, heat.
+    """Measure a policy on any actuator: return, success, torque tracking, voltage, energy, heat.
 
-    Of several motors there is a second table, with what each of them did. Several policies have a
-    row each, every one in the environment of its own training.
+    For several motors a second table lists the measures of each motor. Several policies have one
+    row each, evaluated in the environment of their own training.
 
     Example: codrl-mj evaluate runs/cartpole-ppo-ideal-0 --actuator weaker --episodes 100
     """
@@ -32,7 +37,7 @@ class Evaluate:
         tyro.conf.arg(
             metavar="POLICY",
             help=(
-                "Run folders; or folders with a policy alone, or Stable-Baselines3 zips (see"
+                "Run folders; or folders with only a policy, or Stable-Baselines3 zips (see"
                 " --trust)."
             ),
         ),
@@ -40,42 +45,44 @@ class Evaluate:
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
     actuator_name: ActuatorName = AS_TRAINED
     episodes: int = 50
-    """Episodes, each from its own seed."""
+    """Number of episodes, each from its own seed."""
     seed: int = 0
     """Seed of the first episode; the others count up from it."""
     stochastic: bool = False
     """Sample the actions instead of taking the most likely ones."""
     out: Path | None = None
-    """JSON file for the result; of several policies for all of them, by their names."""
+    """JSON file for the result; with several policies, for all results by name."""
     as_json: AsJson = False
 
-    for_line = classmethod(with_environment)
+    for_line = classmethod(with_environment_flags)
 
     def run(self: Any) -> tuple[int, Any]:
-        """Evaluate and print tables."""
+        """Evaluate the policies and print tables."""
         if not self.policies:
             raise ValueError(
-                "POLICY: none was given; name a run folder or more, such as"
+                "POLICY: none was given; name one or more run folders, such as"
                 " runs/cartpole-ppo-ideal-0"
             )
-        to_do, found = {}, {}
+        jobs, evaluations = {}, {}
         for path, name in zip(self.policies, told_apart(self.policies), strict=True):
             verb = self
-            if len(self.policies) > 1:  # each run has the defaults of its flags
+            if len(self.policies) > 1:
+                # The defaults of the flags come from the first run of a line, so the line is parsed
+                # again for each run, without the other runs.
                 line = [
                     word
                     for word in self.line
                     if Path(word) == path or Path(word) not in self.policies
                 ]
-                verb = tyro.cli(with_environment(Evaluate, line), args=line)
+                verb = tyro.cli(with_environment_flags(Evaluate, line), args=line)
             subject = verb.source.load(path)
-            env = environment(verb, subject.env.task, verb.actuator_name, subject.env)
+            env = build_env_config(verb, subject.env.task, verb.actuator_name, subject.env)
             subject.check_interface(env)
-            to_do[f"{name} on {env.actuator_label}"] = subject.policy, env
+            jobs[f"{name} on {env.actuator_label}"] = subject.policy, env
         with progress_bar("{task.completed}/{task.total} episodes") as bar:
-            for name, (policy, env) in to_do.items():
-                row = bar.add_task("evaluating" if len(to_do) == 1 else name, total=self.episodes)
-                found[name] = evaluate(
+            for name, (policy, env) in jobs.items():
+                row = bar.add_task("evaluating" if len(jobs) == 1 else name, total=self.episodes)
+                evaluations[name] = evaluate(
                     policy,
                     env,
                     self.episodes,
@@ -83,8 +90,8 @@ class Evaluate:
                     not self.stochastic,
                     on_step=lambda _, ended, row=row: bar.update(row, completed=ended),  # type: ignore[misc]
                 )
-        print_evaluations(found)
-        mappings = {name: one.as_mapping() for name, one in found.items()}
+        print_evaluations(evaluations)
+        mappings = {name: evaluation.as_mapping() for name, evaluation in evaluations.items()}
         content = mappings if len(mappings) > 1 else mappings.popitem()[1]
         if self.out is not None:
             write_json(self.out, content)
@@ -93,91 +100,104 @@ class Evaluate:
 
 
 def print_evaluations(evaluations: Mapping[str, Evaluation], details: bool = True) -> None:
-    """Print the most telling measures in one table, a row for each evaluation by its name, and details below it.
+    """Print the main measures in one table, with a row for each evaluation, and details below it.
 
-    Measures that none of them has are left out.
+    Measures that no evaluation has are left out.
     """
     counts = sorted({evaluation.episodes for evaluation in evaluations.values()})
     _print_measures(
-        f"{' or '.join(map(str, counts))} episodes a row: means [95 % bootstrap interval]",
+        f"{' or '.join(map(str, counts))} episodes per row: means [95 % bootstrap interval]",
         "policy",
         {title: vars(evaluation) for title, evaluation in evaluations.items()},
-        _TELLING,
+        _MAIN_COLUMNS,
     )
     if not details:
         return
     for title, evaluation in evaluations.items():
         if evaluation.motors:
             _print_measures(
-                f"motors of {title}: energies of an episode", "motor", evaluation.motors, _OF_MOTORS
+                f"motors of {title}: energies of an episode",
+                "motor",
+                evaluation.motors,
+                _MOTOR_COLUMNS,
             )
     names = list(evaluations)
+    # Three columns of evaluations fit into 80 characters.
     for begin in range(0, len(names), 3):
         _print_details({name: evaluations[name] for name in names[begin : begin + 3]})
 
 
 Columns = Mapping[str, tuple[str, Callable[[Any], str]]]
-"""Measure -> its column's header, and its value as text."""
+"""Measure -> header of its column, and a function that formats its value."""
 
 
 def _print_measures(
-    title: str, what: str, rows: Mapping[str, Mapping[str, Any]], columns: Columns
+    title: str, row_header: str, rows: Mapping[str, Mapping[str, Any]], columns: Columns
 ) -> None:
-    """A row for each of some measured things, a column for each measure that one of them has."""
-    shown = {
+    """Print a row for each entry, with a column for each measure that at least one entry has."""
+    shown_columns = {
         name: columns[name]
         for name in columns
         if any(row.get(name) is not None for row in rows.values())
     }
-    heads = [head for head, _ in shown.values()]
+    heads = [head for head, _ in shown_columns.values()]
     cells = [
         (
             label,
             *(
                 "–" if row[name] is None else as_text(row[name])
-                for name, (_, as_text) in shown.items()
+                for name, (_, as_text) in shown_columns.items()
             ),
         )
         for label, row in rows.items()
     ]
-    print_table(title, (what, *heads), cells, right=heads, whole=heads)
+    print_table(title, (row_header, *heads), cells, right=heads, whole=heads)
 
 
 def _print_details(evaluations: Mapping[str, Evaluation]) -> None:
-    """A column for each evaluation, a row for each measure that one of them has and that is not whole in the first."""
-    ends = [
+    """Print a column for each evaluation, and a row for each measure.
+
+    Measures that the first table shows completely, and those that no evaluation has, are left out.
+    """
+    endings = [
         f"{e.terminated} task, {e.episodes - e.terminated} time limit" for e in evaluations.values()
     ]
-    rows = [("episodes ended by", *ends)]
+    rows = [("episodes ended by", *endings)]
     for name, field in MEASURES.items():
         values = [getattr(evaluation, name) for evaluation in evaluations.values()]
-        spread = any(isinstance(value, Interval | Quartiles) for value in values)
+        has_interval = any(isinstance(value, Interval | Quartiles) for value in values)
         if (
-            name in _SHOWN
-            or (name in _TELLING and not spread)
+            name in _NOT_IN_DETAILS
+            or (name in _MAIN_COLUMNS and not has_interval)
             or all(value is None for value in values)
         ):
             continue
         unit = field.metadata["unit"]
         if unit == "share":
-            unit, values = "%", [value and tuple(100.0 * one for one in value) for value in values]
-        rows.append((f"{field.metadata['label']} [{unit.replace('*', '·')}]", *map(number, values)))
+            unit, values = (
+                "%",
+                [value and tuple(100.0 * bound for bound in value) for value in values],
+            )
+        rows.append(
+            (f"{field.metadata['label']} [{unit.replace('*', '·')}]", *map(format_number, values))
+        )
     title = "mean [95 % interval], or median [quartiles]"
     print_table(title, ("measure", *evaluations), rows, right=list(evaluations), whole=("measure",))
 
 
-_TELLING: Columns = {
+_MAIN_COLUMNS: Columns = {
     "success": ("success", lambda value: f"{100 * value.mean:.0f} %"),
     "returns": ("return", lambda value: "{:.1f} [{:.1f}, {:.1f}]".format(*value)),
     "time_to_goal": ("time to\ngoal", lambda value: f"{value.median:.1f} s"),
-    "tracking_rms": ("shaft\ntorque\nerror", lambda value: f"{number(value)} N·m"),
+    "tracking_rms": ("shaft\ntorque\nerror", lambda value: f"{format_number(value)} N·m"),
     "saturated_percent": ("satu-\nrated", lambda value: f"{value:.1f} %"),
     "peak_voltage": ("peak\n|u|", lambda value: f"{value:.1f} V"),
-    "energy_drawn": ("energy\ndrawn", lambda value: f"{number(value.mean)} J"),
+    "energy_drawn": ("energy\ndrawn", lambda value: f"{format_number(value.mean)} J"),
 }
-_SHOWN = ("returns", "failure")  # whole in the first table, or by what is in it
-_OF_MOTORS: Columns = {
-    name: (head, number)
+# The first table shows the returns with their interval; failure is the complement of success.
+_NOT_IN_DETAILS = ("returns", "failure")
+_MOTOR_COLUMNS: Columns = {
+    name: (head, format_number)
     for name, head in {
         "tracking_rms": "shaft torque\nerror [N·m]",
         "tracking_percent": "of desired\n[%]",

@@ -4,15 +4,15 @@ import importlib.metadata
 import re
 
 DISTRIBUTIONS = {"PIL": "pillow", "serial": "pyserial"}
-"""Modules whose distribution has another name than they have."""
+"""Modules whose distribution has another name."""
 _NOT_FOR_USERS = {"bench", "dev", "docs"}
 
 
 def missing_module_message(error: ModuleNotFoundError) -> str:
-    """Return a sentence that names a missing module, and the extras of this package that install it.
+    """Return a sentence that names a missing module and the extras of this package that install it.
 
-    The extras are read from the metadata of the installed package, so there is no second list of
-    them.
+    The extras are read from the metadata of the installed package, so that there is no second list
+    of them.
 
     Args:
         error: the error of an import, or of `importlib.metadata`.
@@ -21,24 +21,25 @@ def missing_module_message(error: ModuleNotFoundError) -> str:
     distribution = DISTRIBUTIONS.get(module, module).replace("_", "-").lower()
     extras = _extras_with(distribution)
     if not extras:
-        return f"{' '.join(str(error).split())}: install what provides it"
+        return f"{' '.join(str(error).split())}: install the package that provides it"
     if len(extras) == 1:
         return (
-            f"{module} is not installed. The extra '{extras[0]}' brings it: pip install"
+            f"{module} is not installed. The extra '{extras[0]}' installs it: pip install"
             f" 'codrl-mj[{extras[0]}]'"
         )
     names = ", ".join(f"'{extra}'" for extra in extras)
     return (
-        f"{module} is not installed. Each of the extras {names} brings it: pip install one, or"
+        f"{module} is not installed. Each of the extras {names} installs it: pip install one, or"
         " 'codrl-mj[all]'"
     )
 
 
 def _extras_with(distribution: str) -> list[str]:
-    """Return the extras that require a distribution, without those that contain another one of them."""
+    """Return the extras that require a distribution, without those that contain another of them."""
     try:
         requirements = importlib.metadata.requires("codrl-mj") or []
-    except importlib.metadata.PackageNotFoundError:  # a checkout that was not installed
+    # A checkout that was not installed has no metadata.
+    except importlib.metadata.PackageNotFoundError:
         return []
     extras: dict[str, set[str]] = {}
     for requirement in requirements:
@@ -46,9 +47,9 @@ def _extras_with(distribution: str) -> list[str]:
         extra = re.search(r"extra == ['\"](?P<name>[\w-]+)['\"]", requirement)
         if name and extra and extra["name"] not in _NOT_FOR_USERS:
             extras.setdefault(extra["name"], set()).add(name[0].lower())
-    having = {extra: names for extra, names in extras.items() if distribution in names}
+    matching = {extra: names for extra, names in extras.items() if distribution in names}
     return [
         extra
-        for extra, names in having.items()
-        if not any(other < names for other in having.values())
+        for extra, names in matching.items()
+        if not any(subset < names for subset in matching.values())
     ]

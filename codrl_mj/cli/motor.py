@@ -1,4 +1,4 @@
-"""`codrl-mj motor list`, `new`, `show`, `design` and `step`: off-the-shelf motors, and your own."""
+"""`codrl-mj motor list`, `new`, `show`, `design` and `step`: off-the-shelf and custom motors."""
 
 import dataclasses
 import math
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from codrl_mj.cli.parsing import AsJson
-from codrl_mj.cli.terminal import number, print_table, say
+from codrl_mj.cli.terminal import format_number, print_table, print_text
 from codrl_mj.fields import command
 
 MotorName = Annotated[
@@ -17,7 +17,7 @@ MotorName = Annotated[
         metavar="NAME",
         help=(
             "A motor of the catalogue (codrl-mj motor list), a TOML file with a datasheet, a YAML"
-            " or JSON file with the fields of a drive, or module:NAME of your own."
+            " or JSON file with the fields of a drive, or your own as module:NAME."
         ),
     ),
 ]
@@ -25,41 +25,45 @@ MotorName = Annotated[
 
 @dataclasses.dataclass(frozen=True)
 class Changes:
-    """Set over the named motor and its drive; what is left out is theirs."""
+    """Values that override those of the named motor and its drive."""
 
     gear_ratio: float | None = None
-    """Turns of the rotor for a turn of the output."""
+    """Turns of the rotor per turn of the output."""
     sample_rate: float | None = None
-    """Samples of the current loop a second [Hz]; 20000 of a motor of the catalogue."""
+    """Samples per second of the current loop [Hz]; motors of the catalogue: 20000."""
     bandwidth: float | None = None
-    """Bandwidth [Hz] that the loop's gains are designed for, at most sample rate / (2 pi); 0: 0.0555 of the rate."""
+    """Bandwidth [Hz] that the loop's gains are designed for, at most sample rate / (2 pi); 0:
+    0.0555 of the rate.
+    """
     voltage: float | None = None
-    """Voltage of the supply [V]; the nominal one of a motor of the catalogue, or 24."""
+    """Voltage of the supply [V]; motors of the catalogue: the nominal voltage, or 24."""
     delayed: tyro.conf.FlagCreatePairsOff[bool] = False
-    """The voltage that a sample computes is applied in the next one, as by most digital drives."""
+    """Apply each computed voltage in the next sample, as most digital drives do."""
     not_delayed: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(name="no-delayed")] = (
         False
     )
-    """It is applied at once, as by the drive of a motor of the catalogue."""
+    """Apply each computed voltage at once, as the drives of the catalogue's motors do."""
     max_current: float | None = None
-    """Largest current [A] that the drive asks for."""
+    """Current limit of the drive [A]."""
 
     def drive(self, name: str) -> Any:
-        """The named drive with these set over it."""
+        """Return the named drive with these values."""
         from codrl_mj.sizing import find_drive
 
-        given: dict[str, Any] = dict(vars(self))
-        if given.pop("not_delayed") == given["delayed"]:
-            given["delayed"] = None
+        overrides: dict[str, Any] = dict(vars(self))
+        if overrides.pop("not_delayed") == overrides["delayed"]:
+            overrides["delayed"] = None
         if self.delayed and self.not_delayed:
             raise ValueError("--delayed and --no-delayed: give one of them")
-        return find_drive(name, **given)
+        return find_drive(name, **overrides)
 
 
 Settings = tyro.conf.OmitArgPrefixes[Changes]
-"""Type of a verb's field for `Changes`: `--gear-ratio` and not `--changes.gear-ratio`."""
-_LISTED = {
-    # column: header, its unit, SI values to it
+"""Type of a verb's field for `Changes`, with flags `--gear-ratio` instead of
+`--changes.gear-ratio`.
+"""
+_LIST_COLUMNS = {
+    # field: (header, unit, factor from SI units)
     "name": ("name", "", 0.0),
     "voltage": ("at", "V", 1.0),
     "power": ("power", "W", 1.0),
@@ -74,16 +78,16 @@ _LISTED = {
 
 @dataclasses.dataclass(frozen=True)
 class List:
-    """List the motors of the catalogue, with what they can do at their nominal voltage.
+    """List the motors of the catalogue with their abilities at nominal voltage.
 
-    Power is the most that the motor makes; the torque that it bears for ever, that of the blocked
-    shaft and the speed of the free one are those of the gear's output, past friction; kT and J are
-    the motor's alone. --json has more.
+    Power is the maximum mechanical power. Continuous torque, stall torque and no-load speed are
+    those of the gear's output, with friction subtracted; kT and J are those of the motor without
+    its gear. --json has more.
 
     Example: codrl-mj motor list --sort power
     """
 
-    sort: Literal[tuple(_LISTED)] = "name"  # type: ignore[valid-type]
+    sort: Literal[tuple(_LIST_COLUMNS)] = "name"  # type: ignore[valid-type]
     """Order: names from A, numbers from the highest."""
     as_json: AsJson = False
 
@@ -95,10 +99,13 @@ class List:
         from codrl_mj.sizing.abilities import ABILITY_UNITS
 
         rows = catalogue_rows(self.sort)
-        columns = [f"{head}\n{unit}" for head, unit, _ in _LISTED.values()]
-        scales = [(name, scale) for name, (*_, scale) in _LISTED.items() if name != "name"]
+        columns = [f"{head}\n{unit}" for head, unit, _ in _LIST_COLUMNS.values()]
+        scales = [(name, scale) for name, (*_, scale) in _LIST_COLUMNS.items() if name != "name"]
         cells = [
-            (row["name"], *(number(row[name] and row[name] * scale) for name, scale in scales))
+            (
+                row["name"],
+                *(format_number(row[name] and row[name] * scale) for name, scale in scales),
+            )
             for row in rows
         ]
         print_table(
@@ -109,8 +116,8 @@ class List:
             whole=columns[:1],
             padding=(0, 0),
         )
-        say("at: nominal voltage. –: not printed; a voltage is then taken as 24 V.")
-        print("codrl-mj motor show NAME says where each number is from")
+        print_text("at: nominal voltage. –: not on the datasheet; the voltage is then 24 V.")
+        print("codrl-mj motor show NAME gives the source of each number")
         kinds = {name: KINDS.get(OTHER_NAMES.get(name, name)) for name in rows[0]}
         units = ABILITY_UNITS | {
             name: kind.unit for name, kind in kinds.items() if kind is not None
@@ -120,12 +127,12 @@ class List:
 
 @dataclasses.dataclass(frozen=True)
 class Show:
-    """Show a motor: every number with its unit and where it is from, and its torque-speed diagram.
+    """Show a motor: every number with its unit and source, and the torque-speed diagram.
 
-    The diagram has the voltage limit (torque falls with speed, because the back-EMF takes its share
-    of the voltage), the peak and the continuous current, at the output of the gear and past
-    friction, in all four quadrants: what the motor drives with, and what it brakes with. Shaded is
-    what it can do for a moment.
+    The diagram shows the voltage limit (torque falls with speed, because the back-EMF uses up a
+    part of the voltage), the peak current and the continuous current, at the output of the gear and
+    with friction subtracted. It covers all four quadrants, both driving and braking. The shaded
+    area is available for short times only.
 
     Example: codrl-mj motor show maxon-ec45-flat-50w --gear-ratio 12 --out motor
     """
@@ -135,20 +142,22 @@ class Show:
     out: Path | None = None
     """Folder for torque_speed.png."""
     html: Path | None = None
-    """Page with all of this, the current loop and its steps: one .html file."""
+    """Page with these tables, the current loop and its steps: one .html file."""
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
-        """Print the tables, draw the diagram."""
+        """Print the tables and draw the diagram."""
         from codrl_mj.sizing import explain, find_entry, find_loop
 
         drive, entry = self.changes.drive(self.name), find_entry(self.name)
-        found = explain(drive, entry, find_loop(self.name))
+        explanation = explain(drive, entry, find_loop(self.name))
         if self.out is not None:
             from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
             figure = torque_speed_diagram(drive, entry and entry.numbers)
-        _print_explained(f"{self.name}: {entry.title}" if entry else "", drive.voltage_limit, found)
+        _print_explanation(
+            f"{self.name}: {entry.title}" if entry else "", drive.voltage_limit, explanation
+        )
         if self.html is not None:
             from codrl_mj.viz.pages.motor import motor_page
 
@@ -156,45 +165,58 @@ class Show:
             print(f"wrote {self.html}")
         if self.out is not None:
             save_plot(figure, self.out / "torque_speed.png")
-        return 0, found
+        return 0, explanation
 
 
-def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
-    """What it can do first, then its numbers, then what to know of them."""
+def _print_explanation(title: str, volts: float, explanation: dict[str, Any]) -> None:
+    """Print the abilities of a motor, then its numbers, then the notes on them."""
     from codrl_mj.sizing import unknown_in_words
 
     def show(title: str, part: str) -> None:
-        rows = [(row["name"], number(row["value"], 4), row["unit"]) for row in found[part]]
+        rows = [
+            (row["name"], format_number(row["value"], 4), row["unit"]) for row in explanation[part]
+        ]
         print_table(title, ("number", "value", "unit"), rows, right=("value",))
 
-    say(title)
-    show(f"What it can do at its output, at {volts:g} V", "abilities")
-    say(found["assumed"])
-    if "numbers" in found:
+    print_text(title)
+    show(f"Abilities at its output, at {volts:g} V", "abilities")
+    print_text(explanation["assumed"])
+    if "numbers" in explanation:
         rows = []
-        for row in found["numbers"]:
-            how = row["how"].removeprefix(f"{row['name']} = ")
-            estimated = "" if row["name"] not in found["estimated"] else " (estimated)"
+        for row in explanation["numbers"]:
+            derivation = row["how"].removeprefix(f"{row['name']} = ")
+            estimated = "" if row["name"] not in explanation["estimated"] else " (estimated)"
             rows.append(
-                (row["name"], number(row["value"], 4), row["unit"], how + estimated, row["places"])
+                (
+                    row["name"],
+                    format_number(row["value"], 4),
+                    row["unit"],
+                    derivation + estimated,
+                    row["places"],
+                )
             )
-        columns = "number", "value", "unit", "how it came about", "source"
+        columns = "number", "value", "unit", "derivation", "source"
         print_table(
             "The motor, at its rotor", columns, rows, right=("value",), whole=("number", "unit")
         )
     show("As it is simulated", "drive")
-    if "numbers" in found:
+    if "numbers" in explanation:
         for kind, texts in (
-            ("disagreement", found["disagreements"]),
-            ("note", [" ".join(found["notes"].split())] if found["notes"] else []),
-            ("estimated", [f"{field}: {why}" for field, why in found["estimated"].items()]),
-            ("source", [f"{number}: {source}" for number, source in enumerate(found["cited"], 1)]),
+            ("disagreement", explanation["disagreements"]),
+            ("note", [" ".join(explanation["notes"].split())] if explanation["notes"] else []),
+            ("estimated", [f"{field}: {why}" for field, why in explanation["estimated"].items()]),
+            (
+                "source",
+                [f"{index}: {source}" for index, source in enumerate(explanation["cited"], 1)],
+            ),
         ):
-            say(*(f"{kind} {text}" if kind == "source" else f"{kind}: {text}" for text in texts))
-        say(unknown_in_words(found["unknown"]))
+            print_text(
+                *(f"{kind} {text}" if kind == "source" else f"{kind}: {text}" for text in texts)
+            )
+        print_text(unknown_in_words(explanation["unknown"]))
 
 
-_DESIGNED = (
+_DESIGN_COLUMNS = (
     *(
         "rate\nkHz",
         "delay\nsamples",
@@ -221,15 +243,16 @@ _LOOP_UNITS |= dict.fromkeys(("sample_rate", "phase_crossover", "crossover", "ba
 
 @dataclasses.dataclass(frozen=True)
 class Design:
-    """Design the current loop: gains, margins, bandwidth, settling time, with and without a sample of delay.
+    """Design the current loop: gains, margins, bandwidth and settling time, with and without delay.
 
-    The PI controller's zero cancels the winding's pole, which leaves one choice, the bandwidth.
-    More of it follows faster and stands less delay: a phase margin of 60 degrees is comfortable, 30
-    rings, 0 oscillates. A digital drive computes a voltage from one sample and applies it in the
-    next (--delayed), and the hold costs half a sample more, so bandwidth is bought with sample
-    rate. Margins count the delay and the hold; bandwidth is where the closed loop's gain is -3 dB,
-    above the one designed for where a delayed loop swings; settling time and overshoot are those of
-    a small step of the simulated drive.
+    The zero of the PI controller cancels the pole of the winding, so that only the bandwidth is
+    left to choose. A larger bandwidth follows faster and tolerates less delay: a phase margin of 60
+    degrees is comfortable, 30 rings, 0 oscillates. A digital drive computes a voltage from one
+    sample and applies it in the next (--delayed), and the hold costs another half sample, so that a
+    larger bandwidth needs a higher sample rate. The margins include the delay and the hold. The
+    bandwidth is where the gain of the closed loop is -3 dB; with a delayed loop that overshoots it
+    is above the designed one. Settling time and overshoot are those of a small step of the
+    simulated drive.
 
     Example: codrl-mj motor design quanser-qube-servo-2 --bandwidth 1000 --delayed --out motor
     """
@@ -237,41 +260,50 @@ class Design:
     name: MotorName
     changes: Settings = Changes()
     out: Path | None = None
-    """Folder for bode.png: the loop, open and closed, with its margins."""
+    """Folder for bode.png: the open and the closed loop, with the margins."""
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
-        """Print the table, draw Bode's diagram."""
+        """Print the table and draw the Bode plot."""
         from codrl_mj.sizing import LoopDesign, design, designs, sampled_too_seldom
 
         drive = self.changes.drive(self.name)
-        own, every = design(drive), designs(drive)
-        late = "a sample of delay" if own.delayed else "no delay"
-        say(
-            f"{self.name} at {own.sample_rate:g} Hz, {late}: kp = {own.kp:.6g} V/A, ki ="
-            f" {own.ki:.6g} V/(A·s)"
+        chosen, all_designs = design(drive), designs(drive)
+        delay_text = "a sample of delay" if chosen.delayed else "no delay"
+        print_text(
+            f"{self.name} at {chosen.sample_rate:g} Hz, {delay_text}: kp = {chosen.kp:.6g} V/A,"
+            f" ki = {chosen.ki:.6g} V/(A·s)"
         )
         rows = []
-        for (rate, delayed), one in every.items():
-            mark = "*" if (rate, delayed) == (own.sample_rate, own.delayed) else ""
+        for (rate, delayed), candidate in all_designs.items():
+            mark = "*" if (rate, delayed) == (chosen.sample_rate, chosen.delayed) else ""
             row = [f"{mark}{rate / 1e3:g}", "1" if delayed else "0"]
-            if isinstance(one, LoopDesign):
-                margin = 20.0 * math.log10(one.gain_margin)
-                rest = one.kp, one.ki, margin, one.phase_margin, one.crossover, one.bandwidth
+            if isinstance(candidate, LoopDesign):
+                margin = 20.0 * math.log10(candidate.gain_margin)
+                rest = (
+                    candidate.kp,
+                    candidate.ki,
+                    margin,
+                    candidate.phase_margin,
+                    candidate.crossover,
+                    candidate.bandwidth,
+                )
                 row += [
-                    number(value, 4)
-                    for value in (*rest, 1e3 * one.settling_time, 100.0 * one.overshoot)
+                    format_number(value, 4)
+                    for value in (*rest, 1e3 * candidate.settling_time, 100.0 * candidate.overshoot)
                 ]
             rows.append(row)
         print_table(
-            "The loop at other rates, with and without delay (*: as asked for)",
-            _DESIGNED,
+            "The loop at other rates, with and without delay (*: the chosen one)",
+            _DESIGN_COLUMNS,
             rows,
-            _DESIGNED,
+            _DESIGN_COLUMNS,
             padding=(0, 0),
         )
-        impossible = dict.fromkeys(one for one in every.values() if isinstance(one, str))
-        say(
+        impossible = dict.fromkeys(
+            candidate for candidate in all_designs.values() if isinstance(candidate, str)
+        )
+        print_text(
             *(f"not possible: {why}" for why in impossible),
             sampled_too_seldom(drive),
             drive.assumed,
@@ -280,18 +312,20 @@ class Design:
             from codrl_mj.viz.pages.diagrams import bode_diagram
 
             save_plot(bode_diagram(drive), self.out / "bode.png")
-        others = [one for one in every.values() if isinstance(one, LoopDesign)]
-        return 0, {"units": _LOOP_UNITS, **vars(own), "others": others}
+        others = [
+            candidate for candidate in all_designs.values() if isinstance(candidate, LoopDesign)
+        ]
+        return 0, {"units": _LOOP_UNITS, **vars(chosen), "others": others}
 
 
 @dataclasses.dataclass(frozen=True)
 class Step:
     """Step the current: a small step, and one out of saturation with each kind of anti-windup.
 
-    For 20 ms more current is asked for than the voltage can make against the back-EMF, then less.
-    Without anti-windup the controller's integral has grown meanwhile and has to be worked off
-    before the current comes down (recovery); with clamping it stands still, with back-calculation
-    it follows what was possible.
+    For 20 ms the reference is larger than the current that the voltage can drive against the
+    back-EMF; then it is smaller. Without anti-windup the controller's integral has grown in the
+    meantime and must unwind before the current falls (recovery). With clamping the integral stands
+    still, with back-calculation it follows the current that is possible.
 
     Example: codrl-mj motor step quanser-qube-servo-2 --out motor
     """
@@ -303,7 +337,7 @@ class Step:
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
-        """Print the table, draw the responses."""
+        """Print the table and draw the responses."""
         from codrl_mj.sizing import sampled_too_seldom, step
 
         drive = self.changes.drive(self.name)
@@ -312,30 +346,37 @@ class Step:
         settled, amplitude = small.settling_time(), float(small.reference[-1])
         responses = steps.recoveries.items()
         recoveries = {
-            k: {"time": one.settling_time(0.05), "undershoot": one.undershoot}
-            for k, one in responses
+            kind: {"time": response.settling_time(0.05), "undershoot": response.undershoot}
+            for kind, response in responses
         }
-        say(
+        print_text(
             f"{self.name}: a step to {amplitude:.4g} A, {constant * amplitude:.4g} N·m at the"
-            f" rotor, stays within 2 % after {number(1e3 * settled, 4)} ms and overshoots by"
+            f" rotor, stays within 2 % after {format_number(1e3 * settled, 4)} ms and overshoots by"
             f" {100.0 * small.overshoot:.2g} %",
-            f"at {steps.speed:.4g} rad/s of the rotor it is asked for {steps.unreachable:.4g} A,"
-            f" out of reach, for 20 ms, then {steps.reachable:.4g} A, which it reaches:",
+            f"at {steps.speed:.4g} rad/s of the rotor the reference is {steps.unreachable:.4g} A,"
+            f" which is out of reach, for 20 ms, then {steps.reachable:.4g} A, which is reached:",
         )
         columns = "anti-windup", "within 5 %\nafter ms", "undershoot\n%"
         rows = [
-            (kind, number(1e3 * one["time"]), number(100.0 * one["undershoot"], 2))
-            for kind, one in recoveries.items()
+            (
+                kind,
+                format_number(1e3 * response["time"]),
+                format_number(100.0 * response["undershoot"], 2),
+            )
+            for kind, response in recoveries.items()
         ]
         print_table("", columns, rows, right=columns[1:])
-        say(sampled_too_seldom(drive), drive.assumed)
+        print_text(sampled_too_seldom(drive), drive.assumed)
         if self.out is not None:
             from codrl_mj.viz.pages import diagrams
 
-            shown = [*diagrams.small_steps({"": (drive, None)}), *diagrams.recoveries(drive, steps)]
-            save_plot(shown, self.out / "step.png")
+            plots = [
+                *diagrams.small_step_plots({"": (drive, None)}),
+                *diagrams.recovery_plots(drive, steps),
+            ]
+            save_plot(plots, self.out / "step.png")
         content = {"current": amplitude, "settling_time": settled, "overshoot": small.overshoot}
-        asked = {name: getattr(steps, name) for name in ("speed", "unreachable", "reachable")}
+        currents = {name: getattr(steps, name) for name in ("speed", "unreachable", "reachable")}
         units = {
             "current": "A",
             "settling_time": "s",
@@ -347,22 +388,22 @@ class Step:
         return 0, {
             "units": units,
             "small": content,
-            "saturated": {**asked, "recoveries": recoveries},
+            "saturated": {**currents, "recoveries": recoveries},
         }
 
 
 @dataclasses.dataclass(frozen=True)
 class New:
-    """Write a file for a motor of your own, to be filled in with what its datasheet prints; docs/motors.md.
+    """Write a template file for a custom motor, to be filled in from its datasheet; docs/motors.md.
 
     Example: codrl-mj motor new my_motor.toml
     """
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE.toml")]
-    """The file; one that exists is left alone."""
+    """File to write; an existing file is not changed."""
 
     def run(self) -> int:
-        """Write it."""
+        """Write the file."""
         from codrl_mj.catalogue import new_motor
 
         new_motor(self.file)
@@ -371,8 +412,8 @@ class New:
 
 
 def save_plot(figure: Any, path: Path) -> None:
-    """Write a figure, and say so."""
-    from codrl_mj.viz.pages.plots import save
+    """Write a figure to a PNG file and print its path."""
+    from codrl_mj.viz.pages.plots import save_png
 
-    save(figure, path)
+    save_png(figure, path)
     print(f"wrote {path}")

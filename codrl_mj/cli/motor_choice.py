@@ -10,36 +10,36 @@ from rich.text import Text
 
 from codrl_mj.cli.motor import save_plot
 from codrl_mj.cli.parsing import AsJson, Trust
-from codrl_mj.cli.terminal import print_table, say
+from codrl_mj.cli.terminal import print_table, print_text
 from codrl_mj.runs import told_apart
 
-Asked = Annotated[
+TaskOrRun = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(
         metavar="TASK|RUN",
         help=(
             "A task, which a scripted controller drives; a run folder, trained on the ideal"
-            " actuator, of a task or of somebody else's environment; or an .npz file with the"
-            " arrays time [s], torque [N*m] and speed [rad/s] of a joint."
+            " actuator, of a task or a third-party environment; or an .npz file with the arrays"
+            " time [s], torque [N*m] and speed [rad/s] of a joint."
         ),
     ),
 ]
-OfMotor = Annotated[
+MotorOfRun = Annotated[
     str | None,
     tyro.conf.arg(
         metavar="NAME",
-        help="Of a run with several motors, the one that is asked about, by its name.",
+        help="Name of the motor to consider, for a run with several motors.",
     ),
 ]
 
 
 @dataclasses.dataclass(frozen=True)
 class Feasible:
-    """Ask whether a motor can do a task, before training; docs/motors.md.
+    """Check before training whether a motor can do a task; docs/motors.md.
 
-    The last line is surely, it depends (on what the datasheet lacks), try it, hopeless or surely
-    not; exit status 1 for the last two. Example: codrl-mj motor feasible maxon-ec45-flat-50w
-    pendulum --gear-ratio 20
+    The last line is surely, it depends (on values that the datasheet lacks), try it, hopeless or
+    surely not. The exit status is 1 for the last two. Example: codrl-mj motor feasible
+    maxon-ec45-flat-50w pendulum --gear-ratio 20
     """
 
     name: Annotated[
@@ -49,16 +49,16 @@ class Feasible:
             help="A motor of the catalogue (codrl-mj motor list), or a file or module:NAME.",
         ),
     ]
-    asked: Asked
+    task_or_run: TaskOrRun
     gear_ratio: float | None = None
-    """Turns of the rotor for a turn of the joint, or radians for a metre; the motor's own unless given."""
+    """Turns of the rotor per turn of the joint, or radians per meter; default: the motor's own."""
     voltage: float | None = None
     """Voltage of the supply [V]."""
     max_current: float | None = None
-    """Largest current that the drive gives [A]; the motor's own unless given."""
-    motor: OfMotor = None
+    """Current limit of the drive [A]; default: the motor's own."""
+    motor: MotorOfRun = None
     out: Path | None = None
-    """Folder for torque_speed.png: what was asked for over what the motor can do."""
+    """Folder for torque_speed.png: the demanded operating points and the motor's limits."""
     trust: Trust = False
     as_json: AsJson = False
 
@@ -79,11 +79,14 @@ class Feasible:
         )
         entry = find_entry(self.name)
         continuous, unknown = entry.numbers.continuous_current if entry else None, uncounted(entry)
-        demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
-        found = feasibility(drive, demand, continuous)
-        title = f"{self.name}, {_gear(drive, demand)}, {drive.voltage_limit:g} V: {demand.source}"
+        demand = demand_of(self.task_or_run, trust=self.trust, motor=self.motor)
+        judgment = feasibility(drive, demand, continuous)
+        title = (
+            f"{self.name}, {_gear_text(drive, demand)}, {drive.voltage_limit:g} V: {demand.source}"
+        )
         rows: list[Any] = []
-        for bound in found.bounds:
+        for bound in judgment.bounds:
+            # Unknown numbers are NaN, which differs from itself.
             numbers = (
                 f"{value:.4g}" if value == value else "unknown"
                 for value in (bound.needed, bound.available)
@@ -92,57 +95,61 @@ class Feasible:
             mark = Text("unknown", "yellow") if bound.verdict == sizing.DEPENDS else mark
             rows.append((bound.name, bound.formula, *numbers, bound.unit, mark, bound.verdict))
         print_table(
-            title, ("bound", "of", "needs", "has", "unit", "", "says"), rows, right=("needs", "has")
+            title,
+            ("bound", "of", "needs", "has", "unit", "", "verdict"),
+            rows,
+            right=("needs", "has"),
         )
-        asked, best = found.operation, geared(drive, demand, continuous)
-        at_best, (low, high) = (
-            feasibility(best, demand, continuous),
-            sizing.equal_gears(best, demand, continuous),
+        operation, best_drive = judgment.operation, geared(drive, demand, continuous)
+        best_judgment, (low, high) = (
+            feasibility(best_drive, demand, continuous),
+            sizing.equal_gears(best_drive, demand, continuous),
         )
-        say(
-            f"{asked.energy_drawn:.3g} J drawn and {asked.copper_loss:.3g} J of heat in an episode,"
-            f" {asked.rms_current:.3g} A rms; share of rotor and friction in the largest load:"
-            f" {_share(drive, asked)}",
-            *map(str, found.in_the_way),
-            f"best {_gear(best, demand)}: {at_best.verdict}, with a margin of {at_best.margin:.0%};"
-            f" the verdict is the same from {low:.3g} to {high:.3g}",
-            _uncounted(unknown, found.why),
+        print_text(
+            f"{operation.energy_drawn:.3g} J drawn and {operation.copper_loss:.3g} J of heat per"
+            f" episode, {operation.rms_current:.3g} A rms; share of rotor and friction in the"
+            f" largest load: {_own_share_text(drive, operation)}",
+            *map(str, judgment.in_the_way),
+            f"best {_gear_text(best_drive, demand)}: {best_judgment.verdict}, with a margin of"
+            f" {best_judgment.margin:.0%}; the verdict is the same from {low:.3g} to {high:.3g}",
+            _unknown_text(unknown, judgment.why),
             drive.assumed,
         )
         if self.out is not None:
             _draw(drive, demand, self.name, self.out / "torque_speed.png")
-        say(found.verdict)
+        print_text(judgment.verdict)
         content = {
             "units": _UNITS,
             "motor": self.name,
             "gear_ratio": 1.0 / drive.arm_radius,
             "voltage": drive.voltage_limit,
             "demand": demand.source,
-            "verdict": found.verdict,
-            "margin": found.margin,
-            "bounds": found.bounds,
-            **_asked(asked),
+            "verdict": judgment.verdict,
+            "margin": judgment.margin,
+            "bounds": judgment.bounds,
+            **_operation_mapping(operation),
             "best": {
-                "gear_ratio": 1.0 / best.arm_radius,
-                "verdict": at_best.verdict,
-                "margin": at_best.margin,
+                "gear_ratio": 1.0 / best_drive.arm_radius,
+                "verdict": best_judgment.verdict,
+                "margin": best_judgment.margin,
             },
             "gear_ratios_as_good": (low, high),
             "unknown": unknown,
         }
-        return int(found.verdict in (sizing.HOPELESS, sizing.SURELY_NOT)), content
+        return int(judgment.verdict in (sizing.HOPELESS, sizing.SURELY_NOT)), content
 
 
 @dataclasses.dataclass(frozen=True)
 class Choose:
-    """Rank motors for a task, the smallest that does it first, and say what is wrong with the others.
+    """Rank motors for a task, the smallest suitable one first, and say why others are unsuitable.
 
-    Exit status 1 if none does it. Motors of your own (files) or of the catalogue are named beside
-    the task; without any the catalogue's are ranked. Each keeps the gear of its datasheet, gets its
-    best one if it has none, or is judged with each of --gears. It does the task if motor feasible
-    says surely, with the margin; smallest means by the most mechanical power at its supply. A run
-    with several motors gets one for each of them. With --out there is the file actuators.yaml,
-    which train, evaluate and render take as --actuators FILE.
+    The exit status is 1 if none is suitable. Name custom motors (files) or motors of the catalogue
+    beside the task; without any, all motors of the catalogue are ranked. Each keeps the gear of its
+    datasheet, gets the best gear if it has none, or is judged with each of --gears. A motor is
+    suitable if motor feasible says surely, with the margin; the smallest is the one with the least
+    maximum mechanical power at its supply. For a run with several motors one is chosen for each of
+    them. --out also writes actuators.yaml, which train, evaluate and render take as --actuators
+    FILE.
 
     Example: codrl-mj motor choose pendulum --top 5 --out chosen, codrl-mj motor choose a.toml
     b.toml pendulum, codrl-mj motor choose a.toml pendulum --gears 6.25 18.75 30, or codrl-mj motor
@@ -154,32 +161,33 @@ class Choose:
         tyro.conf.arg(
             metavar="[MOTOR ...] TASK|RUN",
             help=(
-                "Motors to rank, as for motor show, if not the whole catalogue; and a task, run"
+                "Motors to rank, as for motor show (default: the whole catalogue); and a task, run"
                 " folder or .npz file, as for motor feasible."
             ),
         ),
     ]
     top: int = 5
-    """How many to show in the table; of those that do not do it is told why."""
+    """Number of motors in the table; for unsuitable ones the reason is printed."""
     margin: float = 0.2
-    """Share of voltage, largest and continuous current that has to be left."""
+    """Share of the voltage, the peak current and the continuous current that must be left."""
     voltage: float | None = None
-    """Voltage of the supply [V]; each motor's own unless given."""
+    """Voltage of the supply [V]; default: each motor's own."""
     max_current: float | None = None
-    """Largest current that the drive gives [A]; each motor's own unless given."""
+    """Current limit of the drive [A]; default: each motor's own."""
     gears: Annotated[tuple[float, ...], tyro.conf.arg(metavar="RATIO ...")] = ()
-    """Gears that can be bought, turns of the rotor for a turn of the joint, or radians for a metre:
-    every motor is judged with each of them. None: the motor's own gear, or its best one if it has
-    none.
+    """Available gears, turns of the rotor per turn of the joint, or radians per meter: every motor
+    is judged with each of them. Default: the motor's own gear, or its best one if it has none.
     """
-    motor: OfMotor = None
+    motor: MotorOfRun = None
     out: Path | None = None
-    """Folder for NAME.png of those shown: what was asked for over what the motor can do."""
+    """Folder for NAME.png of the motors in the table: demanded operating points and the motor's
+    limits.
+    """
     trust: Trust = False
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
-        """Print the ranking, or of several motors the best for each."""
+        """Print the ranking, or for several motors the best choice for each."""
         import yaml
 
         from codrl_mj.runs.files import writing
@@ -187,37 +195,41 @@ class Choose:
 
         if self.top < 1:
             raise ValueError(f"--top {self.top}: must be >= 1")
-        asked, motors = _told_apart(self.words)
-        one = self.motor is not None and {
-            self.motor: demand_of(asked, trust=self.trust, motor=self.motor)
+        task_or_run, motors = _split_words(self.words)
+        single_demand = self.motor is not None and {
+            self.motor: demand_of(task_or_run, trust=self.trust, motor=self.motor)
         }
-        demands = one or demands_of(asked, trust=self.trust)
+        demands = single_demand or demands_of(task_or_run, trust=self.trust)
         settings = motors or None, self.voltage, self.margin, self.gears, self.max_current
         ranked = {name: choose(demand, *settings) for name, demand in demands.items()}
-        alone = next(iter(demands.values())) if len(demands) == 1 else None
-        if alone is not None and alone.model_gear != 1.0:
+        only_demand = next(iter(demands.values())) if len(demands) == 1 else None
+        # MuJoCo multiplies the force of an actuator by its gear. The motor's arm radius divides by
+        # it, so that the motor acts on the joint as it does here.
+        if only_demand is not None and only_demand.model_gear != 1.0:
             text = (
-                f"gears are at the joint; the model's actuator has one of {alone.model_gear:g},"
-                " which the motor's "
+                f"gears act at the joint; the model's actuator has a gear of"
+                f" {only_demand.model_gear:g}, which the motor's "
             )
-            say(f"{text}arm_radius {alone.model_gear:g} undoes")
-        told = [
+            print_text(f"{text}arm_radius {only_demand.model_gear:g} cancels")
+        choices = [
             (name, choice)
-            for name, found in ranked.items()
-            for choice in (found if alone else found[:1])
+            for name, ranking in ranked.items()
+            for choice in (ranking if only_demand else ranking[:1])
         ]
-        shown = told[: self.top] if alone else told
-        source = alone.source if alone else asked
+        shown = choices[: self.top] if only_demand else choices
+        source = only_demand.source if only_demand else task_or_run
         _print_ranking(
-            shown, demands, f"smallest that does it with {self.margin:.0%} left first: {source}"
+            shown,
+            demands,
+            f"smallest suitable motor with a margin of {self.margin:.0%} first: {source}",
         )
-        for place, (name, choice) in enumerate(told):
-            at = f"{choice.name} at {_gear(choice.drive, demands[name])}"
-            unknown = _uncounted(choice.unknown, choice.lacks)
-            about = "; ".join(filter(None, (choice.lacks, unknown, choice.drive.assumed)))
-            if about and (choice.lacks or place < len(shown)):
-                say(f"{at}: {about}" if alone else f"{name}: {at}: {about}")
-        short = [found[0].name for found in ranked.values() if found[0].lacks]
+        for rank, (name, choice) in enumerate(choices):
+            label = f"{choice.name} at {_gear_text(choice.drive, demands[name])}"
+            unknown = _unknown_text(choice.unknown, choice.lacks)
+            notes = "; ".join(filter(None, (choice.lacks, unknown, choice.drive.assumed)))
+            if notes and (choice.lacks or rank < len(shown)):
+                print_text(f"{label}: {notes}" if only_demand else f"{name}: {label}: {notes}")
+        unsuitable = [ranking[0].name for ranking in ranked.values() if ranking[0].lacks]
         if self.out is not None:
             gears = [f"-{choice.ratio:.4g}" if self.gears else "" for _, choice in shown]
             stems = [choice.name.removesuffix(Path(choice.name).suffix) for _, choice in shown]
@@ -225,18 +237,18 @@ class Choose:
                 [Path(f"{stem}{gear}") for stem, gear in zip(stems, gears, strict=True)]
             )
             for (name, choice), motor in zip(shown, motors, strict=True):
-                picture = motor.replace("/", "-") if alone else name
+                picture = motor.replace("/", "-") if only_demand else name
                 _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")
             with writing(self.out / "actuators.yaml") as temporary:
                 chosen = actuators_of(
-                    {name: (found[0], demands[name]) for name, found in ranked.items()}
+                    {name: (ranking[0], demands[name]) for name, ranking in ranked.items()}
                 )
                 temporary.write_text(yaml.safe_dump(chosen, sort_keys=False))
             print(f"wrote {self.out / 'actuators.yaml'}")
-            if short:
-                say(
-                    "no motor surely does it with that margin; written is the nearest:"
-                    f" {', '.join(short)}"
+            if unsuitable:
+                print_text(
+                    "no motor is surely suitable with that margin; the nearest was written:"
+                    f" {', '.join(unsuitable)}"
                 )
         content = [
             {
@@ -249,12 +261,12 @@ class Choose:
                 "does_it": not choice.lacks,
                 "lacks": choice.lacks,
                 "margin": choice.feasibility.margin,
-                **_asked(choice.feasibility.operation),
+                **_operation_mapping(choice.feasibility.operation),
                 "unknown": choice.unknown,
             }
-            for name, choice in told
+            for name, choice in choices
         ]
-        return int(bool(short)), {"units": _UNITS, "demand": source, "ranking": content}
+        return int(bool(unsuitable)), {"units": _UNITS, "demand": source, "ranking": content}
 
 
 _UNITS = {
@@ -271,57 +283,57 @@ _UNITS = {
 }
 
 
-def _asked(found: Any) -> dict[str, Any]:
-    """What an episode asks of a motor, by names in `_UNITS`."""
-    named = {
-        name: getattr(found, name)
+def _operation_mapping(operation: Any) -> dict[str, Any]:
+    """Return the numbers of an episode's operation, with names as in `_UNITS`."""
+    fields = {
+        name: getattr(operation, name)
         for name in ("own_share", "rms_current", "energy_drawn", "copper_loss")
     }
-    return {"peak_current": float(abs(found.current).max()), **named}
+    return {"peak_current": float(abs(operation.current).max()), **fields}
 
 
-def _uncounted(unknown: Sequence[str], said: str) -> str:
-    """Say which numbers a judgment leaves out, but for those that it names itself."""
-    rest = ", ".join(name for name in unknown if name not in said)
-    return f"not known, and not counted: {rest}" if rest else ""
+def _unknown_text(unknown: Sequence[str], judgment_text: str) -> str:
+    """Return a sentence on the numbers that a judgment omits, except those it names itself."""
+    omitted = ", ".join(name for name in unknown if name not in judgment_text)
+    return f"unknown and not counted: {omitted}" if omitted else ""
 
 
-def _told_apart(words: Sequence[str]) -> tuple[str, list[str]]:
-    """The task, run or recording among some words, and the motors."""
+def _split_words(words: Sequence[str]) -> tuple[str, list[str]]:
+    """Return the task, run or recording among some words, and the motors."""
     from codrl_mj.catalogue import motor_names
     from codrl_mj.tasks import TASKS
 
-    asked = [
+    subjects = [
         word
         for word in words
         if word in TASKS or Path(word).suffix == ".npz" or Path(word).is_dir()
     ]
     files = ".toml", ".yaml", ".yml", ".json"
-    asked = asked or [
+    subjects = subjects or [
         word for word in words if not word.endswith(files) and word not in motor_names()
     ]
-    if len(asked) != 1:
+    if len(subjects) != 1:
         raise ValueError(
-            f"motor choose: {' and '.join(asked) or 'nothing'} to choose for: name one task, run"
+            f"motor choose: got {' and '.join(subjects) or 'no task'}: name exactly one task, run"
             " folder or .npz file, such as codrl-mj motor choose a.toml b.toml pendulum"
         )
-    return asked[0], [word for word in words if word != asked[0]]
+    return subjects[0], [word for word in words if word != subjects[0]]
 
 
-def _gear(drive: Any, demand: Any) -> str:
-    """Its gear, with the unit that it has on a slide."""
+def _gear_text(drive: Any, demand: Any) -> str:
+    """Return the gear of a drive as text, in rad/m on a slide."""
     return f"gear {1.0 / drive.arm_radius:.4g}{' rad/m' if demand.linear else ''}"
 
 
-def _share(drive: Any, asked: Any) -> str:
-    """What rotor and friction take of the load, where the rotor is known."""
-    return f"{asked.own_share:.0%}" if drive.motor.rotor_inertia > 0.0 else "unknown"
+def _own_share_text(drive: Any, operation: Any) -> str:
+    """Return the share of the load that rotor and friction take, if the inertia is known."""
+    return f"{operation.own_share:.0%}" if drive.motor.rotor_inertia > 0.0 else "unknown"
 
 
 def _print_ranking(
     choices: Sequence[tuple[str, Any]], demands: Mapping[str, Any], title: str
 ) -> None:
-    """A row for each choice; of several motors, each with what it drives."""
+    """Print a row for each choice; for several motors with the name of each."""
     columns: tuple[str, ...]
     columns = (
         "motor",
@@ -335,32 +347,37 @@ def _print_ranking(
     )
     columns += ("rms\n[A]", "drawn\n[J]", "heat\n[J]")
     right, rows = [name for name in columns if name not in ("motor", "verdict")], []
-    several = len(demands) > 1
+    has_motor_names = len(demands) > 1
     for name, choice in choices:
-        asked = choice.feasibility.operation
-        numbers = abs(asked.current).max(), asked.rms_current, asked.energy_drawn, asked.copper_loss
-        gear, does = (
-            _gear(choice.drive, demands[name]),
+        operation = choice.feasibility.operation
+        numbers = (
+            abs(operation.current).max(),
+            operation.rms_current,
+            operation.energy_drawn,
+            operation.copper_loss,
+        )
+        gear, verdict = (
+            _gear_text(choice.drive, demands[name]),
             Text(choice.feasibility.verdict, "red" if choice.lacks else "green"),
         )
         row = (
-            *((name, choice.name) if several else (choice.name,)),
+            *((name, choice.name) if has_motor_names else (choice.name,)),
             *(
                 gear.removeprefix("gear "),
                 f"{choice.drive.voltage_limit:g}",
                 f"{choice.power:,.0f}",
-                does,
+                verdict,
             ),
             *(
                 f"{choice.feasibility.margin:.0%}",
-                _share(choice.drive, asked),
-                *(f"{one:.3g}" for one in numbers),
+                _own_share_text(choice.drive, operation),
+                *(f"{value:.3g}" for value in numbers),
             ),
         )
         rows.append(row)
     print_table(
         title,
-        (*(("drives",) if several else ()), *columns),
+        (*(("drives",) if has_motor_names else ()), *columns),
         rows,
         right,
         columns[1:],
@@ -369,13 +386,18 @@ def _print_ranking(
 
 
 def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
-    """The torque-speed diagram with what the demand asks at the gear's output, the rotor's inertia included."""
+    """Draw the torque-speed diagram of a drive with the operating points of a demand.
+
+    The points are at the output of the gear and include the torque that the rotor's inertia needs.
+    """
     import numpy as np
 
     from codrl_mj.sizing.abilities import find_entry
     from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
     radius, entry = drive.motor.arm_radius, find_entry(name)
+    # The demand is at the joint. Dividing speeds and multiplying torques by the arm radius refers
+    # it to the gear's output.
     torque = radius * (demand.torque + drive.additions.armature * demand.acceleration)
     points = np.column_stack([demand.speed / radius, torque])
     save_plot(torque_speed_diagram(drive, None if entry is None else entry.numbers, points), path)

@@ -1,4 +1,4 @@
-"""From the words of a command line to a verb: its own modules and numbers understood, errors in one plain sentence."""
+"""Parsing of a command line into a verb: custom modules, numbers, one-sentence error messages."""
 
 import contextlib
 import dataclasses
@@ -25,7 +25,7 @@ _PATHS = (
     "--compare",
     "--policies",
 )
-_SHORT = {"--gear-ratio": "gear ratio", "--voltage": "supply voltage"}
+_MOTOR_FLAGS = {"--gear-ratio": "gear ratio", "--voltage": "supply voltage"}
 
 AsJson = Annotated[
     bool,
@@ -35,123 +35,142 @@ AsJson = Annotated[
         help="Print JSON and nothing else: in SI units, or with the unit beside the number.",
     ),
 ]
-"""Type of a verb's field for which its `run` returns not only the exit status, but what to print as JSON."""
+"""Type of a field whose verb returns the exit status and the content to print as JSON."""
 Trust = Annotated[
     bool,
     tyro.conf.arg(
         help=(
-            "Import the modules that a run folder, a contract or an actuator's file names as task,"
-            " agent or actuator if these are somebody's own, which executes them."
+            "Import custom modules that a run folder, a contract or an actuator's file names as"
+            " task, agent or actuator. This executes their code."
         )
     ),
 ]
-"""Type of a verb's field that lets it import what a run folder names."""
+"""Type of a field that allows a verb to import the custom modules that a run folder names."""
 
 
-def named_numbers(flag: str, texts: Sequence[str], example: str) -> dict[str, float]:
-    """What a flag has: NAME=NUMBER, each once."""
-    found: dict[str, float] = {}
+def parse_named_numbers(flag: str, texts: Sequence[str], example: str) -> dict[str, float]:
+    """Return the numbers of a flag that takes NAME=NUMBER, each name once."""
+    numbers: dict[str, float] = {}
     for text in texts:
         name, _, value = text.partition("=")
-        if name in found:
+        if name in numbers:
             raise ValueError(f"{flag} {name}: given twice; give it one value")
         try:
-            found[name] = float(value)
+            numbers[name] = float(value)
         except ValueError:
             raise ValueError(f"{flag} {text}: must be NAME=NUMBER, such as {example}") from None
-    return found
+    return numbers
 
 
-def parse(kind: Any, called: str, words: Sequence[str], about: str | None = None) -> Any:
-    """A dataclass with its settings; of a mapping of verbs to what they do nothing but help; SystemExit after help."""
-    cli: Any = tyro.cli  # of a union of as many kinds as there are
+def parse(kind: Any, program: str, words: Sequence[str], description: str | None = None) -> Any:
+    """Parse words into an instance of a verb's dataclass; SystemExit after the help is printed.
+
+    A mapping of verbs to descriptions is parsed only to print its help.
+    """
+    # The union of verbs is built at run time, which the annotations of `tyro.cli` do not cover.
+    cli: Any = tyro.cli
     if isinstance(kind, Mapping):
         verbs = [
-            dataclasses.make_dataclass(name, [], namespace={"__doc__": says})
-            for name, says in kind.items()
+            dataclasses.make_dataclass(name, [], namespace={"__doc__": text})
+            for name, text in kind.items()
         ]
         kind = Union[tuple(Annotated[verb, tyro.conf.subcommand(verb.__name__)] for verb in verbs)]  # noqa: UP007
-    errors: Any = getattr(
-        tyro, "_errors", None
-    )  # of no public name; without it errors come in boxes
-    hook = errors and errors.on_parse_error(lambda event: _refuse(event, kind, called))
+    # tyro has no public hook for parse errors. If a later version has no `_errors`, its errors are
+    # printed in its own boxes.
+    errors: Any = getattr(tyro, "_errors", None)
+    hook = errors and errors.on_parse_error(lambda event: _raise_parse_error(event, kind, program))
     with hook or contextlib.nullcontext():
         return cli(
             kind,
-            prog=called,
-            description=about,
+            prog=program,
+            description=description,
             args=words,
             compact_help=not {"-h", "-H", "--help-verbose"}.isdisjoint(words),
         )
 
 
-def _refuse(event: Any, kind: Any, called: str) -> None:
-    """Say in a sentence what the parser would in a box; of kinds of errors that are not known here its box remains."""
+def _raise_parse_error(event: Any, kind: Any, program: str) -> None:
+    """Raise ValueError with one sentence for a parser error; tyro prints unknown kinds in a box."""
     match type(event).__name__:
         case "MissingSubcommand":
-            known = ", ".join(event.subcommand_spec.parser_from_name)
-            first = (
-                f"try {called} motor list, or {called} train cartpole first; "
-                if called == "codrl-mj"
+            choices = ", ".join(event.subcommand_spec.parser_from_name)
+            hint = (
+                f"try {program} motor list, or {program} train cartpole first; "
+                if program == "codrl-mj"
                 else ""
             )
             raise ValueError(
-                f"{called} needs a verb: {first}there are {known}; {called} --help says more"
+                f"{program} needs a verb: {hint}there are {choices}; {program} --help says more"
             )
         case "MissingArgs":
-            missing = [_called(one.arg) for one in event.missing_arguments]
-            raise ValueError(f"{called} needs {', '.join(missing)}; {called} --help says more")
+            missing = [
+                _argument_name(missing_argument.arg) for missing_argument in event.missing_arguments
+            ]
+            raise ValueError(f"{program} needs {', '.join(missing)}; {program} --help says more")
         case "BadValue" if event.reason == "too_few_values":
-            raise ValueError(f"{_called(event.argument)} needs a value: {_kind(event.argument)}")
-        case "InvalidChoice":
-            hint = did_you_mean(event.value, event.choices)
-            known = ", ".join(event.choices)
             raise ValueError(
-                f"{_called(event.argument)} {event.value}: {hint}must be one of {known}"
+                f"{_argument_name(event.argument)} needs a value: {_expected_type(event.argument)}"
+            )
+        case "InvalidChoice":
+            suggestion = did_you_mean(event.value, event.choices)
+            choices = ", ".join(event.choices)
+            raise ValueError(
+                f"{_argument_name(event.argument)} {event.value}: {suggestion}must be one of"
+                f" {choices}"
             )
         case "InstantiationFailure" if event.argument is not None:
             value = re.search(r"'([^']*)'", event.message)
-            given = f" {value[1]}" if value else ""
-            raise ValueError(f"{_called(event.argument)}{given}: must be {_kind(event.argument)}")
+            value_text = f" {value[1]}" if value else ""
+            raise ValueError(
+                f"{_argument_name(event.argument)}{value_text}: must be"
+                f" {_expected_type(event.argument)}"
+            )
         case "UnrecognizedArgs":
+            # The event does not list the flags of the verb, but its help does: print the help into
+            # a string and search it.
             with (
                 contextlib.redirect_stdout(io.StringIO()) as printed,
                 contextlib.suppress(SystemExit),
             ):
-                parse(kind, called, ["--help"])
-            _refuse_words(event.tokens, printed.getvalue(), called)
+                parse(kind, program, ["--help"])
+            _raise_unknown_words(event.tokens, printed.getvalue(), program)
 
 
-def _refuse_words(tokens: Sequence[str], text: str, shown: str) -> None:
-    """Refuse words that the parser left over, by what the verb's help has."""
-    verbs = re.match(r"usage: [^\n]*\{([\w,]+)\}\n", text)
+def _raise_unknown_words(tokens: Sequence[str], help_text: str, program: str) -> None:
+    """Raise ValueError for words that the parser left over, with hints from the verb's help."""
+    verbs = re.match(r"usage: [^\n]*\{([\w,]+)\}\n", help_text)
     flag = next((token.partition("=")[0] for token in tokens if token.startswith("-")), None)
     if flag is None or (verbs and not tokens[0].startswith("-")):
         choice = verbs[1].split(",") if verbs else []
-        listed = (
-            f"verbs are {', '.join(choice)}" if choice else f"{shown} --help says what it takes"
+        remedy = (
+            f"verbs are {', '.join(choice)}" if choice else f"{program} --help lists its arguments"
         )
-        what = "unknown verb" if choice else "unexpected"
-        raise ValueError(f"{what} {tokens[0]!r}: {did_you_mean(tokens[0], choice)}{listed}")
-    known = [
-        one
-        for one in dict.fromkeys(re.findall(r"(?<![\w-])--[a-z][\w-]*(?:\.[\w-]+)*", text))
-        if one != flag
+        problem = "unknown verb" if choice else "unexpected"
+        raise ValueError(f"{problem} {tokens[0]!r}: {did_you_mean(tokens[0], choice)}{remedy}")
+    known_flags = [
+        known_flag
+        for known_flag in dict.fromkeys(
+            re.findall(r"(?<![\w-])--[a-z][\w-]*(?:\.[\w-]+)*", help_text)
+        )
+        if known_flag != flag
     ]
-    inner = [
-        f"did you mean {one!r}? " for one in known if one.rpartition(".")[2] == flag.lstrip("-")
+    nested_hints = [
+        f"did you mean {known_flag!r}? "
+        for known_flag in known_flags
+        if known_flag.rpartition(".")[2] == flag.lstrip("-")
     ]
-    hint = "".join(inner[:1]) or did_you_mean(flag, known)
-    if flag in _SHORT and "--actuator" in known:
+    hint = "".join(nested_hints[:1]) or did_you_mean(flag, known_flags)
+    if flag in _MOTOR_FLAGS and "--actuator" in known_flags:
         raise ValueError(
-            f"{flag}: the actuator has no {_SHORT[flag]}; motors of codrl-mj motor list have one"
+            f"{flag}: the actuator has no {_MOTOR_FLAGS[flag]}; motors of codrl-mj motor list have"
+            " one"
         )
-    if "--actuator" in known and (owners := _families_with(flag)):
+    if "--actuator" in known_flags and (owners := _families_with(flag)):
         hint = f"this actuator has no such field; a {' or a '.join(owners)} has; "
         hint += (
             "add --actuator.family servo to make a motor a servo; " if owners == ["servo"] else ""
         )
-    raise ValueError(f"unknown flag {flag}: {hint}{shown} --help lists them")
+    raise ValueError(f"unknown flag {flag}: {hint}{program} --help lists them")
 
 
 def _families_with(flag: str) -> list[str]:
@@ -162,8 +181,8 @@ def _families_with(flag: str) -> list[str]:
     return [name for name, family in FAMILIES.items() if path in field_paths(family)]
 
 
-def _called(argument: Any) -> str:
-    """What a person calls an argument: its flag, or its name in capitals."""
+def _argument_name(argument: Any) -> str:
+    """Return the name of an argument for messages: its flag, or its name in capitals."""
     if argument.is_positional():
         return str(argument.field.intern_name.upper())
     # A short name, such as --voltage, stands first; who typed the long one would look for it in
@@ -171,47 +190,51 @@ def _called(argument: Any) -> str:
     return "/".join(name for name in argument.lowered.name_or_flags if not name.startswith("--no-"))
 
 
-def _kind(argument: Any) -> str:
-    """What an argument has to be."""
+def _expected_type(argument: Any) -> str:
+    """Return a description of the values that an argument takes."""
     kind = str(argument.lowered.metavar).replace("{None}|", "None or ")
     return kind.replace("INT", "a whole number").replace("FLOAT", "a number")
 
 
-def understood(arguments: Sequence[str]) -> list[str]:
-    """The words with 1e5 and 20:1 as plain numbers, and FILE.py:NAME as modules.
+def normalize_arguments(arguments: Sequence[str]) -> list[str]:
+    """Return the words with 1e5 and 20:1 as plain numbers and FILE.py:NAME as module:NAME.
 
-    Python finds the modules of the present folder from here on if the person who typed the words
-    names one of them, or says `--trust`: what a file names stays to be refused.
+    If the line names a module of the present folder, or has `--trust`, that folder is appended to
+    `sys.path`. Modules that only a file names are still refused without `--trust`.
     """
-    here, found = Path.cwd(), []
-    for before, word in itertools.pairwise(["", *arguments]):
-        flag = word if word.startswith("--") else before  # a folder may be called 1e5
-        counted = flag.startswith("--") and flag.partition("=")[0] not in _PATHS
+    folder, words = Path.cwd(), []
+    for previous, word in itertools.pairwise(["", *arguments]):
+        # Values of flags that take paths stay as they are: a folder may be called 1e5.
+        flag = word if word.startswith("--") else previous
+        is_number_flag = flag.startswith("--") and flag.partition("=")[0] not in _PATHS
         number = re.fullmatch(r"(--[\w.-]+=)?(\d+(?:\.\d+)?)(?::1|(e\+?\d{1,2}))", word)
-        if counted and number:
+        if is_number_flag and number:
             value = float(number[2] + (number[3] or ""))
             word = f"{number[1] or ''}{int(value) if value.is_integer() else value}"
         elif file := re.fullmatch(r"(.*=)?([^=:]+\.py):([\w./-]+)", word):
-            word = f"{file[1] or ''}{_module(Path(file[2]), here)}:{file[3]}"
-        found.append(word)
-    typed = re.findall(r"^(?:.*=)?(\w+)[\w.]*:[\w./-]+$", "\n".join(found), re.MULTILINE)
-    if "--trust" in found or any(
-        (here / name).is_dir() or (here / f"{name}.py").is_file() for name in typed
+            word = f"{file[1] or ''}{_module_name(Path(file[2]), folder)}:{file[3]}"
+        words.append(word)
+    module_names = re.findall(r"^(?:.*=)?(\w+)[\w.]*:[\w./-]+$", "\n".join(words), re.MULTILINE)
+    if "--trust" in words or any(
+        (folder / name).is_dir() or (folder / f"{name}.py").is_file() for name in module_names
     ):
-        sys.path += [str(here)] if str(here) not in sys.path and "" not in sys.path else []
-    return found
+        sys.path += [str(folder)] if str(folder) not in sys.path and "" not in sys.path else []
+    return words
 
 
-def _module(file: Path, here: Path) -> str:
-    """The module that a file is, by which what is written here today finds it tomorrow."""
-    path = Path(os.path.normpath(here / file)).with_suffix("")
+def _module_name(file: Path, folder: Path) -> str:
+    """Return the importable module name of a file, relative to the present folder.
+
+    A run folder stores this name, so the same line finds the module again later.
+    """
+    path = Path(os.path.normpath(folder / file)).with_suffix("")
     if not file.is_file():
         raise ValueError(f"{file}: there is no such file; must be FILE.py:NAME or module:NAME")
-    parts = path.relative_to(here).parts if path.is_relative_to(here) else ("..",)
+    parts = path.relative_to(folder).parts if path.is_relative_to(folder) else ("..",)
     if not all(part.isidentifier() for part in parts):
         raise ValueError(
-            f"{file}: must be a file in the present folder {here} or below it, in folders whose"
-            f" names Python takes for modules (letters, digits, _): go to {path.parent} and name"
+            f"{file}: must be a file in the present folder {folder} or below it, in folders whose"
+            f" names are valid module names (letters, digits, _): change to {path.parent} and name"
             f" {file.name}"
         )
     return ".".join(parts)

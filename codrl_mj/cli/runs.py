@@ -1,4 +1,4 @@
-"""`codrl-mj runs`, `data` and `cache`: what lies on disk, of trainings, of others, of compiled code."""
+"""`codrl-mj runs`, `data` and `cache`: run folders, published logs, and compiled code on disk."""
 
 import dataclasses
 import datetime
@@ -11,7 +11,7 @@ from rich.text import Text
 
 from codrl_mj import compile_cache
 from codrl_mj.cli.parsing import AsJson
-from codrl_mj.cli.terminal import console, number, print_table, say
+from codrl_mj.cli.terminal import console, format_number, print_table, print_text
 from codrl_mj.runs import summaries
 from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import SORT_KEYS, Comparison, RunSummary
@@ -19,13 +19,13 @@ from codrl_mj.runs.summaries import SORT_KEYS, Comparison, RunSummary
 
 @dataclasses.dataclass(frozen=True)
 class Runs:
-    """List the runs of a folder, or compare some: what differs in their settings, and what they came to.
+    """List the runs of a folder, or compare some: differing settings, and results.
 
     Example: codrl-mj runs runs --sort return, or codrl-mj runs --compare runs/one runs/other
     """
 
     root: Annotated[
-        tyro.conf.Positional[Path], tyro.conf.arg(help="Folder to look in, with its subfolders.")
+        tyro.conf.Positional[Path], tyro.conf.arg(help="Folder to search, with its subfolders.")
     ] = Path("runs")
     sort: Literal[SORT_KEYS] = "name"  # type: ignore[valid-type]
     """Order of the list: names from A, numbers and times from the highest."""
@@ -36,7 +36,7 @@ class Runs:
     as_json: AsJson = False
 
     def run(self) -> tuple[int, Any]:
-        """List or compare."""
+        """List or compare runs."""
         content: Any
         if self.compare:
             comparison = summaries.compare(
@@ -56,14 +56,14 @@ class Runs:
 
 
 _STATES = {"finished": "green", "unfinished": "yellow", "damaged": "red"}
-_OF_RUNS = "seed", "steps", "state", "training\nreturn", "evaluated\nreturn", "modified"
+_RIGHT_COLUMNS = "seed", "steps", "state", "training\nreturn", "evaluated\nreturn", "modified"
 
 
 def _print_runs(runs: Sequence[RunSummary]) -> None:
-    """A row for each run, and what is damaged."""
+    """Print a row for each run, and the problems of damaged runs."""
     rows: list[Any] = []
     for run in runs:
-        known = map(number, (run.task, run.agent, run.actuator, run.seed))
+        known = map(format_number, (run.task, run.agent, run.actuator, run.seed))
         returns = [
             "–" if value is None else f"{value:.1f}"
             for value in (run.mean_return, run.evaluation_return)
@@ -77,23 +77,24 @@ def _print_runs(runs: Sequence[RunSummary]) -> None:
             else f"{datetime.datetime.fromtimestamp(run.modified):%m-%d %H:%M}"
         )
         rows.append((run.name, *known, steps, Text(run.state, _STATES[run.state]), *returns, time))
-    columns: tuple[str, ...] = ("run", "task", "agent", "actuator", *_OF_RUNS)
-    if console().width < 100:  # without what the names of most runs have, and the time
+    columns: tuple[str, ...] = ("run", "task", "agent", "actuator", *_RIGHT_COLUMNS)
+    # A narrow terminal has no room for the seed, which most names of runs contain, and the time.
+    if console().width < 100:
         rows = [(*row[:4], *row[5:-1]) for row in rows]
         columns = tuple(name for name in columns if name not in ("seed", "modified"))
     title = f"{len(runs)} run{'' if len(runs) == 1 else 's'}"
-    print_table(title, columns, rows, right=_OF_RUNS, whole=columns[1:], padding=(0, 0))
-    say(
+    print_table(title, columns, rows, right=_RIGHT_COLUMNS, whole=columns[1:], padding=(0, 0))
+    print_text(
         *(f"{run.name}: damaged: {run.problem}" for run in runs if run.problem is not None),
         style="red",
     )
 
 
 def _print_comparison(comparison: Comparison) -> None:
-    """What differs in the configuration, and the results: a column for each run, as many as fit at a time."""
-    some = 3 if console().width >= 100 else 2
-    for begin in range(0, len(comparison.names), some):
-        chunk = slice(begin, begin + some)
+    """Print differing settings and results, with as many columns of runs as fit at a time."""
+    runs_per_table = 3 if console().width >= 100 else 2
+    for first in range(0, len(comparison.names), runs_per_table):
+        chunk = slice(first, first + runs_per_table)
         names = comparison.names[chunk]
         for title, content in (
             ("settings that differ", comparison.configuration),
@@ -102,74 +103,76 @@ def _print_comparison(comparison: Comparison) -> None:
             if content:
                 units = comparison.units if title == "results" else {}
                 rows = [
-                    (one, units.get(one, ""), *map(number, values[chunk]))
-                    for one, values in content.items()
+                    (name, units.get(name, ""), *map(format_number, values[chunk]))
+                    for name, values in content.items()
                 ]
                 print_table(title, ("", "unit" if units else "", *names), rows, right=names)
 
 
 @dataclasses.dataclass(frozen=True)
 class Data:
-    """List measurements of real motors that others have published, or fetch one of the sets: docs/identify.md.
+    """List published measurements of real motors, or download a data set: docs/identify.md.
 
-    Nothing of them comes with codrl_mj: files are fetched from where their authors have them, and
-    checked by digest.
+    codrl_mj does not contain the data: files are downloaded from the authors' sites and checked by
+    their digests.
 
     Example: codrl-mj data dfki_pendulum
     """
 
     name: Annotated[
         tyro.conf.Positional[str | None],
-        tyro.conf.arg(metavar="NAME", help="The set to fetch; lists them without it."),
+        tyro.conf.arg(metavar="NAME", help="Data set to download; without it, all are listed."),
     ] = None
     out: Path = Path("data")
     """Folder that gets bench_logs/NAME."""
 
     def run(self) -> int:
-        """List, or fetch."""
+        """List the data sets, or download one."""
         from codrl_mj.identify.published import fetch, published_datasets
 
         if self.name is None:
             rows = [
-                (name, one["title"], one["licence"]) for name, one in published_datasets().items()
+                (name, entry["title"], entry["licence"]) for name, entry in published_datasets().items()
             ]
             print_table("", ("name", "motor and rig", "licence"), rows)
             print(
-                "\n".join(f"{name}: {one['source']}" for name, one in published_datasets().items())
+                "\n".join(f"{name}: {entry['source']}" for name, entry in published_datasets().items())
             )
             return 0
         files = fetch(self.name, self.out)
         for file in files:
             print(file)
-        known = published_datasets()[self.name]
-        say(
-            f"{known['licence']}, {known['source']} at {known['commit'][:10]}; columns:"
-            f" {known['columns']}"
+        data_set = published_datasets()[self.name]
+        print_text(
+            f"{data_set['licence']}, {data_set['source']} at {data_set['commit'][:10]}; columns:"
+            f" {data_set['columns']}"
         )
         return 0
 
 
 @dataclasses.dataclass(frozen=True)
 class Cache:
-    """Show what compiled code is kept on disk, which saves seconds in every process after the first, or clear it.
+    """Show or clear the cache of compiled code, which saves seconds in each process.
 
-    CODRL_MJ_CACHE names another folder; CODRL_MJ_CACHE=off keeps nothing. Code that does not fit
-    any more is never used, so that nothing has to be cleared: docs/engine.md.
+    CODRL_MJ_CACHE names another folder; CODRL_MJ_CACHE=off disables the cache. Outdated code is
+    never used, so that the cache need not be cleared: docs/engine.md.
 
     Example: codrl-mj cache --clear
     """
 
-    clear: Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Delete it.")] = False
+    clear: Annotated[
+        bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Delete the cached files.")
+    ] = False
 
     def run(self) -> int:
-        """Show or clear."""
-        place = compile_cache.cache_folder()
-        if place is None:
-            print("off: CODRL_MJ_CACHE says so")
+        """Show or clear the cache."""
+        folder = compile_cache.cache_folder()
+        if folder is None:
+            print("off: disabled by CODRL_MJ_CACHE")
             return 0
-        files = [*place.glob("*.code")]
+        files = [*folder.glob("*.code")]
         size = sum(file.stat().st_size for file in files) / 1e6
-        told = (
+        content = (
             f"{len(files)} file{'' if len(files) == 1 else 's'}, {size:.1f} MB"
             if files
             else "empty"
@@ -178,7 +181,7 @@ class Cache:
             for file in files:
                 file.unlink(missing_ok=True)
         print(
-            f"{place}: {told}"
+            f"{folder}: {content}"
             + (
                 ", cleared"
                 if self.clear and files

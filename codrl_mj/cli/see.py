@@ -1,4 +1,4 @@
-"""`codrl-mj render`, `replay`, `view` and `report`: an episode as a film, in three dimensions, live, and of a run."""
+"""`codrl-mj render`, `replay`, `view` and `report`: films, replay_parts, live views and reports."""
 
 import contextlib
 import dataclasses
@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from codrl_mj.actuators import allow_imports
-from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, with_environment
+from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, with_environment_flags
 from codrl_mj.cli.parsing import Trust
 from codrl_mj.cli.subject import Source, policy_and_environment
 from codrl_mj.cli.terminal import progress_bar
@@ -24,14 +24,14 @@ from codrl_mj.runs import told_apart
 
 
 @dataclasses.dataclass(frozen=True)
-class OfEpisodes:
-    """What acts, in what, and from which seed."""
+class EpisodeVerb:
+    """Common flags of the verbs that show an episode: policy, environment and seed."""
 
     subject: Annotated[
         tyro.conf.Positional[str],
         tyro.conf.arg(
             help=(
-                "Run folder, a folder with a policy alone, or a Stable-Baselines3 zip (see"
+                "Run folder, a folder with only a policy, or a Stable-Baselines3 zip (see"
                 " --trust); or a task name or an environment's id, for random actions."
             )
         ),
@@ -39,14 +39,14 @@ class OfEpisodes:
     source: tyro.conf.OmitArgPrefixes[Source] = Source()
     actuator_name: ActuatorName = AS_TRAINED
     seed: int = 0
-    """Seed of the episode, or of the first."""
+    """Seed of the episode, or of the first one."""
 
-    for_line = classmethod(with_environment)
+    for_line = classmethod(with_environment_flags)
 
 
 @dataclasses.dataclass(frozen=True)
-class Render(OfEpisodes):
-    """Film one episode: the scene, and a strip of desired and actual torque and the voltage below it.
+class Render(EpisodeVerb):
+    """Film one episode, with desired and actual torque and the voltage plotted below the scene.
 
     Example: codrl-mj render runs/cartpole-ppo-weaker-0 --out balance.mp4, or codrl-mj render
     cartpole (random actions).
@@ -55,17 +55,20 @@ class Render(OfEpisodes):
     out: Path = Path("episode.mp4")
     """File to write: .mp4 (H.264) or .gif; without a suffix, a folder of PNG frames."""
     trajectory: Path | None = None
-    """File for the episode itself, .npz: time, state, observation, action, reward and every actuator signal."""
+    """NPZ file for the episode: time, state, observation, action, reward and every actuator signal.
+    """
     width: int = 640
     """Width [px], even."""
     height: int = 480
     """Height of the scene [px], even."""
     camera: str = "fixed"
-    """A camera of the model: fixed or close; other models have others, and fixed is their environment's own."""
+    """Camera of the model. Tasks have fixed and close; in other models fixed is the environment's
+    default.
+    """
     pretty: bool = False
     """Shadows, reflections and multisampling: slower."""
     motor: str | None = None
-    """Of several motors that whose torque and voltage the strip shows, by its name; the first unless given."""
+    """Name of the motor whose torque and voltage are plotted; default: the first."""
 
     def run(self: Any) -> int:
         """Run the episode and film it."""
@@ -84,9 +87,9 @@ class Render(OfEpisodes):
         episode = panel.episode
         title = f"{title}: return {episode.total:.0f}"
         if self.motor is not None and self.motor not in episode.motors:
-            there = ", ".join(episode.motors) or "one, which needs no name"
+            choices = ", ".join(episode.motors) or "a single one without a name"
             hint = did_you_mean(self.motor, episode.motors)
-            raise ValueError(f"--motor {self.motor}: {hint}there are {there}")
+            raise ValueError(f"--motor {self.motor}: {hint}the motors are {choices}")
         strip = 0 if self.motor is None else episode.motors.index(self.motor)
         title += f"; {episode.motors[strip]}" if episode.motors else ""
         panel = dataclasses.replace(panel, title=title, motor=strip)
@@ -96,9 +99,9 @@ class Render(OfEpisodes):
                 [panel],
                 self.out,
                 *view,
-                lambda done, total: bar.update(row, completed=done, total=total),
+                lambda written, total: bar.update(row, completed=written, total=total),
             )
-        print(f"wrote {self.out}{_rank(self, env, episode)}")
+        print(f"wrote {self.out}{_rank_text(self, env, episode)}")
         if self.trajectory is not None:
             save_episode(episode, self.trajectory)
             print(f"wrote {self.trajectory}")
@@ -106,8 +109,8 @@ class Render(OfEpisodes):
 
 
 @dataclasses.dataclass(frozen=True)
-class Replay(OfEpisodes):
-    """Write one episode as a page in three dimensions: to be turned, scrubbed and played at any speed.
+class Replay(EpisodeVerb):
+    """Write one episode as a web page in 3D, which can be turned, scrubbed and played at any speed.
 
     Example: codrl-mj replay runs/cartpole-ppo-weaker-0 --out balance.html, or codrl-mj replay
     Ant-v5 (random actions).
@@ -117,7 +120,7 @@ class Replay(OfEpisodes):
     """File to write."""
 
     def run(self: Any) -> int:
-        """Run the episode and write it."""
+        """Run the episode and write the page."""
         from codrl_mj.evaluation import run_episodes
         from codrl_mj.viz.replay import motion_of_episode, write_replay
 
@@ -126,42 +129,44 @@ class Replay(OfEpisodes):
         title = f"{title}: return {episode.total:.0f}"
         write_replay(motion_of_episode(episode, env), self.out, title)
         print(
-            f"wrote {self.out} ({self.out.stat().st_size / 1e6:.1f} MB){_rank(self, env, episode)}"
+            f"wrote {self.out} ({self.out.stat().st_size / 1e6:.1f} MB)"
+            f"{_rank_text(self, env, episode)}"
         )
         return 0
 
 
-def _rank(verb: Any, env: Any, episode: Any) -> str:
-    """Return how an episode compares with those of a run's evaluation, if it is one of the same environment."""
+def _rank_text(verb: Any, env: Any, episode: Any) -> str:
+    """Return text that ranks an episode within the run's evaluation, in the same environment."""
     from codrl_mj.runs.summaries import rank, read_evaluation
 
     evaluation = read_evaluation(Path(verb.subject), verb.source.which == "best") or {}
     try:
         with allow_imports(verb.source.trust):
-            same = EnvConfig.from_mapping(evaluation["conditions"]["env"]) == env
+            is_same_env = EnvConfig.from_mapping(evaluation["conditions"]["env"]) == env
     except (
+        # The run has no evaluation, or one of a format that this version cannot read.
         KeyError,
         TypeError,
         ValueError,
-    ):  # no evaluation, or one that this version does not read
-        same = False
-    said = rank(evaluation, episode.total) if same else ""
-    return f": seed {verb.seed}, return {episode.total:.3g}; {said}" if said else ""
+    ):
+        is_same_env = False
+    ranking = rank(evaluation, episode.total) if is_same_env else ""
+    return f": seed {verb.seed}, return {episode.total:.3g}; {ranking}" if ranking else ""
 
 
 @dataclasses.dataclass(frozen=True)
-class LiveView(OfEpisodes):
-    """Watch a simulation live in a browser: pause, push, set motor, loop, supply and delay, see what the motors do.
+class LiveView(EpisodeVerb):
+    """Watch a simulation live in a browser: pause, push, and change motor, loop, supply and delay.
 
     Example: codrl-mj view runs/cartpole-ppo-weaker-0, or codrl-mj view furuta (random actions).
     """
 
     policies: tuple[Path, ...] = ()
-    """Other run folders whose policies can be chosen."""
+    """Further run folders whose policies can be selected."""
     port: int = 8080
-    """Where to listen, on this machine alone; the next free one, where it is taken."""
+    """Port to listen on, on this machine only; if it is taken, the next free one."""
     native: bool = False
-    """MuJoCo's own viewer instead of a browser; needs a display."""
+    """Use MuJoCo's own viewer instead of a browser; needs a display."""
 
     def run(self: Any) -> int:
         """Serve until Ctrl-C."""
@@ -194,45 +199,53 @@ class LiveView(OfEpisodes):
         if self.native:
             run_native(session)
             return 0
-        shown = Browser(session, self.port, title)
-        print(f"{shown.url} (on this machine alone; Ctrl-C ends it)", flush=True)
+        browser = Browser(session, self.port, title)
+        print(f"{browser.url} (on this machine only; Ctrl-C ends it)", flush=True)
+        # Ctrl-C only sets a flag, which the loop reads between two frames: an exception inside a
+        # library could leave a lock held.
         with (
-            collecting_signals(signal.SIGINT) as asked,
-            contextlib.closing(shown),
-        ):  # not amidst what libraries have locked
-            shown.run(lambda: bool(asked))
-        if asked:
+            collecting_signals(signal.SIGINT) as signals,
+            contextlib.closing(browser),
+        ):
+            browser.run(lambda: bool(signals))
+        if signals:
             signal.raise_signal(signal.SIGINT)
         return 0
 
-    def _policies(self: Any, given: Any, env: Any) -> dict[str, Callable[[], Any]]:
-        """Name -> policy, made when it is chosen: what is watched, its other one, and other runs."""
-        found: dict[str, Callable[[], Any]] = {}
+    def _policies(self: Any, loaded_policy: Any, env: Any) -> dict[str, Callable[[], Any]]:
+        """Return name -> factory of a policy: last or best of this run, and those of other runs.
+
+        A policy is loaded only when it is selected.
+        """
+        factories: dict[str, Callable[[], Any]] = {}
         subject = Path(self.subject)
         if not is_source_name(self.subject):
-            found[self.source.which] = lambda: given
+            factories[self.source.which] = lambda: loaded_policy
             if (subject / "best").is_dir():
-                other = "best" if self.source.which == "last" else "last"
-                found[other] = lambda: (
-                    dataclasses.replace(self.source, which=other).load(subject).policy
+                alternative = "best" if self.source.which == "last" else "last"
+                factories[alternative] = lambda: (
+                    dataclasses.replace(self.source, which=alternative).load(subject).policy
                 )
 
-        def policy_of(run: Path) -> Any:
+        def load_policy(run: Path) -> Any:
             loaded = self.source.load(run)
             loaded.check_interface(env)
             return loaded.policy
 
-        taken = {*found, "random", "zero"}
+        used_names = {*factories, "random", "zero"}
         for name, run in zip(told_apart(self.policies), self.policies, strict=True):
-            found[f"run {name}" if name in taken else name] = functools.partial(policy_of, run)
-        return found
+            factories[f"run {name}" if name in used_names else name] = functools.partial(
+                load_policy, run
+            )
+        return factories
 
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Write a report of a run as one HTML file: learning, evaluation, and an episode with film and plots on one clock.
+    """Write a report of a run as one HTML file: learning, evaluation, a filmed episode with plots.
 
-    Several runs are shown side by side. Unfinished and damaged runs are reported as far as they go.
+    Several runs are shown side by side. Of unfinished and damaged runs the readable parts are
+    shown.
 
     Example: codrl-mj report runs/cartpole-ppo-weaker-0 --out balance.html
     """
@@ -241,22 +254,24 @@ class Report:
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN", help="Run folders.")
     ]
     out: Path = Path("report.html")
-    """The page to write, .html."""
+    """HTML file to write."""
     which: Literal["last", "best"] = "last"
-    """Whose policy acts in the episode: the last, or that of the best evaluation; of an unfinished run its best."""
+    """Policy of the episode: the last one, or that of the best evaluation. An unfinished run has
+    only its best one.
+    """
     seed: int | None = None
-    """Seed of the episode; unless given, that of the evaluated episode with the median return."""
+    """Seed of the episode; default: that of the evaluated episode with the median return."""
     film: bool = True
     """Film the episode."""
     replay: bool = False
-    """Show it in three dimensions too, on the same clock: 0.7 MB more."""
+    """Also show the episode in 3D, on the same clock: 0.7 MB more."""
     certificate: Path | None = None
-    """A certificate.json, or its folder, to be summed up; unless given, that in a run folder, if there is one."""
+    """A certificate.json, or its folder, to summarize; default: the one in a run folder, if any."""
     trust: Trust = False
 
     def run(self) -> int:
         """Write the page."""
-        from codrl_mj.viz.pages.report import replays, report
+        from codrl_mj.viz.pages.report import replay_parts, report
 
         with progress_bar("") as bar:
             row = bar.add_task("reading", total=None)
@@ -266,10 +281,10 @@ class Report:
                 which=self.which,
                 seed=self.seed,
                 trust=self.trust,
-                filmed=self.film,
-                joined=replays if self.replay else lambda _: (),
+                with_film=self.film,
+                extra_parts=replay_parts if self.replay else lambda _: (),
                 certificate=self.certificate,
-                on_part=lambda what: bar.update(row, description=what),
+                on_part=lambda part: bar.update(row, description=part),
             )
         print(f"wrote {self.out} ({self.out.stat().st_size / 1e6:.1f} MB)")
         return 0

@@ -1,4 +1,4 @@
-"""What a person sees in a terminal: lines, tables and progress bars."""
+"""Output on a terminal: lines, tables and progress bars."""
 
 import contextlib
 import math
@@ -15,12 +15,12 @@ from rich.text import Text
 
 
 def console() -> Console:
-    """A console on standard output; 110 columns where it goes to a file, unless COLUMNS has another number."""
+    """Return a console on standard output; 110 columns wide in a file, unless COLUMNS is set."""
     return Console() if sys.stdout.isatty() or "COLUMNS" in os.environ else Console(width=110)
 
 
-def say(*texts: str, style: str | None = None) -> None:
-    """Print each text that is not empty, as wide as the terminal."""
+def print_text(*texts: str, style: str | None = None) -> None:
+    """Print each nonempty text, wrapped at the width of the terminal."""
     for text in filter(None, texts):
         console().print(text, markup=False, highlight=False, style=style)
 
@@ -32,12 +32,24 @@ def print_table(
     right: Collection[str] = (),
     whole: Collection[str] = (),
     styles: Sequence[str] = (),
-    **look: Any,
+    **table_options: Any,
 ) -> None:
-    """Print a table of texts, not markup, and rich's: some columns to the right, some never wrapped, rows in styles."""
-    usual: dict[str, Any] = {"title_justify": "left", "box": box.SIMPLE_HEAD, "pad_edge": False}
+    """Print a table of plain texts, not of markup, or of rich's renderables.
+
+    Args:
+        title: text above the table.
+        columns: headers.
+        rows: cells of each row.
+        right: columns that are aligned to the right.
+        whole: columns that are never wrapped.
+        styles: rich style of each row.
+        table_options: further options of `rich.table.Table`.
+    """
+    defaults: dict[str, Any] = {"title_justify": "left", "box": box.SIMPLE_HEAD, "pad_edge": False}
     table = Table(
-        title=escape(title) or None, row_styles=styles, **{**usual, "padding": (0, 1, 0, 0), **look}
+        title=escape(title) or None,
+        row_styles=styles,
+        **{**defaults, "padding": (0, 1, 0, 0), **table_options},
     )
     for name in columns:
         justify: Any = "right" if name in right else "left"
@@ -52,11 +64,15 @@ def print_table(
     console().print(table)
 
 
-def number(value: Any, digits: int = 3) -> str:
-    """A number with so many digits, thousands whole; – where there is none; a mean or a median with its interval."""
+def format_number(value: Any, digits: int = 3) -> str:
+    """Format a number with a number of digits; – if there is none; a tuple with its interval.
+
+    A mean or a median with its interval is a tuple or a mapping. Thousands are shown whole.
+    """
     if isinstance(value, Mapping | tuple):
         middle, *ends = (
-            number(one, digits) for one in (value.values() if isinstance(value, Mapping) else value)
+            format_number(part, digits)
+            for part in (value.values() if isinstance(value, Mapping) else value)
         )
         return f"{middle} [{', '.join(ends)}]"
     if value is None or (isinstance(value, float) and math.isnan(value)):
@@ -69,11 +85,11 @@ def number(value: Any, digits: int = 3) -> str:
 
 
 def progress_bar(*columns: str) -> Any:
-    """A progress display with the given text columns, the time elapsed and the time left.
+    """Return a progress display with the given text columns, elapsed and remaining time.
 
-    Text is in one line; nothing while numbers in it are not known, such as of how many a count is.
-    Where all is too long for a line, the bar and the description give way. It goes to standard
-    error, and nowhere where that is no terminal.
+    Each text is on one line, and empty while its numbers are unknown. If all do not fit on a line,
+    the bar and the description are shortened. The display goes to standard error, and is disabled
+    if that is no terminal.
     """
     from rich.progress import (
         BarColumn,
@@ -87,11 +103,13 @@ def progress_bar(*columns: str) -> Any:
     class Line(TextColumn):
         def render(self, task: Task) -> Text:
             text = super().render(task)
+            # A total or a measure that is not known yet is formatted as None or nan. Hide the text
+            # until then.
             text = Text() if "/None" in text.plain or " nan" in f" {text.plain}" else text
             text.no_wrap, text.overflow = True, "ellipsis"
             return text
 
-    errors = Console(stderr=True)
+    stderr_console = Console(stderr=True)
     return Progress(
         Line("{task.description}", table_column=Column()),
         BarColumn(),
@@ -99,14 +117,14 @@ def progress_bar(*columns: str) -> Any:
         TimeElapsedColumn(table_column=Column(no_wrap=True)),
         TextColumn("left"),
         TimeRemainingColumn(table_column=Column(no_wrap=True)),
-        console=errors,
-        disable=not errors.is_terminal,
+        console=stderr_console,
+        disable=not stderr_console.is_terminal,
     )
 
 
 @contextlib.contextmanager
 def any_key() -> Iterator[Callable[[], bool]]:
-    """Gives a function that says whether a key was pressed since; never, where there is no terminal."""
+    """Yield a function that returns True if a key was pressed; always False without a terminal."""
     if not sys.stdin.isatty():
         yield lambda: False
         return
@@ -115,6 +133,7 @@ def any_key() -> Iterator[Callable[[], bool]]:
     import tty
 
     before = termios.tcgetattr(sys.stdin)
+    # Without cbreak mode the terminal delivers keys only after Enter.
     tty.setcbreak(sys.stdin)
     try:
         yield lambda: bool(select.select([sys.stdin], [], [], 0.0)[0])

@@ -1,4 +1,4 @@
-"""`codrl-mj train`: its flags depend on the agent, and their defaults on agent, task and configuration file."""
+"""`codrl-mj train`: flags and their defaults depend on agent, task and configuration file."""
 
 import argparse
 import contextlib
@@ -19,13 +19,13 @@ from codrl_mj.cli.environments import (
     AS_CONFIGURED,
     FAMILY,
     ActuatorName,
-    environment,
+    build_env_config,
     environment_fields,
-    flags,
-    scan,
+    flag_dataclass,
+    scan_flags,
 )
 from codrl_mj.cli.parsing import AsJson
-from codrl_mj.cli.terminal import progress_bar, say
+from codrl_mj.cli.terminal import print_text, progress_bar
 from codrl_mj.envs.sources import find_source
 from codrl_mj.fields import command
 from codrl_mj.runs import PROGRESS, RESULT, finished
@@ -36,28 +36,32 @@ from codrl_mj.training.config import TrainConfig, default_agent, read_config
 from codrl_mj.training.folder import load_config, needs_trust, prepare_run
 from codrl_mj.training.history import REPORT_COLUMNS
 
-_OWN_FLAGS = ("agent", "env")  # of the configuration: not made from its fields' types
+# Fields of `TrainConfig` whose flags are not generated from their types.
+_SEPARATE_FIELDS = ("agent", "env")
 
 
 def train_verb(arguments: list[str]) -> Any:
-    """The verb's dataclass for a command line, whose agent, task, settings and files decide on flags and defaults."""
-    chosen = scan(arguments, "agent", "settings", "actuator", FAMILY, "config", "resume")
+    """Return the verb's dataclass for a command line.
+
+    Agent, task, settings and files on the line determine the flags and their defaults.
+    """
+    chosen = scan_flags(arguments, "agent", "settings", "actuator", FAMILY, "config", "resume")
     if chosen.task is None and arguments and not arguments[0].startswith("-"):
         try:
             find_source(arguments[0])
         except ValueError as error:
-            others = "an environment of Gymnasium's goes by its id, such as HalfCheetah-v5"
-            raise ValueError(f"{error}; {others}") from None
-    base = _base(chosen)
+            hint = "for an environment of Gymnasium give its id, such as HalfCheetah-v5"
+            raise ValueError(f"{error}; {hint}") from None
+    base = _base_config(chosen)
     resuming = chosen.resume is not None
-    configured = resuming or chosen.config is not None
-    agent_flags = flags(type(base.agent), base.agent)
-    rest = flags(TrainConfig, base, _OWN_FLAGS)
-    task_known = configured or chosen.task is not None
+    has_config = resuming or chosen.config is not None
+    agent_flags = flag_dataclass(type(base.agent), base.agent)
+    train_flags = flag_dataclass(TrainConfig, base, _SEPARATE_FIELDS)
+    task_known = has_config or chosen.task is not None
     tasks: Any = Literal[tuple(dict.fromkeys([*TASKS, base.task, chosen.task or base.task]))]
     agents: Any = Literal[tuple(dict.fromkeys([*AGENTS, base.agent.registry_name()]))]
     positional: Any = tyro.conf.Positional
-    task = "task", Annotated[positional[tasks], tyro.conf.arg(help="What to learn.")]
+    task = "task", Annotated[positional[tasks], tyro.conf.arg(help="Task to learn.")]
     fields: list[Any] = [
         (*task, base.task) if task_known else task,
         (
@@ -67,8 +71,8 @@ def train_verb(arguments: list[str]) -> Any:
                 tyro.conf.arg(
                     name="agent",
                     help=(
-                        "Who learns. Its settings are below; `codrl-mj train TASK --agent NAME"
-                        " --help` shows others'."
+                        "Learning agent. Its settings are below; those of others are listed by"
+                        " `codrl-mj train TASK --agent NAME --help`."
                     ),
                 ),
             ],
@@ -80,9 +84,9 @@ def train_verb(arguments: list[str]) -> Any:
                 Literal[SETTINGS],  # type: ignore[valid-type]
                 tyro.conf.arg(
                     help=(
-                        "Where the defaults come from: `default` (ours), `paper` (as printed),"
-                        " `repaired` (the paper's, with what makes it fail changed), or `fast`"
-                        " (ours, for the least time)."
+                        "Source of the defaults: `default` (ours), `paper` (as printed),"
+                        " `repaired` (the paper's, with the settings changed that make it fail),"
+                        " or `fast` (ours, for the shortest training)."
                     )
                 ),
             ],
@@ -91,9 +95,9 @@ def train_verb(arguments: list[str]) -> Any:
         (
             "actuator_name",
             ActuatorName,
-            AS_CONFIGURED if configured else base.env.source.default_actuator,
+            AS_CONFIGURED if has_config else base.env.source.default_actuator,
         ),
-        *((field.name, field.type, field.default) for field in dataclasses.fields(rest)),
+        *((field.name, field.type, field.default) for field in dataclasses.fields(train_flags)),
         (
             "agent",
             Annotated[agent_flags, tyro.conf.arg(help="The agent's settings.")],
@@ -119,36 +123,36 @@ class Train:
 
     Example: codrl-mj train cartpole --actuator weaker --env.center-radius 0.1 --out
     runs/through-weaker, and after an interruption codrl-mj train --resume runs/through-weaker.
-    Environments of others go by their Gymnasium ids: codrl-mj train HalfCheetah-v5 --actuators
-    'b.*=maxon-ec45-flat-50w' 'f.*=lag'
+    Other environments go by their Gymnasium ids:
+    codrl-mj train HalfCheetah-v5 --actuators 'b.*=maxon-ec45-flat-50w' 'f.*=lag'
     """
 
     config: Path | None = None
-    """YAML file with the configuration: the keys are the flags' names, nested at the dots, with
-    underscores (agent: {name: ppo, gamma: 0.98}). Flags win over it. A run's config.json will do as
-    well.
+    """YAML file with the configuration: the keys are the names of the flags, nested at the dots,
+    with underscores (agent: {name: ppo, gamma: 0.98}). Flags override it. The config.json of a
+    run works too.
     """
     out: Path | None = None
-    """Run folder to make; the default is runs/TASK-AGENT-ACTUATOR-SEED."""
+    """Run folder to create; default: runs/TASK-AGENT-ACTUATOR-SEED."""
     resume: Path | None = None
-    """Run folder of a training that was interrupted, to be continued from its last checkpoint to
-    the result that it would have had. Needs no other flags.
+    """Run folder of an interrupted training, to continue from its last checkpoint to the same
+    result as without the interruption. Needs no other flags.
     """
     accept_changes: bool = False
-    """Continue even if the code or a package is no longer the one that the run was started with."""
+    """Continue even if the code or a package has changed since the run was started."""
     trust: bool = False
-    """Import the module of an actuator of somebody's own that the file or the run names as
-    module:NAME, which executes whatever its author wants.
+    """Import the module of a custom actuator that the file or the run names as module:NAME. This
+    executes the code of its author.
     """
     tensorboard: bool = True
     """Write events for TensorBoard, if it is installed."""
     wandb: str | None = None
-    """Weights & Biases project to report to as well."""
+    """Weights & Biases project to report to, in addition."""
     as_json: AsJson = False
     for_line = staticmethod(train_verb)
 
     def run(self: Any) -> tuple[int, Any]:
-        """Train, with a progress bar."""
+        """Train with a progress bar."""
         from codrl_mj.training import train
 
         if (
@@ -165,33 +169,35 @@ class Train:
             )
         config = dataclasses.replace(
             self.base,
-            env=environment(self, self.base.task, self.actuator_name, self.base.env),
+            env=build_env_config(self, self.base.task, self.actuator_name, self.base.env),
             agent=type(self.base.agent)(**vars(self.agent)),
             **{
                 field.name: getattr(self, field.name)
                 for field in dataclasses.fields(TrainConfig)
-                if field.name not in _OWN_FLAGS
+                if field.name not in _SEPARATE_FIELDS
             },
         )
-        through = "-".join(
-            dict.fromkeys(Path(each.rpartition("=")[2]).stem for each in self.actuators)
+        actuator_text = "-".join(
+            dict.fromkeys(Path(item.rpartition("=")[2]).stem for item in self.actuators)
         )
-        through = "-".join(
-            filter(None, (through or self.actuator_name, self.actuator_fields.family))
+        actuator_text = "-".join(
+            filter(None, (actuator_text or self.actuator_name, self.actuator_fields.family))
         )
-        parts = config.task, config.agent.name, through, str(config.seed)
+        name_parts = config.task, config.agent.name, actuator_text, str(config.seed)
         if (
             self.resume is not None
             and finished(self.resume)
             and config == load_config(self.resume, self.trust)
         ):
-            print(f"{self.resume} is finished already; {_following(self.resume)}")
-            return 0, _came_to(self.resume) if self.as_json else None
-        name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in parts)
+            print(f"{self.resume} is already finished; {_next_command(self.resume)}")
+            return 0, _result_mapping(self.resume) if self.as_json else None
+        name = "-".join(re.sub(r"[^\w.]+", "_", part) for part in name_parts)
         out = self.resume or self.out or Path("runs") / name
         prepare_run(out, config, self.resume is not None, self.accept_changes)
-        config.env.make().close()  # what is wrong with it is said before there is a bar
-        say(*dict.fromkeys(one.assumed for one in config.env.actuators))
+        # Build the environment once, so that an invalid setting is reported before the progress bar
+        # starts.
+        config.env.make().close()
+        print_text(*dict.fromkeys(actuator.assumed for actuator in config.env.actuators))
         with training_bars({f"{config.agent.name.upper()} on {config.task}": (config, out)}):
             train(
                 config,
@@ -201,17 +207,17 @@ class Train:
                 tensorboard=self.tensorboard,
                 wandb=self.wandb,
             )
-        print(f"wrote {out}: see {out / 'learning_curve.png'}; {_following(out)}")
-        return 0, _came_to(out) if self.as_json else None
+        print(f"wrote {out}: see {out / 'learning_curve.png'}; {_next_command(out)}")
+        return 0, _result_mapping(out) if self.as_json else None
 
 
-def _following(run: Path) -> str:
-    """Return the command to go on with after a training."""
+def _next_command(run: Path) -> str:
+    """Return the command that evaluates a finished run."""
     return f"next: {command('evaluate', run, trust=needs_trust(run))}"
 
 
-def _came_to(run: Path) -> dict[str, Any]:
-    """What there is to say of a finished run."""
+def _result_mapping(run: Path) -> dict[str, Any]:
+    """Return the result of a finished run, with units, for --json."""
     units = {
         "mean_return": "reward",
         "evaluation_return": "reward",
@@ -223,7 +229,10 @@ def _came_to(run: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None]:
-    """Show a bar for each training while the block runs, by what the run folders say, whatever process writes them."""
+    """Show a bar for each training while the block runs, updated from the files of the run folders.
+
+    Any process may write them.
+    """
     columns = (
         "{task.completed:,}/{task.total:,} {task.fields[unit]}",
         "return {task.fields[mean_return]:.1f}",
@@ -231,7 +240,11 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
         "{task.fields[steps_per_second]:.0f}/s",
     )
     with progress_bar(
-        *(one for one in columns if "torque" not in one or Console(stderr=True).width >= 100)
+        *(
+            column
+            for column in columns
+            if "torque" not in column or Console(stderr=True).width >= 100
+        )
     ) as bar:
         rows = {}
         for name, (config, folder) in runs.items():
@@ -240,8 +253,9 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
                 if config.total_episodes
                 else ("steps", config.total_steps)
             )
-            nothing: dict[str, Any] = dict.fromkeys(REPORT_COLUMNS, math.nan)
-            rows[bar.add_task(name, total=total, unit=unit, **nothing)] = (
+            # Columns of NaN stay hidden until the first report (see `progress_bar`).
+            no_report: dict[str, Any] = dict.fromkeys(REPORT_COLUMNS, math.nan)
+            rows[bar.add_task(name, total=total, unit=unit, **no_report)] = (
                 folder / PROGRESS,
                 unit,
                 total or 0,
@@ -253,35 +267,38 @@ def training_bars(runs: Mapping[str, tuple[TrainConfig, Path]]) -> Iterator[None
                     report: dict[str, Any] = {name: float(value) for name, value in last.items()}
                     bar.update(row, completed=min(int(report[unit]), total), **report)
 
-        ended = threading.Event()
+        finished = threading.Event()
 
-        def follow() -> None:
-            while not ended.wait(0.2):
+        def update_bars() -> None:
+            # The thread reads the progress files instead of being called by the training, so that
+            # it also shows trainings of other processes.
+            while not finished.wait(0.2):
                 show()
 
-        follower = threading.Thread(target=follow)
-        follower.start()
+        thread = threading.Thread(target=update_bars)
+        thread.start()
         try:
             yield
         finally:
-            ended.set()
-            follower.join()
+            finished.set()
+            # One last update shows the final numbers.
+            thread.join()
             show()
 
 
-def _base(chosen: argparse.Namespace) -> TrainConfig:
-    """The configuration whose values are the flags' defaults."""
+def _base_config(chosen: argparse.Namespace) -> TrainConfig:
+    """Return the configuration whose values are the defaults of the flags."""
     if chosen.resume is not None and chosen.config is None:
-        begun = load_config(Path(chosen.resume), chosen.trust)
-        if chosen.settings is not None or chosen.agent not in (None, begun.agent.registry_name()):
+        stored = load_config(Path(chosen.resume), chosen.trust)
+        if chosen.settings is not None or chosen.agent not in (None, stored.agent.registry_name()):
             raise ValueError(
-                f"{chosen.resume} is a training of {begun.agent.name} and continues as it began:"
+                f"{chosen.resume} is a training of {stored.agent.name} and continues unchanged:"
                 " leave --agent and --settings out"
             )
-        return begun
+        return stored
     if chosen.config is not None:
-        given = {name: getattr(chosen, name) for name in ("task", "agent", "settings")}
-        return read_config(Path(chosen.config), chosen.trust, **given)
+        overrides = {name: getattr(chosen, name) for name in ("task", "agent", "settings")}
+        return read_config(Path(chosen.config), chosen.trust, **overrides)
     task = chosen.task or "cartpole"
     world = find_source(task)
     options = world.options_of({"options": chosen.options}) if chosen.options else {}

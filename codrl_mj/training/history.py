@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from codrl_mj.runs.files import writing
-from codrl_mj.viz.pages.plots import Curve, Plot, save
+from codrl_mj.viz.pages.plots import Curve, Plot, save_png
 
 WINDOW = 100
 """Number of training episodes in running means."""
@@ -107,7 +107,7 @@ def save_learning_curve(path: Path, title: str, episodes: np.ndarray, reports: n
         reports[:, REPORT_COLUMNS.index(name)] for name in ("steps", "evaluation_return")
     )
     curves = tuple(learning_curves(episodes, steps, evaluations))
-    save(Plot(title, "environment steps", "return", curves), path, (6.0, 3.5))
+    save_png(Plot(title, "environment steps", "return", curves), path, (6.0, 3.5))
 
 
 class GrowingTable:

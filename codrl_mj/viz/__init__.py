@@ -1,1 +1,1 @@
-"""Pictures of what happened: films, replays, live views and pages."""
+"""Visualization of episodes and results: films, replays, live views and pages."""

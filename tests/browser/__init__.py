@@ -1,1 +1,1 @@
-"""Pages in a browser; `make browser` runs these."""
+"""Tests of pages in a browser; `make browser` runs them."""

@@ -1,4 +1,4 @@
-"""Chromium, and pages that say what they asked for and what went wrong."""
+"""Chromium, and a fixture that opens pages and checks their errors and requests."""
 
 import os
 import shutil
@@ -20,7 +20,7 @@ QUIET = (
 
 @pytest.fixture(scope="session")
 def chromium():
-    """The browser."""
+    """Return the browser."""
     from playwright.sync_api import sync_playwright
 
     path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
@@ -37,24 +37,29 @@ def chromium():
 
 @pytest.fixture
 def opened(chromium):
-    """Opens an address; after the test nothing may have gone wrong in any page, nor been asked of another host."""
-    pages, wrong = [], []
+    """Yield a function that opens an address.
+
+    At the end no page may have had an error or a request to another host.
+    """
+    pages, problems = [], []
 
     def open_page(address, width=1280, height=800, scheme="light", **options):
         page = chromium.new_page(
             viewport={"width": width, "height": height}, color_scheme=scheme, **options
         )
         page.emulate_media(reduced_motion="reduce")
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda message: message.type == "error" and wrong.append(message.text))
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on(
+            "console", lambda message: message.type == "error" and problems.append(message.text)
+        )
 
-        def asked(request):
+        def check_request(request):
             if not request.url.startswith(
                 ("data:", "blob:", "file:", "http://127.0.0.1:", "ws://127.0.0.1:")
             ):
-                wrong.append(f"asked for {request.url}")
+                problems.append(f"request to {request.url}")
 
-        page.on("request", asked)
+        page.on("request", check_request)
         page.goto(address)
         pages.append(page)
         return page
@@ -62,4 +67,4 @@ def opened(chromium):
     yield open_page
     for page in pages:
         page.close()
-    assert wrong == []
+    assert problems == []

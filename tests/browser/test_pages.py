@@ -1,4 +1,4 @@
-"""Pages in Chromium: film and plots on one clock, zoom, keyboard, light and dark, laptop and phone."""
+"""Pages in Chromium: film and plots on one clock, zoom, keyboard, themes, and screen sizes."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from codrl_mj.sizing import find_drive, find_entry
 from codrl_mj.viz.pages import page as builder
 from codrl_mj.viz.pages.motor import motor_page
 from codrl_mj.viz.pages.plots import Curve, Plot
-from codrl_mj.viz.pages.report import replays, report
+from codrl_mj.viz.pages.report import replay_parts, report
 from tests.browser.waiting import until
 
 pytestmark = pytest.mark.browser
@@ -20,15 +20,22 @@ AXE = Path(__file__).parents[2] / "node_modules" / "axe-core" / "axe.min.js"
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """A report with something that joins its clock, one of two runs, a motor's page, and names with markup."""
+    """Write a report with a clocked part, a report of two runs, a motor page, and odd names.
+
+    The names contain markup.
+    """
     folder = tmp_path_factory.mktemp("pages")
-    joined = builder.clocked(
+    clocked_part = builder.clocked_part(
         "a replay",
         '<button id="scrub" type="button">scrub</button> <span id="at"></span>',
         """element.querySelector("#scrub").addEventListener("click", () => seek(1.5));
         function setTime(time) { element.querySelector("#at").textContent = time.toFixed(2); }""",
     )
-    report([RUN], folder / "report.html", joined=lambda shown: (*replays(shown), joined))
+    report(
+        [RUN],
+        folder / "report.html",
+        extra_parts=lambda shown: (*replay_parts(shown), clocked_part),
+    )
     report([RUN, RUN.parent / "cartpole"], folder / "two.html")
     motor_page(
         "qube",
@@ -46,7 +53,7 @@ def pages(tmp_path_factory):
 
 
 def drawn(page, title):
-    """The box of a plot by its title, drawn."""
+    """Return a plot by its title, scrolled into view and drawn."""
     figure = page.locator("figure.uplotted", has=page.locator("figcaption", has_text=title)).first
     figure.scroll_into_view_if_needed()
     figure.locator(".u-over").wait_for()
@@ -54,7 +61,7 @@ def drawn(page, title):
 
 
 def span(figure):
-    """What a plot shows of its horizontal axis."""
+    """Return the visible range of a plot's horizontal axis."""
     return figure.locator(".plot").evaluate(
         "box => [box.plot.u.scales.x.min, box.plot.u.scales.x.max]"
     )
@@ -65,7 +72,7 @@ def now(page):
 
 
 def line(figure):
-    """The time at which a plot draws the present."""
+    """Return the time at which a plot draws its line of the present."""
     return figure.locator(".plot").evaluate(
         "box => box.plot.u.posToVal(new DOMMatrix(getComputedStyle(box.plot.line).transform).e,"
         " 'x')"
@@ -91,9 +98,8 @@ def test_pages_fit_laptop_and_phone_in_light_and_dark(opened, pages, name, width
 def test_the_plots_follow_the_film(opened, pages):
     page = opened((pages / "report.html").as_uri())
     torque = drawn(page, "Torque at the shaft")
-    until(
-        page, "document.querySelector('video').currentTime > 0"
-    )  # a frame of its own: the poster is a later one
+    # The first frame has replaced the poster, which is a later one.
+    until(page, "document.querySelector('video').currentTime > 0")
     assert page.evaluate("codrl.clock.time") == 0.0
     page.get_by_role("button", name="Play").click()
     until(page, "codrl.clock.time > 0.6")
@@ -107,7 +113,7 @@ def test_the_plots_follow_the_film(opened, pages):
     assert page.locator("#at").inner_text() == f"{time:.2f}"
 
 
-def test_dragging_in_a_plot_seeks_the_film_and_all_others(opened, pages):
+def test_dragging_in_a_plot_seeks_the_film_and_the_other_plots(opened, pages):
     page = opened((pages / "report.html").as_uri())
     torque, reward = drawn(page, "Torque at the shaft"), drawn(page, "Reward of each step")
     torque.scroll_into_view_if_needed()
@@ -119,12 +125,12 @@ def test_dragging_in_a_plot_seeks_the_film_and_all_others(opened, pages):
     page.mouse.up()
     assert now(page) == pytest.approx(0.6 * end, abs=0.02 * end)
     assert line(reward) == pytest.approx(now(page), abs=1e-2 * end)
-    wanted = now(page)
-    until(page, f"Math.abs(document.querySelector('video').currentTime - {wanted}) < 0.06")
+    time = now(page)
+    until(page, f"Math.abs(document.querySelector('video').currentTime - {time}) < 0.06")
     assert span(torque) == [0.0, pytest.approx(end)]
 
 
-def test_what_joins_the_clock_follows_it_and_may_scrub(opened, pages):
+def test_a_clocked_part_follows_the_clock_and_can_seek(opened, pages):
     page = opened((pages / "report.html").as_uri())
     torque = drawn(page, "Torque at the shaft")
     page.click("#scrub")
@@ -135,7 +141,7 @@ def test_what_joins_the_clock_follows_it_and_may_scrub(opened, pages):
     assert page.locator("#at").inner_text() == "2.00"
 
 
-def test_plots_zoom_pan_and_show_all_again(opened, pages):
+def test_plots_zoom_pan_and_reset(opened, pages):
     page = opened((pages / "motor.html").as_uri())
     figure = drawn(page, "A small step of the current")
     low, high = whole = span(figure)
@@ -168,8 +174,10 @@ def test_the_keyboard_reads_zooms_and_seeks(opened, pages):
     assert now(page) > 0.0
     assert "desired" in figure.locator("output").inner_text()
     page.keyboard.press("+")
-    other = span(drawn(page, "Reward of each step"))
-    assert other[1] - other[0] == pytest.approx(page.evaluate("codrl.clock.end") / 2, rel=1e-3)
+    other_span = span(drawn(page, "Reward of each step"))
+    assert other_span[1] - other_span[0] == pytest.approx(
+        page.evaluate("codrl.clock.end") / 2, rel=1e-3
+    )
     figure.locator(".plot").focus()
     page.keyboard.press("0")
     assert span(figure)[1] == pytest.approx(page.evaluate("codrl.clock.end"))
@@ -187,7 +195,7 @@ def test_runs_can_be_hidden(opened, pages):
     assert series == [True, True, False, False]
 
 
-def test_without_scripts_there_are_pictures_and_the_films_own_controls(opened, pages):
+def test_without_scripts_there_are_pictures_and_native_film_controls(opened, pages):
     page = opened((pages / "report.html").as_uri(), java_script_enabled=False)
     assert (
         page.locator("figure.uplotted noscript img").count()
@@ -204,6 +212,13 @@ def test_axe_finds_nothing_serious(opened, pages, name, scheme):
         pytest.fail("no axe-core: npm install --no-save axe-core", pytrace=False)
     page = opened((pages / f"{name}.html").as_uri(), scheme=scheme, bypass_csp=True)
     page.add_script_tag(path=AXE)
-    found = page.evaluate("axe.run().then((result) => result.violations)")
-    bad = [(one["id"], [node["html"][:150] for node in one["nodes"]][:3]) for one in found]
-    assert [one["id"] for one in found if one["impact"] in ("serious", "critical")] == [], bad
+    violations = page.evaluate("axe.run().then((result) => result.violations)")
+    details = [
+        (violation["id"], [node["html"][:150] for node in violation["nodes"]][:3])
+        for violation in violations
+    ]
+    assert [
+        violation["id"]
+        for violation in violations
+        if violation["impact"] in ("serious", "critical")
+    ] == [], details

@@ -1,4 +1,4 @@
-"""A replay in Chromium: it plays, is scrubbed, is turned, and follows a clock of others."""
+"""A replay in Chromium: it plays, is scrubbed, is turned, and follows an external clock."""
 
 import io
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from codrl_mj.viz.replay import SCRIPT, library, motion, replay, write_replay
+from codrl_mj.viz.replay import SCRIPT, library_script, motion, replay_html, write_replay
 from tests.browser.waiting import until
 from tests.viz.replay.test_motion import ARM, positions
 
@@ -15,19 +15,19 @@ pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")
-def what():
+def recorded():
     model = mujoco.MjModel.from_xml_string(ARM)
     return motion(model, positions(model, 60), np.arange(60) / 30)
 
 
 @pytest.fixture(scope="module")
-def page_file(what, tmp_path_factory):
-    return write_replay(what, tmp_path_factory.mktemp("replay") / "arm.html", "arm & co")
+def page_file(recorded, tmp_path_factory):
+    return write_replay(recorded, tmp_path_factory.mktemp("replay") / "arm.html", "arm & co")
 
 
 CLOCKED = """<!DOCTYPE html><title>report</title><link rel="icon" href="data:,">
 <div id="one">{part}</div><div id="other">{part}</div>
-<script>{library}</script>
+<script>{library_script}</script>
 <script>
 const clocks = ["one", "other"].map((id) => {{
   const element = document.getElementById(id), seek = () => {{}};
@@ -54,32 +54,31 @@ def poses(page):
     )
 
 
-def test_it_shows_the_recorded_poses_and_goes_straight_between_them(what, page_file, opened):
+def test_it_shows_the_recorded_poses_and_interpolates(recorded, page_file, opened):
     page = opened(page_file.as_uri())
     for index in (0, 17, 59):
-        page.evaluate(f"replay.seek({float(what.time[index])!r})")
-        np.testing.assert_allclose(poses(page), what.poses[index], atol=1e-4)
-    page.evaluate(f"replay.seek({float(what.time[20] + what.time[21]) / 2!r})")
-    middle = (what.poses[20] + what.poses[21]) / 2
+        page.evaluate(f"replay.seek({float(recorded.time[index])!r})")
+        np.testing.assert_allclose(poses(page), recorded.poses[index], atol=1e-4)
+    page.evaluate(f"replay.seek({float(recorded.time[20] + recorded.time[21]) / 2!r})")
+    middle = (recorded.poses[20] + recorded.poses[21]) / 2
     np.testing.assert_allclose(poses(page)[:, :3], middle[:, :3], atol=1e-4)
 
 
-def test_it_plays_at_a_speed_and_stops_at_the_end(page_file, opened):
+def test_it_plays_at_the_chosen_speed_and_stops_at_the_end(page_file, opened):
     page = opened(page_file.as_uri())
     page.select_option("#speed", "4")
     page.clock.install(time=0)
-    page.clock.pause_at(3_600_000)  # ms; from here on time passes as it is told to
+    page.clock.pause_at(3_600_000)  # ms; from here on only `run_for` advances the time
     page.click("#play")
     page.clock.run_for(250)  # ms
-    assert page.evaluate("replay.now()") == pytest.approx(
-        4 * 0.25, abs=4 * 2 / 60
-    )  # its first frame begins to count
+    # The first frame only sets the start, so up to two frames are missing.
+    assert page.evaluate("replay.now()") == pytest.approx(4 * 0.25, abs=4 * 2 / 60)
     page.clock.run_for(500)
     assert page.evaluate("replay.now()") == pytest.approx(59 / 30, abs=1e-3)
     assert page.inner_text("#play") == "Play"
     page.click("#play")
     page.clock.run_for(100)
-    assert page.evaluate("replay.playing() && replay.now() < 0.5")  # from the beginning
+    assert page.evaluate("replay.playing() && replay.now() < 0.5")  # restarted from the beginning
 
 
 def test_the_picture_moves_with_the_time_and_with_the_mouse(page_file, opened):
@@ -131,17 +130,17 @@ def test_it_fits_laptop_and_phone_light_and_dark(page_file, opened, width, schem
     assert (np.mean(picture(page)[2:8, 2:8]) < 90) == (scheme == "light")
 
 
-def test_a_part_of_another_page_follows_its_clock(what, tmp_path, opened):
-    part = replay(what, "arm")
+def test_a_part_of_another_page_follows_its_clock(recorded, tmp_path, opened):
+    part = replay_html(recorded, "arm")
     path = tmp_path / "report.html"
-    path.write_text(CLOCKED.format(part=part, library=library(), script=SCRIPT))
+    path.write_text(CLOCKED.format(part=part, library_script=library_script(), script=SCRIPT))
     page = opened(path.as_uri())
     for index in (30, 5):
-        page.evaluate(f"setAll({float(what.time[index])!r})")
-        np.testing.assert_allclose(poses(page), what.poses[index], atol=1e-4)
+        page.evaluate(f"setAll({float(recorded.time[index])!r})")
+        np.testing.assert_allclose(poses(page), recorded.poses[index], atol=1e-4)
 
 
-def test_without_webgl_it_says_so(page_file, chromium):
+def test_missing_webgl_is_reported(page_file, chromium):
     page = chromium.new_page()
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.goto(page_file.as_uri())

@@ -16,22 +16,22 @@ pytestmark = pytest.mark.browser
 
 @pytest.fixture(scope="module")
 def browser():
-    """A pole on a motor, simulated in a thread of its own as in a terminal."""
+    """Yield a live view of a pole on a motor, simulated in a thread as by the command."""
     config = EnvConfig.from_mapping(
         {"task": "InvertedPendulum-v5", "actuator": {".*": "maxon-re65"}}
     )
-    made = Browser(Session(config, {}), 0, "pole")
+    live_view = Browser(Session(config, {}), 0, "pole")
     ended = threading.Event()
-    thread = threading.Thread(target=lambda: made.run(ended.is_set))
+    thread = threading.Thread(target=lambda: live_view.run(ended.is_set))
     thread.start()
-    yield made
+    yield live_view
     ended.set()
     thread.join()
-    made.close()
+    live_view.close()
 
 
 def field(page, label):
-    """The input beside a label."""
+    """Return the input next to a label."""
     return page.locator(f"xpath=//label[text()='{label}']/following::input[not(@type='hidden')][1]")
 
 
@@ -43,12 +43,16 @@ def shown(browser, page):
 def test_it_simulates_in_real_time_and_is_paused_stepped_and_reset(browser, opened):
     page = opened(browser.url)
     shown(browser, page)
-    until(page, lambda: browser._real == pytest.approx(1.0, abs=0.2) and browser.session.time > 0)
+    until(
+        page,
+        lambda: (
+            browser._real_time_factor == pytest.approx(1.0, abs=0.2) and browser.session.time > 0
+        ),
+    )
     page.get_by_role("button", name="Play or pause").click()
     page.wait_for_selector("text=paused")
-    browser.session.again = (
-        False  # an episode that has just ended would begin anew with the next step
-    )
+    # An episode that has just ended would be reset by the next step.
+    browser.session.auto_reset = False
     time = browser.session.time
     page.get_by_role("button", name="Step").click()
     until(
@@ -57,7 +61,7 @@ def test_it_simulates_in_real_time_and_is_paused_stepped_and_reset(browser, open
             browser.session.time == pytest.approx(time + browser.session.recorder.step_duration)
         ),
     )
-    browser.session.again = True
+    browser.session.auto_reset = True
     page.get_by_role("button", name="Reset").click()
     page.wait_for_selector("text=0.00 s")
     page.get_by_role("button", name="Play or pause").click()
@@ -68,8 +72,8 @@ def test_a_push_moves_the_pole(browser, opened):
     page = opened(browser.url)
     shown(browser, page)
     pushed = []
-    plain = browser.session.push
-    browser.session.push = lambda *given: pushed.append(given) or plain(*given)
+    original = browser.session.push
+    browser.session.push = lambda *arguments: pushed.append(arguments) or original(*arguments)
     page.get_by_role("button", name="Push forth").click()
     until(page, lambda: pushed)
     del browser.session.push
@@ -78,7 +82,7 @@ def test_a_push_moves_the_pole(browser, opened):
     assert force > 0
 
 
-def test_settings_change_the_simulation_and_unstable_ones_are_said(browser, opened):
+def test_settings_change_the_simulation_and_unstable_ones_are_reported(browser, opened):
     page = opened(browser.url)
     shown(browser, page)
     page.get_by_text("controller", exact=True).click()
@@ -103,10 +107,10 @@ def test_settings_change_the_simulation_and_unstable_ones_are_said(browser, open
     )
 
 
-def test_signals_that_differ_by_rounding_alone_are_drawn(browser, opened):
+def test_signals_that_differ_only_by_rounding_are_drawn(browser, opened):
     page = opened(browser.url)
     shown(browser, page)
-    kept, browser.playing = browser.session.signals, False
+    signals, browser.playing = browser.session.signals, False
     count = len(browser.session.recorder.trace_names)
     browser.session.signals = collections.deque(
         (0.01 * index, np.full((1, count), -24.0) * (1 + 1e-10 * (index % 2)))
@@ -115,19 +119,19 @@ def test_signals_that_differ_by_rounding_alone_are_drawn(browser, opened):
     until(page, lambda: page.evaluate("document.querySelectorAll('.u-wrap').length") > 0)
     page.wait_for_timeout(1500)
     assert page.evaluate("1 + 1") == 2
-    browser.session.signals, browser.playing = kept, True
+    browser.session.signals, browser.playing = signals, True
 
 
-def test_another_policy_acts(browser, opened):
+def test_another_policy_can_be_selected(browser, opened):
     page = opened(browser.url)
     shown(browser, page)
     page.get_by_label("policy").click()
     page.get_by_role("option", name="zero").click()
-    until(page, lambda: browser.session.chosen == "zero")
+    until(page, lambda: browser.session.policy_name == "zero")
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
-def test_it_is_dark_where_that_is_preferred_and_leaves_a_phone_the_scene(
+def test_it_follows_the_preferred_theme_and_leaves_the_scene_visible_on_a_phone(
     browser, opened, width, scheme
 ):
     page = opened(browser.url, width, scheme=scheme)

@@ -1,12 +1,12 @@
-"""Waiting for a page, or for the simulation behind it, on a machine that may be busy."""
+"""Waiting for a page, or for the simulation behind it, on a busy machine."""
 
 import pytest
 
 
 def until(page, condition):
-    """Wait for a condition, a function or JavaScript, for at most 30 s.
+    """Wait until a condition, a function or JavaScript, is true, for at most 30 s.
 
-    Playwright's own way evaluates text, which our pages' policy forbids.
+    Playwright's own function evaluates text, which the policy of our pages forbids.
     """
     for _ in range(600):
         if condition() if callable(condition) else page.evaluate(condition):

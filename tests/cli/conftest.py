@@ -1,19 +1,19 @@
-"""An empty folder for each test of the command line, and a run."""
+"""Fixtures of the command line's tests: an empty folder for each test, and a run."""
 
 import pytest
 
-from tests.cli.lines import TINY, ran
+from tests.cli.lines import TINY, run_ok
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
-    """Every test runs in an empty folder."""
+def empty_folder(tmp_path, monkeypatch):
+    """Run every test in an empty folder."""
     monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
-    """A tiny run of CartPole through the actuator `weaker`."""
+    """Return a tiny run of CartPole through the actuator `weaker`."""
     out = tmp_path_factory.mktemp("trained") / "run"
-    ran(f"train cartpole --actuator weaker {TINY} --out {out}")
+    run_ok(f"train cartpole --actuator weaker {TINY} --out {out}")
     return out

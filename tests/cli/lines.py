@@ -1,4 +1,4 @@
-"""Lines of the command line, and what is asked of all of them."""
+"""Helpers that run command lines and check their output."""
 
 import json
 import shutil
@@ -15,40 +15,40 @@ TINY = (
 SMALL_FILM = "--width 200 --height 120 --env.max-episode-steps 2"
 
 
-def ran(line):
+def run_ok(line):
     assert main(line.split()) == 0
 
 
-def read(name):
+def read_json(name):
     return json.loads(Path(name).read_text())
 
 
-def contents(folder):
+def folder_contents(folder):
     return {path: path.is_file() and path.read_bytes() for path in folder.rglob("*")}
 
 
-def refused(capsys, line):
-    """The one line that bad input costs; nothing is written."""
-    before = contents(Path.cwd())
+def assert_refused(capsys, line):
+    """Check that a line is refused with one line of error and writes nothing; return the error."""
+    before = folder_contents(Path.cwd())
     assert main(line.split()) == 2
     error = capsys.readouterr().err
     assert error.startswith("codrl-mj: error: ")
     assert error.count("\n") == 1
     assert "Traceback" not in error
-    assert contents(Path.cwd()) == before
+    assert folder_contents(Path.cwd()) == before
     return error
 
 
-def policy_alone(run):
-    """Its policy in a folder `alone`, that says nothing of the run."""
+def copy_policy_only(run):
+    """Copy the policy of a run to a folder `alone`, without the run's configuration."""
     Path("alone").mkdir()
     for name in ("policy.json", "policy.safetensors"):
         shutil.copy(run / name, "alone")
 
 
-def helped(capsys, *verb):
-    """The help text as one line, without its frame."""
-    with pytest.raises(SystemExit) as done:
+def help_text(capsys, *verb):
+    """Return the help text of a verb as one line, without its frame."""
+    with pytest.raises(SystemExit) as exit_info:
         main([*verb, "--help"])
-    assert done.value.code == 0
+    assert exit_info.value.code == 0
     return " ".join(capsys.readouterr().out.translate(str.maketrans("│╭╮╰╯─", "      ")).split())

@@ -1,4 +1,4 @@
-"""What a verb prints to be typed next is what a shell has to be given, whatever the paths are called."""
+"""Commands that verbs print work in a shell when they are pasted, for any path."""
 
 import ast
 import re
@@ -19,20 +19,20 @@ NAMES = ["my run", 'it\'s "new" $HOME', "plain"]
 
 
 def printed(text):
-    """The words of every command line in a text, as a shell takes them."""
+    """Return the words of every command line in a text, split as by a shell."""
     return [shlex.split(line)[1:] for line in re.findall(r"codrl-mj (?!error)[^;\n]*", text)]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_shell_reads_the_words_of_a_command_as_they_were(name):
+def test_a_shell_splits_a_command_into_its_words(name):
     line = command("board", "check", Path(name), f"{name}.csv", trust=True)
-    said = subprocess.run(
+    result = subprocess.run(
         ["sh", "-c", line.replace("codrl-mj", "printf '%s\\n'", 1)], capture_output=True, text=True
     )
-    assert said.stdout.splitlines() == ["board", "check", name, f"{name}.csv", "--trust"]
+    assert result.stdout.splitlines() == ["board", "check", name, f"{name}.csv", "--trust"]
 
 
-def test_after_a_training_and_an_export_the_next_verb_takes_what_is_printed(capsys, trained):
+def test_commands_printed_after_training_and_export_work(capsys, trained):
     run = shutil.copytree(trained, NAMES[1])
     assert main(["train", "--resume", str(run)]) == 0
     (following,) = printed(capsys.readouterr().out.partition("next: ")[2])
@@ -47,18 +47,16 @@ def test_after_a_training_and_an_export_the_next_verb_takes_what_is_printed(caps
     assert main(following) == 0
 
 
-def test_a_motor_that_is_written_is_shown_by_what_is_printed(capsys):
-    with pytest.raises(ValueError, match="no such file") as told:
+def test_the_command_printed_for_a_new_motor_works(capsys):
+    with pytest.raises(ValueError, match="no such file") as error:
         motor_entry("my motor.toml")
-    (following,) = printed(str(told.value).removesuffix(" writes one"))
+    (following,) = printed(str(error.value).removesuffix(" writes one"))
     assert main(following) == 0
     (following,) = printed(capsys.readouterr().out)
     assert following == ["motor", "show", "my motor.toml"]
 
 
-def test_a_run_is_continued_by_what_is_printed_and_evaluated_with_trust_where_it_needs_it(
-    trained, capsys
-):
+def test_the_command_that_continues_a_run_works_and_has_trust_if_needed(trained, capsys):
     half = Path(shutil.copytree(trained, "half a run"))
     (half / "result.json").unlink()
     assert main(["evaluate", str(half)]) == 2
@@ -69,20 +67,21 @@ def test_a_run_is_continued_by_what_is_printed_and_evaluated_with_trust_where_it
     assert printed(folder.resume_command(half)) == [["train", "--resume", "half a run", "--trust"]]
 
 
-def test_commands_with_paths_in_them_are_made_in_one_place():
-    """Nothing is put into a text after `codrl-mj` but by what quotes it."""
-    quoted = {"shlex.quote", "rig"}  # `rig` is a flag of ours
+def test_all_commands_with_paths_are_built_by_one_function():
+    """Check that only quoting functions insert text after `codrl-mj`."""
+    # `rig` is a flag, not a path.
+    quoted = {"shlex.quote", "rig"}
     for file in Path(codrl_mj.__file__).parent.rglob("*.py"):
         text = file.read_text()
         for node in ast.walk(ast.parse(text)) if "codrl-mj " in text else ():
             if not isinstance(node, ast.JoinedStr) or file.name == "__init__.py":
                 continue
-            begun = False
+            in_command = False
             for part in node.values:
                 if isinstance(part, ast.Constant):
-                    begun = begun or re.search(r"codrl-mj [a-z]", part.value) is not None
+                    in_command = in_command or re.search(r"codrl-mj [a-z]", part.value) is not None
                     continue
                 call = part.value.func if isinstance(part.value, ast.Call) else part.value
-                assert not begun or ast.unparse(call) in quoted, (
+                assert not in_command or ast.unparse(call) in quoted, (
                     f"{file}:{node.lineno}: use codrl_mj.fields.command"
                 )

@@ -1,4 +1,4 @@
-"""Bad input costs one line and leaves nothing."""
+"""Bad input is reported in one line and changes nothing."""
 
 import shutil
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from codrl_mj.cli import main
-from tests.cli.lines import TINY, contents, policy_alone, refused
+from tests.cli.lines import TINY, assert_refused, copy_policy_only, folder_contents
 from tests.matrix import matrix_params
 
 REFUSED = [
@@ -30,7 +30,7 @@ REFUSED = [
         "train pendulm --agent sac",
         "'pendulm': did you mean 'pendulum'? It can be module:NAME of your own",
     ),
-    ("train pendulm", "Gymnasium's goes by its id, such as HalfCheetah-v5"),
+    ("train pendulm", "for an environment of Gymnasium give its id, such as HalfCheetah-v5"),
     ("render pendulm", "no run configuration at pendulm/config.json: did you mean 'pendulum'?"),
     (
         "train CartPole-v1",
@@ -91,7 +91,7 @@ REFUSED = [
     ("render cartpole --out film.avi", "unknown format '.avi'"),
     ("render furuta --trajectory a.csv", "the suffix is '.csv', must be .npz"),
     ("replay furuta --out a.mp4", "the suffix is '.mp4', must be .html"),
-    ("advise re25 Hopper-v5", "knows pendulum, cartpole"),
+    ("advise re25 Hopper-v5", "The study covers pendulum, cartpole"),
     ("advise re25 Hopper-v5", "--measure 5"),
     *(
         (f"{verb} RUN {flag}{value}", f"{text}{flag}{end}")
@@ -104,7 +104,7 @@ REFUSED = [
         for text, end in (("", " = "), ("leave ", " out"))
     ),
 ]
-EVERYWHERE = {
+REFUSED_FLAGS = {
     "--actuator weakr": "did you mean 'weaker'",
     "--env.inner-steps 0": "inner_steps = 0",
     "--seed -1": "seed = -1",
@@ -117,21 +117,23 @@ EVERYWHERE = {
     "--env.max-episode-steps 0": "max_episode_steps = 0",
     "--env.center-radius nan": "center_radius = nan",
 }
-OF_TRAINING = [(f"train cartpole {flags}", says) for flags, says in EVERYWHERE.items()]
-OF_A_RUN = [
-    (f"{verb} RUN {flags}", says)
-    for flags, says in EVERYWHERE.items()
+REFUSED_BY_TRAIN = [
+    (f"train cartpole {flags}", message) for flags, message in REFUSED_FLAGS.items()
+]
+REFUSED_FOR_RUNS = [
+    (f"{verb} RUN {flags}", message)
+    for flags, message in REFUSED_FLAGS.items()
     for verb in ("evaluate", "render")
 ]
 
 
 @pytest.mark.parametrize(
-    ("line", "says"), [*REFUSED, *OF_TRAINING, *matrix_params(OF_A_RUN[:6], OF_A_RUN)]
+    ("line", "message"), [*REFUSED, *REFUSED_BY_TRAIN, *matrix_params(REFUSED_FOR_RUNS[:6], REFUSED_FOR_RUNS)]
 )
-def test_a_line_that_cannot_be_followed_costs_one_line(capsys, trained, line, says):
-    before = contents(trained)
-    assert says in refused(capsys, line.replace("RUN", str(trained)))
-    assert contents(trained) == before
+def test_a_refused_line_prints_one_line_and_changes_nothing(capsys, trained, line, message):
+    before = folder_contents(trained)
+    assert message in assert_refused(capsys, line.replace("RUN", str(trained)))
+    assert folder_contents(trained) == before
 
 
 UNWRITABLE = """
@@ -155,12 +157,12 @@ validate --out {}
 
 
 @pytest.mark.parametrize("line", UNWRITABLE.strip().split("\n"))
-def test_what_cannot_be_written_is_refused_before_anything_is_computed(capsys, line):
+def test_unwritable_outputs_are_refused_before_anything_is_computed(capsys, line):
     Path("file").touch()
-    for place in ("file", "/proc/nowhere"):
-        error = refused(capsys, line.format(place))
+    for path in ("file", "/proc/nowhere"):
+        error = assert_refused(capsys, line.format(path))
         assert "cannot write to" in error
-        assert Path(place).name in error
+        assert Path(path).name in error
 
 
 @pytest.mark.parametrize("verb", ["evaluate", "render"])
@@ -175,28 +177,28 @@ def test_what_cannot_be_written_is_refused_before_anything_is_computed(capsys, l
         ("config.json", b"{"),
     ],
 )
-def test_a_foreign_file_in_the_run_folder_is_named(capsys, trained, verb, file, content):
+def test_a_damaged_file_in_a_run_folder_is_named(capsys, trained, verb, file, content):
     shutil.copytree(trained, "foreign")
     (
         Path("foreign", file).unlink()
         if content is None
         else Path("foreign", file).write_bytes(content)
     )
-    assert file in refused(capsys, f"{verb} foreign")
+    assert file in assert_refused(capsys, f"{verb} foreign")
 
 
 def test_a_policy_for_another_task_is_refused(capsys, trained):
-    policy_alone(trained)
-    assert "observation_space: the policy was trained with" in refused(
+    copy_policy_only(trained)
+    assert "observation_space: the policy was trained with" in assert_refused(
         capsys, "evaluate alone --task pendulum"
     )
 
 
-def stopped(*_, **__):
+def interrupt_verb(*_, **__):
     raise KeyboardInterrupt
 
 
-def stopped_in_a_library(*_):
+def interrupt_in_a_library(*_):
     try:
         raise KeyboardInterrupt
     except KeyboardInterrupt:
@@ -204,25 +206,28 @@ def stopped_in_a_library(*_):
 
 
 @pytest.mark.parametrize(
-    ("line", "function", "how"),
+    ("line", "function", "interrupt"),
     [
-        ("validate cartpole --out certificate", "validation.validate", stopped),
-        ("runs", "runs.summaries.find_runs", stopped_in_a_library),
+        ("validate cartpole --out certificate", "validation.validate", interrupt_verb),
+        ("runs", "runs.summaries.find_runs", interrupt_in_a_library),
     ],
 )
-def test_what_is_stopped_exits_with_130_and_leaves_nothing(
-    monkeypatch, tmp_path, capsys, line, function, how
+def test_an_interrupted_verb_exits_with_130_and_leaves_nothing(
+    monkeypatch, tmp_path, capsys, line, function, interrupt
 ):
-    monkeypatch.setattr(f"codrl_mj.{function}", how)
+    monkeypatch.setattr(f"codrl_mj.{function}", interrupt)
     assert main(line.split()) == 130
-    assert capsys.readouterr().err == "codrl-mj: stopped: the same command begins anew\n"
+    assert (
+        capsys.readouterr().err == "codrl-mj: stopped: the same command starts from the beginning\n"
+    )
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_no_fault_of_the_input_is_one_line_and_whole_on_request(capsys, monkeypatch):
+def test_an_unexpected_error_is_one_line_and_has_a_traceback_on_request(capsys, monkeypatch):
     monkeypatch.setattr("codrl_mj.runs.summaries.find_runs", lambda _: {}["absent"])
     assert (
-        refused(capsys, "runs") == "codrl-mj: error: KeyError: 'absent' (--traceback shows where)\n"
+        assert_refused(capsys, "runs")
+        == "codrl-mj: error: KeyError: 'absent' (--traceback shows where)\n"
     )
     assert main(["runs", "--traceback"]) == 2
     traced = capsys.readouterr().err

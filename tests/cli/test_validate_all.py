@@ -1,17 +1,20 @@
-"""`codrl-mj validate` alone validates every task, as its help and docs/validation.md say."""
+"""`codrl-mj validate` without tasks validates all of them.
+
+Its help and docs/validation.md say so.
+"""
 
 from codrl_mj import validation
 from codrl_mj.cli import main
 
 
-def test_validates_everything_if_no_task_is_named(monkeypatch):
-    asked = []
+def test_validates_every_task_if_none_is_named(monkeypatch):
+    tasks_seen = []
 
-    def stopped(tasks, **_):
-        asked.append(tasks)
+    def raise_early(tasks, **_):
+        tasks_seen.append(tasks)
         raise ValueError("far enough")
 
-    monkeypatch.setattr(validation, "validate", stopped)
+    monkeypatch.setattr(validation, "validate", raise_early)
     assert main(["validate", "--quick"]) == 2
     assert main(["validate", "cartpole", "--quick"]) == 2
-    assert asked == [None, ("cartpole",)]
+    assert tasks_seen == [None, ("cartpole",)]

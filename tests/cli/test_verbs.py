@@ -1,4 +1,4 @@
-"""What the command line teaches, and that it does what it says."""
+"""Help of the command line, and results of its verbs."""
 
 import dataclasses
 import json
@@ -20,15 +20,15 @@ from codrl_mj.evaluation import evaluate, run_episodes
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.tasks import TASKS, named_actuator
 from codrl_mj.training import TrainConfig, load_config
-from tests.cli.lines import SMALL_FILM, TINY, helped, policy_alone, ran, read
+from tests.cli.lines import SMALL_FILM, TINY, copy_policy_only, help_text, read_json, run_ok
 
-# -- help ---------------------------------------------------------------------------------------------------
+# -- help -----------------------------------------------------------------------------------------
 
-TAUGHT = {
+HELP_FRAGMENTS = {
     "": [
-        f"{what}{verb}"
+        f"{prefix}{verb}"
         for verb in ("train", "evaluate", "render", "validate")
-        for what in ("• ", "Example: codrl-mj ")
+        for prefix in ("• ", "Example: codrl-mj ")
     ],
     "train": [
         f"{{{','.join(TASKS)}}}",
@@ -44,15 +44,15 @@ TAUGHT = {
 }
 
 
-@pytest.mark.parametrize("verb", TAUGHT)
+@pytest.mark.parametrize("verb", HELP_FRAGMENTS)
 def test_the_help_lists_verbs_and_tasks_and_gives_examples(capsys, verb):
-    text = helped(capsys, *verb.split())
-    assert [one for one in TAUGHT[verb] if one not in text] == []
+    text = help_text(capsys, *verb.split())
+    assert [fragment for fragment in HELP_FRAGMENTS[verb] if fragment not in text] == []
 
 
 @pytest.mark.parametrize("verb", ["train", "evaluate", "render"])
 def test_the_help_explains_every_named_actuator_and_every_field_with_its_unit(capsys, verb):
-    text = helped(capsys, verb)
+    text = help_text(capsys, verb)
     for name, (description, _) in NAMED.items():
         assert f"{name}: {description}" in text
     for part, kind in (("motor", Motor), ("controller", CurrentLoop), ("supply", Supply)):
@@ -89,8 +89,8 @@ def test_the_help_explains_every_named_actuator_and_every_field_with_its_unit(ca
         for name in named
     ],
 )
-def test_the_help_shows_every_default_of_the_agent_on_the_task(capsys, agent, task, settings):
-    text = helped(capsys, "train", task, "--agent", agent, "--settings", settings)
+def test_the_help_shows_every_default_of_the_agent(capsys, agent, task, settings):
+    text = help_text(capsys, "train", task, "--agent", agent, "--settings", settings)
     config = TrainConfig.preset(task, agent, settings)
     values = {
         f"--agent.{field.name}": getattr(config.agent, field.name)
@@ -112,7 +112,7 @@ def test_the_help_shows_every_default_of_the_agent_on_the_task(capsys, agent, ta
 
 
 def test_the_short_help_has_every_flag_and_half_the_lines(capsys):
-    long = helped(capsys, "train", "pendulum")
+    long = help_text(capsys, "train", "pendulum")
     with pytest.raises(SystemExit):
         main(["train", "pendulum", "-h"])
     short = capsys.readouterr().out
@@ -124,18 +124,18 @@ def test_the_short_help_has_every_flag_and_half_the_lines(capsys):
 
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if hasattr(find_verb(verb), "as_json")])
-def test_the_help_of_a_verb_with_numbers_has_json(capsys, verb):
-    assert "--json Print JSON and nothing else" in helped(capsys, *verb.split())
+def test_verbs_with_numbers_have_json(capsys, verb):
+    assert "--json Print JSON and nothing else" in help_text(capsys, *verb.split())
 
 
-# -- train, evaluate, render --------------------------------------------------------------------------------
+# -- train, evaluate, render ----------------------------------------------------------------------
 
 
-def test_training_leaves_a_run_folder_whose_fields_are_set_over_the_named_actuator(capsys):
+def test_training_writes_a_run_folder_with_the_overridden_actuator_fields(capsys):
     loop = "--actuator.controller.kp 0.3 --actuator.controller.max-voltage inf"
     more = "--actuator.controller.bemf-compensation False --actuator.motor.inductance 0.07"
     env = "--env.center-radius 0.1 --env.inner-steps 2 --env.sutton-barto-reward True"
-    ran(f"train cartpole --actuator weaker --seed 3 {loop} {more} {env} {TINY}")
+    run_ok(f"train cartpole --actuator weaker --seed 3 {loop} {more} {env} {TINY}")
     assert "next: codrl-mj evaluate runs/cartpole-ppo-weaker-3" in capsys.readouterr().out
     config = load_config(Path("runs/cartpole-ppo-weaker-3"))
     assert (config.seed, config.total_steps, config.num_envs, config.agent.hidden) == (
@@ -153,11 +153,13 @@ def test_training_leaves_a_run_folder_whose_fields_are_set_over_the_named_actuat
     assert config.actuator == named_actuator("weaker", "cartpole").replaced(changed)
 
 
-def test_evaluation_is_that_of_the_package_and_a_file_gets_no_colours(capsys, trained, monkeypatch):
+def test_evaluation_equals_the_packages_and_piped_output_has_no_colors(
+    capsys, trained, monkeypatch
+):
     capsys.readouterr()
     monkeypatch.setenv("TERM", "xterm-256color")
-    ran(f"evaluate {trained} --episodes 7 --seed 5 --out a/result.json")
-    result = read("a/result.json")
+    run_ok(f"evaluate {trained} --episodes 7 --seed 5 --out a/result.json")
+    result = read_json("a/result.json")
     make = EnvConfig("cartpole", "weaker").make
     totals = [episode.total for episode in run_episodes(load_policy(trained), make, 7, seed=5)]
     assert result["returns"]["mean"] == pytest.approx(np.mean(totals), rel=1e-12)
@@ -169,31 +171,31 @@ def test_evaluation_is_that_of_the_package_and_a_file_gets_no_colours(capsys, tr
     assert f"{result['tracking_rms']:.3g} N·m" in text
 
 
-def test_several_policies_have_a_row_each_in_the_environment_of_their_own_training(trained):
+def test_each_policy_is_evaluated_in_the_environment_of_its_training(trained):
     shutil.copytree(trained, Path("other", trained.name))
     config = Path("other", trained.name, "config.json")
-    content = read(config)
+    content = read_json(config)
     content["train"]["env"]["actuator"] = "paper"
     content.pop("sha256", None)
     config.write_text(json.dumps(content))
     both = {str(trained): "weaker", str(config.parent): "paper"}
-    ran(f"evaluate {' '.join(both)} --episodes 3 --out both.json")
-    found = read("both.json")
-    assert list(found) == [
-        f"{Path(one).parent.name}/{trained.name} on {motor}" for one, motor in both.items()
+    run_ok(f"evaluate {' '.join(both)} --episodes 3 --out both.json")
+    results = read_json("both.json")
+    assert list(results) == [
+        f"{Path(run).parent.name}/{trained.name} on {motor}" for run, motor in both.items()
     ]
-    for path, result in zip(both, found.values(), strict=True):
-        ran(f"evaluate {path} --episodes 3 --out one.json")
-        assert read("one.json") == result
-    assert len({json.dumps(one["conditions"]) for one in found.values()}) == 2
+    for path, result in zip(both, results.values(), strict=True):
+        run_ok(f"evaluate {path} --episodes 3 --out one.json")
+        assert read_json("one.json") == result
+    assert len({json.dumps(run["conditions"]) for run in results.values()}) == 2
 
 
-def test_a_policy_is_evaluated_on_any_actuator_with_any_field_and_sampled_actions(trained):
+def test_a_policy_is_evaluated_on_other_actuators_and_with_sampled_actions(trained):
     conditions = {name: f"--actuator {name}" for name in ("as-trained", "weaker", "ideal", "paper")}
     conditions |= {"starved": "--actuator.controller.max-voltage 0.2", "sampled": "--stochastic"}
     for name, flags in conditions.items():
-        ran(f"evaluate {trained} --episodes 4 {flags} --out {name}.json")
-    results = {name: read(f"{name}.json") for name in conditions}
+        run_ok(f"evaluate {trained} --episodes 4 {flags} --out {name}.json")
+    results = {name: read_json(f"{name}.json") for name in conditions}
     assert results["as-trained"] == results["weaker"]
     assert results["ideal"]["tracking_rms"] == 0.0
     assert results["ideal"]["peak_voltage"] is None
@@ -208,34 +210,34 @@ def test_a_policy_is_evaluated_on_any_actuator_with_any_field_and_sampled_action
 def test_a_run_is_evaluated_and_filmed_in_the_environment_of_its_training():
     levels = "--env.action voltage --env.levels -3 3 --env.observe-actuator"
     env = f"{levels} --env.disturbances.command-delay 0.1"
-    ran(f"train cartpole --actuator paper {env} {TINY} --out volts")
-    policy_alone(Path("volts"))
+    run_ok(f"train cartpole --actuator paper {env} {TINY} --out volts")
+    copy_policy_only(Path("volts"))
     for subject in ("volts", f"volts {env}", f"alone --task cartpole --actuator paper {env}"):
-        ran(f"evaluate {subject} --episodes 2 --out {len(subject)}.json")
+        run_ok(f"evaluate {subject} --episodes 2 --out {len(subject)}.json")
     first, *others = (path.read_text() for path in Path().glob("*.json"))
     assert others == [first] * 2
     expected = evaluate(load_policy(Path("volts")), load_config(Path("volts")).evaluation_env, 2)
     assert json.loads(first) == json.loads(json.dumps(expected.as_mapping()))
     assert expected.peak_voltage == 3.0
-    ran("evaluate volts --episodes 2 --env.disturbances.command-delay 0 --out at_once.json")
-    assert read("at_once.json")["returns"] != json.loads(first)["returns"]
+    run_ok("evaluate volts --episodes 2 --env.disturbances.command-delay 0 --out at_once.json")
+    assert read_json("at_once.json")["returns"] != json.loads(first)["returns"]
     for subject in ("volts", f"cartpole {levels}"):
-        ran(f"render {subject} --out film.gif {SMALL_FILM}")
+        run_ok(f"render {subject} --out film.gif {SMALL_FILM}")
 
 
 def test_a_run_can_be_filmed_and_a_task_with_random_actions(capsys, trained):
-    ran(f"render {trained} --out film.mp4 --width 200 --height 120")
+    run_ok(f"render {trained} --out film.mp4 --width 200 --height 120")
     with imageio.get_reader("film.mp4") as reader:
         assert reader.get_meta_data()["codec"] == "h264"
         assert reader.get_meta_data()["size"][0] == 200
     assert "wrote film.mp4" in capsys.readouterr().out
-    ran(f"render pendulum --out film.gif {SMALL_FILM} --seed 2 --camera fixed")
+    run_ok(f"render pendulum --out film.gif {SMALL_FILM} --seed 2 --camera fixed")
     assert Path("film.gif").read_bytes().startswith(b"GIF89a")
 
 
-# -- for other programs -------------------------------------------------------------------------------------
+# -- for other programs ---------------------------------------------------------------------------
 
-WITH_NUMBERS = [
+JSON_LINES = [
     # a line, and a number in its JSON by the keys on the way there
     (f"train cartpole {TINY} --out mine", "best return"),
     ("evaluate RUN --episodes 2", "returns mean"),
@@ -252,26 +254,26 @@ WITH_NUMBERS = [
 ]
 
 
-@pytest.mark.parametrize(("line", "place"), WITH_NUMBERS)
-def test_with_json_nothing_else_is_printed(capsys, trained, line, place):
+@pytest.mark.parametrize(("line", "keys"), JSON_LINES)
+def test_json_is_the_only_output(capsys, trained, line, keys):
     words = [str(trained) if word == "RUN" else word for word in line.split()]
     assert main([*words, "--json"]) in (0, 1)
     printed, errors = capsys.readouterr()
-    found = json.loads(printed)
-    assert (printed, errors) == (json.dumps(found, indent=2) + "\n", "")
+    content = json.loads(printed)
+    assert (printed, errors) == (json.dumps(content, indent=2) + "\n", "")
     assert '"unit' in printed  # of each number, or of all by their names
-    for key in place.split():
-        found = found[int(key) if key.isdigit() else key]
-    assert isinstance(found, float)
+    for key in keys.split():
+        content = content[int(key) if key.isdigit() else key]
+    assert isinstance(content, float)
 
 
 LOG = "log.csv --columns time=time:s,voltage=voltage:V,current=current:A,position=position:rad"
 LOGGED = (
     "identify simulate maxon-ec45-flat-50w --out log.csv --amplitude 12 --inertia 1e-4 --duration 1"
 )
-BEHIND = [
+NARROW_LINES = [
     # lines, separated by ;, the last of which is looked at
-    *(line for line, _ in WITH_NUMBERS),
+    *(line for line, _ in JSON_LINES),
     "evaluate RUN RUN --episodes 2",
     "motor new my_motor.toml",
     "advise maxon-ec45-flat-50w pendulum --gear-ratio 20",
@@ -287,61 +289,68 @@ BEHIND = [
 ]
 
 
-TO_COPY = "codrl-mj |--columns|^wrote |https://"
+COPYABLE = "codrl-mj |--columns|^wrote |https://"
 
 
-@pytest.mark.parametrize("line", BEHIND)
-def test_80_columns_hold_every_line_but_one_to_copy(capsys, trained, monkeypatch, line):
+@pytest.mark.parametrize("line", NARROW_LINES)
+def test_output_fits_80_columns_except_lines_to_copy(capsys, trained, monkeypatch, line):
     capsys.readouterr()
     monkeypatch.setenv("COLUMNS", "80")
-    for one in line.split(";"):
-        assert main(one.replace("RUN", str(trained)).split()) in (0, 1)
+    for command in line.split(";"):
+        assert main(command.replace("RUN", str(trained)).split()) in (0, 1)
     printed = capsys.readouterr()
     assert printed.err == ""
     assert "\x1b" not in printed.out
     lines = map(str.rstrip, printed.out.splitlines())
-    assert [text for text in lines if len(text) > 80 and not re.search(TO_COPY, text)] == []
+    assert [text for text in lines if len(text) > 80 and not re.search(COPYABLE, text)] == []
 
 
-# -- what is said -------------------------------------------------------------------------------------------
+# -- messages -------------------------------------------------------------------------------------
 
 
-def test_numbers_are_understood_as_people_write_them(monkeypatch):
-    given = []
-    monkeypatch.setattr("codrl_mj.cli.train.Train.run", lambda self: given.append(self) or 0)
+def test_numbers_may_be_written_as_1e5_and_20_to_1(monkeypatch):
+    verbs = []
+    monkeypatch.setattr("codrl_mj.cli.train.Train.run", lambda self: verbs.append(self) or 0)
     motor = "--actuator maxon-re65 --gear-ratio 20:1 --voltage=12"
-    ran(f"train pendulum --agent ppo {motor} --total-steps 1e5 --num-envs 64 --agent.hidden 1e1 8")
-    assert (given[0].total_steps, given[0].num_envs, given[0].agent.hidden) == (
+    run_ok(
+        f"train pendulum --agent ppo {motor} --total-steps 1e5 --num-envs 64 --agent.hidden 1e1 8"
+    )
+    assert (verbs[0].total_steps, verbs[0].num_envs, verbs[0].agent.hidden) == (
         100_000,
         64,
         (10, 8),
     )
-    assert given[0].actuator_fields.motor.gear_ratio == 20.0
-    assert given[0].actuator_fields.supply.voltage == 12.0
+    assert verbs[0].actuator_fields.motor.gear_ratio == 20.0
+    assert verbs[0].actuator_fields.supply.voltage == 12.0
 
 
 @pytest.mark.filterwarnings("always::UserWarning")
-def test_draws_of_the_training_over_another_actuator_are_said(capsys):
+def test_warns_if_another_actuator_is_randomized_as_in_the_training(capsys):
     flags = (
         "--agent.rollout-steps 64 --agent.batch-size 64 --total-steps 64 --num-envs 1"
         " --evaluation-episodes 1"
     )
-    ran(f"train cartpole --env.randomize motor.inductance=uniform(0.09,0.11) {flags} --out drawn")
+    run_ok(
+        f"train cartpole --env.randomize motor.inductance=uniform(0.09,0.11) {flags} --out drawn"
+    )
     capsys.readouterr()
-    ran("evaluate drawn --episodes 1 --actuator weak")
-    assert "motor.inductance of weak are drawn as in the training" in capsys.readouterr().err
-    ran("evaluate drawn --episodes 1 --actuator weak --env.randomize None")
-    ran("evaluate drawn --episodes 1")
-    assert "drawn as in" not in capsys.readouterr().err
+    run_ok("evaluate drawn --episodes 1 --actuator weak")
+    assert (
+        "motor.inductance of weak are drawn from the ranges of the training"
+        in capsys.readouterr().err
+    )
+    run_ok("evaluate drawn --episodes 1 --actuator weak --env.randomize None")
+    run_ok("evaluate drawn --episodes 1")
+    assert "are drawn from" not in capsys.readouterr().err
 
 
-def test_training_says_first_what_is_assumed_of_the_motor(capsys, monkeypatch):
+def test_training_prints_assumed_motor_values_first(capsys, monkeypatch):
     monkeypatch.setattr("codrl_mj.training.train", lambda *_, **__: None)
     line = "train pendulum --actuator maxon-ec45-flat-339285 --out assumed"
-    ran(line)
+    run_ok(line)
     assumed = "assumed, for none is given: supply.voltage = 24 V, controller.max_current = inf"
     assert capsys.readouterr().out.splitlines()[0] == assumed
-    ran(f"{line} --actuator.supply.voltage 12 --actuator.controller.max-current 5")
+    run_ok(f"{line} --actuator.supply.voltage 12 --actuator.controller.max-current 5")
     assert "assumed, for" not in capsys.readouterr().out
 
 

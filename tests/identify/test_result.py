@@ -10,7 +10,7 @@ import yaml
 
 from codrl_mj.actuators import Drive, identified_ranges, resolve
 from codrl_mj.cli import main
-from codrl_mj.cli.environments import environment
+from codrl_mj.cli.environments import build_env_config
 from codrl_mj.cli.train import train_verb
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.identify.identify import check_arguments, identify, predict_missing
@@ -193,7 +193,7 @@ def test_the_command_line_identifies_and_randomizes_within_the_intervals(tmp_pat
     line, out = f"identify {log} --columns {columns} --known", tmp_path / "motor"
     assert main(f"{line} {known} --out {out} --holdout {wrong}".split()) == 0
     output = capsys.readouterr().out
-    assert "wrong, which is held out, has errors, and is left out" in output
+    assert "the held-out log wrong has errors and is left out" in output
     assert "supply 3 V: the largest of the logs" in output
     assert "resistance" in output
     assert "identified" in output
@@ -210,13 +210,13 @@ def test_the_command_line_identifies_and_randomizes_within_the_intervals(tmp_pat
         "motor.inductance=uniform(1e-4,1e-3)",
     ]
     verb = tyro.cli(train_verb(words), args=words)
-    config = environment(verb, "pendulum", verb.actuator_name, EnvConfig("pendulum"))
+    config = build_env_config(verb, "pendulum", verb.actuator_name, EnvConfig("pendulum"))
     assert config.randomize[0] == "motor.inductance=uniform(0.0001, 0.001)"
     assert f"motor.resistance=loguniform({low!r}, {high!r})" in config.randomize
     words[2] = "weak"
     verb = tyro.cli(train_verb(words), args=words)
     with pytest.raises(ValueError, match="identified: draws within the intervals of a file"):
-        environment(verb, "pendulum", verb.actuator_name, EnvConfig("pendulum"))
+        build_env_config(verb, "pendulum", verb.actuator_name, EnvConfig("pendulum"))
     refused = tmp_path / "refused"
     assert main(f"{line} torque_constant=0.05 back_emf_constant=0.05 --out {refused}".split()) == 1
     assert "not to be used as an actuator: rotor_inertia" in capsys.readouterr().out

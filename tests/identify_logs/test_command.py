@@ -47,7 +47,7 @@ def test_a_repeated_simulation_has_no_findings_and_is_checked_once(capsys):
     for _ in range(2):
         run_identify(capsys, f"{QUBE} --sensor current:noise=0.01")
     once = run_identify(capsys, f"check log.csv {COLUMNS}")
-    assert "nothing is wrong" in once
+    assert "no problems found" in once
     assert run_identify(capsys, f"check log.csv log.csv {COLUMNS}") == once
 
 
@@ -61,7 +61,7 @@ def test_errors_set_the_exit_status_and_are_printed_as_json(capsys):
 def test_proposed_columns_are_printed_with_the_next_command(capsys):
     run_identify(capsys, QUBE)
     text = run_identify(capsys, "columns log.csv")
-    assert "to be checked: current: no unit is stated: replace UNIT by A or mA" in text
+    assert "please check: current: no unit is stated: replace UNIT by A or mA" in text
     line = text.splitlines()[-1].removeprefix("codrl-mj identify ")
     assert "current=current:UNIT" in line
     assert line.endswith("--rig free --known load_inertia=0 --out motor")
@@ -82,7 +82,7 @@ def test_a_plan_is_printed_and_its_excitation_written(capsys, tmp_path, monkeypa
     monkeypatch.setattr("codrl_mj.identify.plan.RATES", (1e3, 5e3))
     text = run_identify(capsys, "plan maxon-ec45-flat-50w --inertia 1e-4 --duration 1 --out plan")
     assert "* play prbs" in text
-    assert "viscous_friction: 0 on the datasheet" in text
+    assert "viscous_friction, which the datasheet gives as 0" in text
     assert (tmp_path / "plan" / "excitation.csv").read_text().startswith("time,voltage\n")
     result = json.loads(
         run_identify(capsys, "plan maxon-ec45-flat-50w --inertia 1e-4 --duration 1 --json")

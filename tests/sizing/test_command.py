@@ -101,7 +101,7 @@ def test_show_takes_a_datasheet_of_one_s_own_and_any_drive(capsys):
     text = printed(capsys, "show", "own.toml", "--out", ".")
     parts = (
         "we ours, brushed",
-        "What it can do at its output, at 12 V",
+        "Abilities at its output, at 12 V",
         "assumed",
         "The motor, at its rotor",
         "source 1",
@@ -208,7 +208,7 @@ def test_operating_points_are_laid_over_the_diagram():
     )
     limit = curves["continuous current, 2.52 A, highest"]
     assert limit.x.max() > 800.0
-    assert plot.y_most > 2.0
+    assert plot.y_limit > 2.0
     assert "rad/s" in plot.x_label
     assert "N·m" in plot.y_label
     with pytest.raises(ValueError, match=r"points: shape \(3,\), must be \(n, 2\)"):

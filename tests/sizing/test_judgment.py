@@ -299,7 +299,7 @@ def test_gears_are_judged_on_the_command_line(tmp_path, pololu, furuta, capsys, 
     printed = " ".join(capsys.readouterr().out.split())
     assert "known.toml at gear 6.25: try it. friction" in printed
     assert "known.toml at gear 18.75: try it. rotor" in printed
-    assert "no motor surely does it with that margin; written is the nearest" in printed
+    assert "no motor is surely suitable with that margin; the nearest was written" in printed
     assert sorted(path.name for path in (tmp_path / "out").glob("*.png")) == [
         "known-18.75.png",
         "known-6.25.png",

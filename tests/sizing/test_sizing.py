@@ -426,7 +426,7 @@ def test_the_command_judges_a_recording_and_draws_it(tmp_path, capsys):
 def test_the_command_chooses_and_says_what_is_wrong_with_the_rest(tmp_path, capsys):
     assert main(["motor", "choose", "pendulum", "--top", "2", "--out", str(tmp_path)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "smallest that does it with 20% left first" in printed
+    assert "smallest suitable motor with a margin of 20% first" in printed
     assert "quanser-srv02 at gear 70: try it" in printed
     assert len(list(tmp_path.glob("*.png"))) == 2
 
@@ -463,8 +463,8 @@ def test_ones_own_motors_are_ranked_among_themselves(tmp_path, capsys, monkeypat
             in printed
         )
     for words, said in (
-        (["a.toml"], "nothing to choose for: name one task"),
-        (["pendulum", "cartpole"], "pendulum and cartpole to choose for"),
+        (["a.toml"], "got no task: name exactly one task"),
+        (["pendulum", "cartpole"], "got pendulum and cartpole: name exactly one"),
         (["c.toml", "joint.npz"], "there is no such file"),
         (["pendulun", "a.toml"], "did you mean 'pendulum'"),
         (["rev-nao", "joint.npz"], "did you mean 'rev-neo'"),

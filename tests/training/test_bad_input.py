@@ -88,7 +88,7 @@ def error_of(capsys, *line):
         ("--agent.gamma 0.5 --num-envs 4", "agent.gamma: 0.99 and 0.5; num_envs: 2 and 4"),
         ("--actuator ideal", "env.actuator.motor.resistance: 1.0 and 'absent'"),
         ("--config other.yaml", "seed: 0 and 9"),
-        ("--agent dqn", "{} is a training of ppo and continues as it began"),
+        ("--agent dqn", "{} is a training of ppo and continues unchanged"),
         ("--settings paper", "leave --agent and --settings out"),
         ("--out elsewhere", "a run continues in its own folder, {}"),
     ],
@@ -150,7 +150,7 @@ def test_flags_that_contradict_a_run_raise(capsys, run, flags, expected):
         ),
         ("evaluate run --task pendulum", "run was trained for cartpole"),
         ("evaluate run --agent dqn", "run was trained by ppo: leave --agent out"),
-        ("evaluate alone", "name its task with --task"),
+        ("evaluate alone", "name it with --task"),
         ("evaluate alone --task pendulum", "observation_space: the policy was trained with Box"),
         ("evaluate alone --task cartpole --which best", "leave --which out"),
         # A zip file may contain code, and is loaded only with --trust.
@@ -160,7 +160,7 @@ def test_flags_that_contradict_a_run_raise(capsys, run, flags, expected):
             "Pass --trust if that author is you",
         ),
         ("evaluate nowhere.zip --task cartpole --agent ppo", "no model at nowhere.zip"),
-        ("evaluate model.zip --agent ppo --trust", "name its task with --task"),
+        ("evaluate model.zip --agent ppo --trust", "name it with --task"),
         ("evaluate model.zip --task cartpole --trust", "name it with --agent"),
         ("evaluate model.zip --task cartpole --agent dqn --trust", "is not a model of dqn"),
         (
@@ -169,7 +169,7 @@ def test_flags_that_contradict_a_run_raise(capsys, run, flags, expected):
         ),
         (
             "evaluate model.zip --task cartpole --which best",
-            "no run folder and holds one policy alone",
+            "no run folder and has a single policy",
         ),
     ],
 )
@@ -211,7 +211,7 @@ def test_other_software_raises_and_can_be_accepted(capsys, changes, expected):
 def test_a_finished_run_is_not_changed(capsys):
     before = files()
     do("train --resume run")
-    assert "run is finished already" in capsys.readouterr().out
+    assert "run is already finished" in capsys.readouterr().out
     assert files() == before
 
 

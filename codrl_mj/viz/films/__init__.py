@@ -1,1 +1,1 @@
-"""Films of episodes, and the strip of signals under the scene."""
+"""Films of episodes, with plots of signals below the scene."""

@@ -1,7 +1,7 @@
-"""Films of episodes: as a file, with a strip of torque and voltage under the scene; as a clip, the scene alone.
+"""Films of episodes: files with plots of signals below the scene, and clips of the scene.
 
-Episodes of tasks are recorded first and drawn afterwards from their states, so that drawing never
-disturbs a simulation; an environment of somebody else's draws itself while it runs.
+Episodes of tasks are recorded first and rendered from their states afterwards, so that rendering
+never changes a simulation. Third-party environments render themselves while they run.
 """
 
 import contextlib
@@ -32,48 +32,58 @@ from codrl_mj.viz.films.strip import (
 )
 
 _FORMATS = (".mp4", ".gif", "")
-_FINE = ("-preset", "veryfast", "-crf", "18")
-"""For files: half the time of ffmpeg's default, and a smaller file."""
-_SOUGHT = ("-preset", "veryfast", "-crf", "26", "-g", "15", "-movflags", "+faststart")
-"""For pages: a key frame every half second, for it is sought in; up to date players need no more than this."""
+_FILE_ENCODING = ("-preset", "veryfast", "-crf", "18")
+"""Encoder options for files: half the time of ffmpeg's default, and a smaller file."""
+_PAGE_ENCODING = ("-preset", "veryfast", "-crf", "26", "-g", "15", "-movflags", "+faststart")
+"""Encoder options for pages: a key frame every half second, because a page seeks in its film."""
 _TITLE_HEIGHT = 40  # px
 _MIN_WIDTH, _MIN_HEIGHT = 160, 80  # px
-_WINDOW_STEPS = 150  # environment steps that the strip shows at a time
-_MAX_FPS, _MOST_FRAMES = 30, 600
-"""Frames a second, and in a clip."""
-_FELL, _LASTED = "#B03A2E", "#1E8449"
+_WINDOW_STEPS = 150  # environment steps visible in the plots
+_MAX_FPS, _MAX_FRAMES = 30, 600
+"""Maximum frame rate [1/s], and maximum number of frames of a clip."""
+_TERMINATED_COLOR, _TIME_LIMIT_COLOR = "#B03A2E", "#1E8449"
 
 
-class Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Keeps an image of every instant of an episode, packed: they would fill a gigabyte."""
+class FrameRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Wrapper that stores an image of every instant of an episode.
+
+    The images are compressed: raw ones would fill a gigabyte.
+    """
 
     def __init__(self, env: "gymnasium.Env[Any, Any]", pretty: bool = False) -> None:
-        """Film an environment; pretty are shadows and multisampling, which on a CPU cost ten times the rest."""
+        """Wrap an environment.
+
+        Args:
+            env: the environment, with `render_mode="rgb_array"`.
+            pretty: render shadows and multisampling, which cost ten times the rest on a CPU.
+        """
         if env.render_mode != "rgb_array":
             raise ValueError(f"render_mode = {env.render_mode!r}: must be 'rgb_array' for a film")
         super().__init__(env)
         if not pretty and hasattr(env.unwrapped, "model"):
             quality = env.unwrapped.model.vis.quality
+            # MuJoCo reads these when a renderer is created, so they must be set before the first
+            # image.
             quality.shadowsize = quality.offsamples = 0
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        """Start an episode, and its film."""
+        """Start an episode and its recording."""
         result = self.env.reset(**options)
         self._packed: list[tuple[tuple[int, ...], bytes]] = []
-        self._keep(self.env.render())
+        self._store_frame(self.env.render())
         return result
 
     def step(self, action: Any) -> Any:
         """Advance by one environment step."""
         result = self.env.step(action)
-        self._keep(self.env.render())
+        self._store_frame(self.env.render())
         return result
 
-    def _keep(self, image: Any) -> None:
+    def _store_frame(self, image: Any) -> None:
         self._packed.append((image.shape, zlib.compress(image.tobytes(), 1)))
 
     def image(self, instant: int) -> np.ndarray:
-        """What was seen after so many steps: (height, width, 3), uint8."""
+        """Return the image after a number of steps: (height, width, 3), uint8."""
         shape, packed = self._packed[instant]
         return np.frombuffer(zlib.decompress(packed), np.uint8).reshape(shape)
 
@@ -86,12 +96,12 @@ class Panel:
     """Task name."""
     episode: Episode
     """The episode."""
-    seen: Filmed | None = None
-    """Of an environment of somebody else's: what was seen of it."""
+    recorder: FrameRecorder | None = None
+    """Recorded images of a third-party environment; None for a task."""
     title: str = ""
-    """Drawn above the scene."""
+    """Text above the scene."""
     motor: int = 0
-    """Which of several motors the strip shows."""
+    """Index of the motor whose signals are plotted."""
 
 
 def record(
@@ -103,49 +113,53 @@ def record(
     camera: str = "fixed",
     pretty: bool = False,
 ) -> Panel:
-    """Run an episode, in an `EnvConfig`, to be filmed in images of a size [px].
+    """Run an episode in an `EnvConfig`, to be filmed in images of a size [px].
 
-    In environments of others the camera `fixed` is their own, and what is seen is kept; our tasks
-    are drawn from their states.
+    Third-party environments store their images while they run, and the camera `fixed` selects their
+    default camera. Tasks are rendered later from their states.
     """
-    view, made = env.source.view(env, width, height, None if camera == "fixed" else camera), []
-    if view is None:
+    render_options, recorders = (
+        env.source.view(env, width, height, None if camera == "fixed" else camera),
+        [],
+    )
+    if render_options is None:
         return Panel(env.task, run_episodes(policy, env.make, 1, seed)[0])
 
-    def make() -> Any:
-        made.append(Filmed(env.make(**view), pretty))
-        return made[-1]
+    def make_recorder() -> Any:
+        recorders.append(FrameRecorder(env.make(**render_options), pretty))
+        return recorders[-1]
 
-    (episode,) = run_episodes(policy, make, 1, seed)
-    return Panel(env.task, episode, made[0])
+    (episode,) = run_episodes(policy, make_recorder, 1, seed)
+    return Panel(env.task, episode, recorders[0])
 
 
 @contextlib.contextmanager
 def _scene(
     panel: Panel, size: tuple[int, int], camera: str = "fixed", pretty: bool = False
 ) -> Iterator[tuple[float, Callable[[int], np.ndarray]]]:
-    """Frames a second of an episode, and what draws its scene after so many steps: (height, width, 3), uint8, new.
+    """Yield the frame rate of an episode, and a function that renders its scene after some steps.
 
-    Of a task an OpenGL context is held meanwhile.
+    The function returns a new array: (height, width, 3), uint8. For a task an OpenGL context is
+    open within the block.
     """
-    episode, seen = panel.episode, panel.seen
-    if seen is not None:
+    episode, recorder = panel.episode, panel.recorder
+    if recorder is not None:
         from PIL import Image
 
-        def sized(instant: int) -> np.ndarray:
-            image = Image.fromarray(seen.image(instant))
+        def resized_image(instant: int) -> np.ndarray:
+            image = Image.fromarray(recorder.image(instant))
             return np.array(image if image.size == size else image.resize(size))
 
-        yield seen.metadata.get("render_fps") or 1.0 / float(episode.time[0]), sized
+        yield recorder.metadata.get("render_fps") or 1.0 / float(episode.time[0]), resized_image
         return
     env: Any = ActuatedEnv(panel.task, "ideal")
     with contextlib.closing(OffscreenRenderer(env.model, *size, camera, pretty)) as renderer:
 
-        def drawn(instant: int) -> np.ndarray:
+        def render_state(instant: int) -> np.ndarray:
             env.physics.show(episode.state[instant])
             return renderer.render(env.data)
 
-        yield env.metadata["render_fps"], drawn
+        yield env.metadata["render_fps"], render_state
 
 
 def film(
@@ -157,18 +171,17 @@ def film(
     pretty: bool = False,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write a video of episodes side by side, at the task's frame rate (CartPole: the time of the simulation).
+    """Write a video of episodes side by side, at the task's frame rate, in simulation time.
 
     Args:
-        panels: one or more episodes of the same task, side by side; a shorter one stands still at
-            its end.
-        out: the file to make; its suffix chooses the format (`.mp4`: H.264; `.gif`). Without a
+        panels: one or more episodes of the same task; a shorter one keeps its last frame.
+        out: the file to write; its suffix selects the format (`.mp4`: H.264; `.gif`). Without a
             suffix, a folder of PNG frames.
         width: width of one panel [px], even, >= 160.
         height: height of one panel's scene [px], even, >= 80.
-        camera: a camera of the model.
+        camera: name of a camera of the model.
         pretty: shadows, reflections and multisampling.
-        on_frame: called with (frames written, frames in all).
+        on_frame: called with (number of frames written, total number).
 
     Returns:
         `out`.
@@ -176,29 +189,29 @@ def film(
     Raises:
         FileExistsError: the folder for the frames exists.
         ValueError: no panel, unknown format, odd or too small a size, or unknown camera.
-        RenderingUnavailableError: no OpenGL context can be made here; the message has the remedy.
+        RenderingUnavailableError: no OpenGL context can be created; the message names a remedy.
     """
     check_film(out, width, height)
     if not panels:
-        raise ValueError("panels: there must be at least one episode to show")
+        raise ValueError("panels: must have at least one episode to show")
     end = max(float(panel.episode.time[-1]) for panel in panels)
     with contextlib.ExitStack() as stack:
         scenes = [
-            stack.enter_context(_scene(one, (width, height), camera, pretty)) for one in panels
+            stack.enter_context(_scene(panel, (width, height), camera, pretty)) for panel in panels
         ]
-        drawn = [
-            _drawn(one, image, width, height, end)
-            for one, (_, image) in zip(panels, scenes, strict=True)
+        painters = [
+            _panel_painter(panel, render, width, height, end)
+            for panel, (_, render) in zip(panels, scenes, strict=True)
         ]
         rate, last = scenes[0][0], max(len(panel.episode.reward) for panel in panels)
         stride = max(1, round(rate / _MAX_FPS))
         instants = [*range(0, last, stride), last]
-        blanks = np.hstack([blank for blank, _ in drawn])
+        background_row = np.hstack([background for background, _ in painters])
         add = stack.enter_context(_encoding(out, rate / stride))
         for count, instant in enumerate(instants, 1):
-            frame = blanks.copy()
-            for (_, draw), part in zip(drawn, np.hsplit(frame, len(drawn)), strict=True):
-                draw(instant, part)
+            frame = background_row.copy()
+            for (_, paint), part in zip(painters, np.hsplit(frame, len(painters)), strict=True):
+                paint(instant, part)
             add(frame)
             if on_frame is not None:
                 on_frame(count, len(instants))
@@ -206,7 +219,7 @@ def film(
 
 
 def check_film(out: Path, width: int, height: int) -> None:
-    """Refuse a film's file and size, as `film` does, before there is an episode.
+    """Raise an error for an invalid file or size of a film, before an episode is run.
 
     Raises:
         FileExistsError: the folder for the frames exists.
@@ -222,41 +235,44 @@ def check_film(out: Path, width: int, height: int) -> None:
     for name, size in (("width", width), ("height", height)):
         if size % 2:
             raise ValueError(f"{name} = {size}: must be even, as video encoders need it [px]")
-    for name, size, least in (("width", width, _MIN_WIDTH), ("height", height, _MIN_HEIGHT)):
-        if size < least:
+    for name, size, minimum in (("width", width, _MIN_WIDTH), ("height", height, _MIN_HEIGHT)):
+        if size < minimum:
             raise ValueError(
-                f"{name} = {size}: must be >= {least} [px], for the title and the strip"
+                f"{name} = {size}: must be >= {minimum} [px], for the title and the strip"
             )
 
 
 class Clip(NamedTuple):
-    """A film whose frame k shows the time k/rate of its episode, until the next."""
+    """A film whose frame k shows the time k/rate of its episode, until the next frame."""
 
     video: bytes
-    """H.264 in an MP4 file."""
+    """H.264 video in an MP4 file."""
     rate: float
-    """Frames a second of the episode."""
+    """Frames per second of the episode."""
     still: bytes
-    """An image of it, a JPEG file."""
+    """One frame as a JPEG file."""
 
 
 def clip(panel: Panel, width: int, height: int) -> Clip:
-    """The scene of an episode in memory, even sizes [px].
+    """Return the scene of an episode as a film in memory, of even sizes [px].
 
-    A `RenderingUnavailableError` has the remedy where no OpenGL context can be made.
+    Raises:
+        RenderingUnavailableError: no OpenGL context can be created; the message names a remedy.
     """
     from PIL import Image
 
     steps, duration = len(panel.episode.time), float(panel.episode.time[0])
-    stride = max(1, round(1.0 / (duration * _MAX_FPS)), -(-steps // _MOST_FRAMES))
+    stride = max(1, round(1.0 / (duration * _MAX_FPS)), -(-steps // _MAX_FRAMES))
     instants = [*range(0, steps, stride), steps]
     rate, still = 1.0 / (stride * duration), io.BytesIO()
     with _scene(panel, (width, height)) as (_, draw), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
-        with _encoding(path, rate, _SOUGHT) as add:
-            for place, instant in enumerate(instants):
+        with _encoding(path, rate, _PAGE_ENCODING) as add:
+            for index, instant in enumerate(instants):
                 image = draw(instant)
-                if place == len(instants) // 3:
+                # The still picture is taken a third into the episode, where more is going on than
+                # at its start.
+                if index == len(instants) // 3:
                     Image.fromarray(image).save(still, "jpeg", quality=85)
                 add(image)
         return Clip(path.read_bytes(), rate, still.getvalue())
@@ -264,9 +280,12 @@ def clip(panel: Panel, width: int, height: int) -> Clip:
 
 @contextlib.contextmanager
 def _encoding(
-    out: Path, fps: float, h264: Sequence[str] = _FINE
+    out: Path, fps: float, h264: Sequence[str] = _FILE_ENCODING
 ) -> Iterator[Callable[[np.ndarray], None]]:
-    """A function that appends a frame, encoded while the next one is drawn, to a film that appears when all is well."""
+    """Yield a function that appends a frame to a film, encoded while the next frame is rendered.
+
+    The file appears under its name only if the block ends without an error.
+    """
     import imageio
 
     options: dict[str, Any] = {"duration": 1000 / fps, "loop": 0}  # ms
@@ -274,6 +293,7 @@ def _encoding(
         options = {
             "fps": fps,
             "codec": "libx264",
+            # imageio would choose its own quality and round sizes up to multiples of 16 px.
             "quality": None,
             "macro_block_size": 2,
             "ffmpeg_log_level": "error",
@@ -289,56 +309,67 @@ def _encoding(
         else:
             temporary = stack.enter_context(writing(out))
             write = stack.enter_context(imageio.get_writer(temporary, **options)).append_data
-        beside = stack.enter_context(ThreadPoolExecutor(1))
-        last: list[Future[None]] = []
+        executor = stack.enter_context(ThreadPoolExecutor(1))
+        pending_writes: list[Future[None]] = []
 
         def add(frame: np.ndarray) -> None:
-            if last:
-                last.pop().result()
-            last.append(beside.submit(write, frame))
+            # Wait for the previous frame: at most one is queued, and an error of the encoder is
+            # raised here.
+            if pending_writes:
+                pending_writes.pop().result()
+            pending_writes.append(executor.submit(write, frame))
 
         yield add
-        for one in last:
-            one.result()
+        for pending in pending_writes:
+            pending.result()
 
 
-def _drawn(
-    panel: Panel, image: Callable[[int], np.ndarray], width: int, height: int, end: float
+def _panel_painter(
+    panel: Panel, render: Callable[[int], np.ndarray], width: int, height: int, end: float
 ) -> tuple[np.ndarray, Callable[[int, np.ndarray], None]]:
-    """A panel without its scene, and what draws it after so many steps over a copy of that: (height, width, 3), uint8.
+    """Return the background of a panel, and a function that paints an instant over a copy of it.
 
-    Title and strip are drawn once, a window slides over the strip. `image` draws the scene, and
-    `end` [s] is where the longest episode ends.
+    Both arrays are (height, width, 3), uint8. Title and plots are drawn only once; a window slides
+    over the plots.
+
+    Args:
+        panel: the episode.
+        render: function that renders the scene.
+        width: width of the panel [px].
+        height: height of the scene [px].
+        end: end of the longest episode [s].
     """
     episode, top, bottom = panel.episode, _TITLE_HEIGHT, _TITLE_HEIGHT + height
     window = min(end, _WINDOW_STEPS * float(episode.time[0]))
     scale, axis, strip = draw_strip(panel.task, episode, panel.motor, width, window, end)
-    last, fell, over = len(episode.reward), episode.terminated, episode.time[-1]
-    words = f"ended at {over:.2f} s" if fell else f"time limit, {over:.2f} s"
-    ending = draw_text(words, width, _TITLE_HEIGHT, _FELL if fell else _LASTED)
+    last, terminated, end_time = len(episode.reward), episode.terminated, episode.time[-1]
+    ending_text = f"ended at {end_time:.2f} s" if terminated else f"time limit, {end_time:.2f} s"
+    ending = draw_text(
+        ending_text, width, _TITLE_HEIGHT, _TERMINATED_COLOR if terminated else _TIME_LIMIT_COLOR
+    )
 
-    def draw(instant: int, frame: np.ndarray) -> None:
+    def paint(instant: int, frame: np.ndarray) -> None:
         now = min(instant, last)
         view = frame[top:bottom]
-        view[:] = image(now)
+        view[:] = render(now)
         if now == last:
             view[-_TITLE_HEIGHT:] = ending
-            if fell:
-                view[:-_TITLE_HEIGHT] = view[:-_TITLE_HEIGHT] // 2 + 90  # faded
+            if terminated:
+                # Fade the scene, to show that the episode has terminated.
+                view[:-_TITLE_HEIGHT] = view[:-_TITLE_HEIGHT] // 2 + 90
         time = float(episode.time[now - 1]) if now else 0.0
         begin, size = round(scale * max(0.0, time - window)), round(scale * window)
         cursor = min(round(scale * time) - begin, size - 1)
-        shown = strip[:, begin : begin + size + MARGIN]
-        below = frame[bottom + HEADER_HEIGHT :, AXIS_WIDTH : AXIS_WIDTH + shown.shape[1]]
-        below[PLOT_HEIGHT:] = shown[PLOT_HEIGHT:]
-        below[:PLOT_HEIGHT, :cursor] = shown[
-            :PLOT_HEIGHT, :cursor
-        ]  # and nothing of what has not happened yet
-        below[:PLOT_HEIGHT, cursor] = 120
+        visible = strip[:, begin : begin + size + MARGIN]
+        plot_area = frame[bottom + HEADER_HEIGHT :, AXIS_WIDTH : AXIS_WIDTH + visible.shape[1]]
+        plot_area[PLOT_HEIGHT:] = visible[PLOT_HEIGHT:]
+        # Only the past is drawn, up to the cursor.
+        plot_area[:PLOT_HEIGHT, :cursor] = visible[:PLOT_HEIGHT, :cursor]
+        plot_area[:PLOT_HEIGHT, cursor] = 120
 
     return (
         np.vstack(
             [draw_text(panel.title, width, top), np.zeros((height, width, 3), np.uint8), axis]
         ),
-        draw,
+        paint,
     )

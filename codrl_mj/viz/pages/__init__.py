@@ -1,1 +1,1 @@
-"""Pages: a run's report, the certificate, a motor, what identification found; each one HTML file, alone."""
+"""Pages as self-contained HTML files: reports, certificates, motors, identifications."""

@@ -1,4 +1,4 @@
-"""The certificate as files: JSON, and a page with plots."""
+"""Files of a validation certificate: JSON, and a page with plots."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -17,33 +17,31 @@ _CHECKS = ("check", "oracle", "samples", "worst", "allowed", "margin", "unit", "
 
 
 def html(certificate: Certificate, caught: Sequence[MutationResult] = ()) -> str:
-    """The page of what was found, and of what mutations did, if they were tried."""
-    top = [page.judged(certificate.passed, certificate.verdict, "p", "verdict")]
+    """Return the page of a certificate, with the results of injected faults if there are any."""
+    top = [page.mark_verdict(certificate.passed, certificate.verdict, "p", "verdict")]
     if certificate.quick:
-        top.append(
-            page.note("The quick form: fewer states, runs and step sizes than in the full one.")
-        )
+        top.append(page.note("Quick form: fewer states, runs and step sizes than the full form."))
     top.append(
         page.paragraph(
-            "Each check has an oracle, a tolerance, and the worst case that was found. The margin"
-            " is tolerance over worst case: a check passes while it is at least 1."
+            "Each check has an oracle, a tolerance, and a worst case. The margin is the tolerance"
+            " divided by the worst case: a check passes if it is at least 1."
         )
     )
     software = page.definitions(versions().items())
-    top.append(page.folded(f"Made in {certificate.seconds:.0f} s, with this software", software))
+    top.append(page.details(f"Made in {certificate.seconds:.0f} s, with this software", software))
     sections = [_group(name, title, certificate) for name, title in GROUPS.items()]
     skipped = [(skip.name, skip.group, skip.reason) for skip in certificate.skipped]
-    left = (
-        page.table("What was not checked", ("what", "group", "why"), skipped, cards=True)
+    skipped_table = (
+        page.table("Skipped checks", ("check", "group", "reason"), skipped, cards=True)
         if skipped
         else Markup()
     )
     sections += [_mutations(certificate, caught)] if caught else []
-    sections.append(page.Section("skipped", "Not checked", left))
+    sections.append(page.Section("skipped", "Not checked", skipped_table))
     return page.page(
-        f"Is the port right? {certificate.subject}",
+        f"Is the port correct? {certificate.subject}",
         "Certificate of validation",
-        page.joined(top),
+        page.join(top),
         sections,
     )
 
@@ -52,10 +50,10 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
     checks = [check for check in certificate.checks if check.group == name]
     body = [page.paragraph(f"{title}.")] if checks else []
     for task in dict.fromkeys(check.task for check in checks):
-        own = [check for check in checks if check.task == task]
+        task_checks = [check for check in checks if check.task == task]
         body.append(page.heading(task) if task else Markup())
         caption = f"Checks of {name}{f', {task}' if task else ''}"
-        failed = (place for place, check in enumerate(own) if not check.passed)
+        failed = (index for index, check in enumerate(task_checks) if not check.passed)
         rows = [
             (
                 *(
@@ -70,78 +68,85 @@ def _group(name: str, title: str, certificate: Certificate) -> page.Section:
                     check.unit,
                     f"{check.where}. {check.fault}" if check.fault else check.where,
                 ),
-                page.judged(check.passed, "passed" if check.passed else "FAILED"),
+                page.mark_verdict(check.passed, "passed" if check.passed else "FAILED"),
             )
-            for check in own
+            for check in task_checks
         ]
         body.append(page.table(caption, _CHECKS, rows, range(2, 6), True, failed))
-        body.append(page.plots(plot for check in own for plot in check.plots))
-    good = sum(check.passed for check in checks)
+        body.append(page.plots(plot for check in task_checks for plot in check.plots))
+    num_passed = sum(check.passed for check in checks)
     mark = Markup("({})").format(
-        page.judged(good == len(checks), f"{good} of {len(checks)}", "span")
+        page.mark_verdict(num_passed == len(checks), f"{num_passed} of {len(checks)}", "span")
     )
-    return page.Section(name, name.capitalize(), page.joined(body), mark)
+    return page.Section(name, name.capitalize(), page.join(body), mark)
 
 
 def _mutations(certificate: Certificate, caught: Sequence[MutationResult]) -> page.Section:
     rows = []
-    for one in caught:
+    for outcome in caught:
         clearest, cells = (
-            one.clearest_failure,
-            [one.mutation, one.task or "the motor", f"{len(one.failed)} of {one.num_checks}"],
+            outcome.clearest_failure,
+            [
+                outcome.mutation,
+                outcome.task or "the motor",
+                f"{len(outcome.failed)} of {outcome.num_checks}",
+            ],
         )
-        found = ["none", "", "", ""]
+        clearest_cells = ["none", "", "", ""]
         if clearest is not None:
             values = (clearest.worst, clearest.tolerance, clearest.tolerance_ratio)
-            found = [f"{clearest.group}: {clearest.name}", *(f"{value:.2g}" for value in values)]
-        said = page.judged(clearest is not None, "MISSED" if clearest is None else "caught")
-        rows.append((*cells, *found, said))
+            clearest_cells = [
+                f"{clearest.group}: {clearest.name}",
+                *(f"{value:.2g}" for value in values),
+            ]
+        mark = page.mark_verdict(clearest is not None, "MISSED" if clearest is None else "caught")
+        rows.append((*cells, *clearest_cells, mark))
     columns = "fault", "in", "failed", "clearest check", "worst", "allowed", "beyond", "verdict"
-    blind = undetected_checks(certificate.checks, caught)
-    told = "; ".join(f"{check.group}, {check.task}: {check.name}" for check in blind)
+    never_failed = undetected_checks(certificate.checks, caught)
+    names = "; ".join(f"{check.group}, {check.task}: {check.name}" for check in never_failed)
     body = (
         page.paragraph(
-            "The certificate put to the test: each fault was made on purpose, and the quick checks"
-            " were run with it. “Beyond” is how many times its tolerance the clearest of the failed"
-            " checks was."
+            "A test of the certificate: each fault was injected, and the quick checks were run with"
+            " it. “Beyond” is the worst case of the clearest failed check, divided by its"
+            " tolerance."
         ),
         page.table(
-            "Faults made on purpose",
+            "Injected faults",
             columns,
             rows,
             numbers=(2, 4, 5, 6),
             cards=True,
-            failed=(place for place, one in enumerate(caught) if not one.failed),
+            failed=(index for index, outcome in enumerate(caught) if not outcome.failed),
         ),
         (
-            page.note(f"✗ No fault fails these checks: {told}", bad=True)
-            if blind
+            page.note(f"✗ These checks fail for no fault: {names}", bad=True)
+            if never_failed
             else page.paragraph(
-                "Every check of the certificate is failed by at least one of the faults."
+                "Every check of the certificate fails for at least one of the faults."
             )
         ),
     )
-    return page.Section("mutations", "Mutations", page.joined(body))
+    return page.Section("mutations", "Mutations", page.join(body))
 
 
 def summary(content: Mapping[str, Any]) -> Markup:
-    """What a `certificate.json` says, in short."""
+    """Return a summary of a `certificate.json` as markup."""
     checks = content["checks"]
     rows = []
     for name in dict.fromkeys(check["group"] for check in checks):
-        own = [check for check in checks if check["group"] == name]
-        good = sum(check["passed"] for check in own)
-        rows.append((name, GROUPS.get(name, ""), f"{good} of {len(own)}"))
+        group_checks = [check for check in checks if check["group"] == name]
+        num_passed = sum(check["passed"] for check in group_checks)
+        rows.append((name, GROUPS.get(name, ""), f"{num_passed} of {len(group_checks)}"))
     passed = content["verdict"] == "passed"
-    whole = verdict([check["passed"] for check in checks])
-    return page.joined(
+    verdict_text = verdict([check["passed"] for check in checks])
+    return page.join(
         (
-            page.judged(passed, whole, "p", "verdict"),
+            page.mark_verdict(passed, verdict_text, "p", "verdict"),
             page.paragraph(
                 f"Of {content['subject']}, made"
                 f" {content['made']}{', the quick form' * content['quick']}."
             ),
-            page.table("Checks passed", ("group", "what", "passed"), rows, numbers=(2,)),
+            page.table("Checks passed", ("group", "content", "passed"), rows, numbers=(2,)),
         )
     )
 
@@ -149,16 +154,20 @@ def summary(content: Mapping[str, Any]) -> Markup:
 def write(
     certificate: Certificate, folder: Path, caught: Sequence[MutationResult] = ()
 ) -> tuple[Path, Path]:
-    """Write `certificate.json` and `certificate.html` into a folder, whole or not at all; older ones are replaced."""
+    """Write `certificate.json` and `certificate.html` into a folder, replacing older ones.
+
+    Each file is replaced only when it is complete.
+    """
     text = (
         json.dumps(
             certificate.as_mapping() | as_mapping(certificate, caught), indent=2, allow_nan=False
         )
         + "\n"
     )
-    found = html(certificate, caught)
+    # Build both texts before the files are opened, so that an error leaves the older pair in place.
+    html_text = html(certificate, caught)
     check_writable(folder)
     with writing(folder / JSON_NAME) as json_file, writing(folder / HTML_NAME) as html_file:
         json_file.write_text(text, encoding="utf-8")
-        html_file.write_text(found, encoding="utf-8")
+        html_file.write_text(html_text, encoding="utf-8")
     return folder / JSON_NAME, folder / HTML_NAME

@@ -1,4 +1,4 @@
-"""Diagrams of actuators, each drawn once for pages and pictures: torque over speed, Bode's of a current loop, steps."""
+"""Diagrams of actuators for pages and pictures: torque-speed curves, Bode plots, step responses."""
 
 import dataclasses
 import math
@@ -33,56 +33,75 @@ from codrl_mj.viz.pages.plots import Curve, Plot
 
 TORQUE_SPEED = "speed of the output [rad/s]", "torque of the output [N·m]"
 """Axes of a torque-speed diagram."""
-_SHOWN, _CLOSE = (0.0, 60.0), (19.5, 24.0)
-"""Of a step out of saturation, what is shown, and what of it closely [ms]."""
+_RECOVERY_SPAN, _CLOSE_UP_SPAN = (0.0, 60.0), (19.5, 24.0)
+"""Time spans of a step out of saturation [ms]: the whole step, and a close-up."""
 
 Loops = Mapping[str, tuple[Looped, float | None]]
-"""Current loops by their names, with the mechanical step [s] of those that are no drives."""
+"""Name of a current loop -> the loop, and the mechanical step [s] if it is not a drive's."""
 
 
 def torque_speed_diagram(drive: Drive, numbers: Any = None, points: Any = None) -> Plot:
-    """What a drive can do at the output of its gear, in all four quadrants, past friction: see `torque_limits`.
+    """Return the torque that a drive can deliver at its output in all quadrants, minus friction.
+
+    See `torque_limits`.
 
     Args:
-        drive: whose voltage, `max_current`, gear and friction are drawn.
-        numbers: `codrl_mj.catalogue.MotorNumbers`, for the continuous current; None where it is not
-            known.
-        points: shape (n, 2), operating points to lay over it: speed [rad/s] and torque [N*m] of the
+        drive: drive whose voltage, `max_current`, gear and friction are drawn.
+        numbers: `codrl_mj.catalogue.MotorNumbers`, for the continuous current; None if
+            it is unknown.
+        points: operating points to draw too, shape (n, 2): speed [rad/s] and torque [N*m] of the
             output.
 
     Raises:
-        ValueError: the drive has no no-load speed to end the diagram at, or `points` have another
-            shape.
+        ValueError: the drive has no finite no-load speed, or `points` have another shape.
     """
-    can, lines = abilities(drive), diagram_limits(drive, numbers)
+    drive_abilities, lines = abilities(drive), diagram_limits(drive, numbers)
     points = np.empty((0, 2)) if points is None else np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(
             f"points: shape {points.shape}, must be (n, 2): speed [rad/s] and torque [N*m]"
         )
-    width = 1.15 * max(can.no_load_speed, *np.abs(points[:, 0]), 0.0)
-    height = 1.25 * max(min(can.stall_torque, 3.0 * can.peak_torque), *np.abs(points[:, 1]), 0.0)
-    half = np.linspace(0.0, width, 400)[1:]
+    width = 1.15 * max(drive_abilities.no_load_speed, *np.abs(points[:, 0]), 0.0)
+    height = 1.25 * max(
+        min(drive_abilities.stall_torque, 3.0 * drive_abilities.peak_torque),
+        *np.abs(points[:, 1]),
+        0.0,
+    )
+    positive_speeds = np.linspace(0.0, width, 400)[1:]
+    # Friction changes its sign at standstill: a point on either side draws the jump.
     speeds = np.concatenate(
-        [-half[::-1], [-1e-9 * width, 1e-9 * width], half]
-    )  # friction changes sign at standstill
+        [-positive_speeds[::-1], [-1e-9 * width, 1e-9 * width], positive_speeds]
+    )
     curves: list[Curve] = []
-    peak = max(place for _, _, place in lines if place < 2)
-    for label, current, place in lines:
-        names, ends = (
+    peak = max(color_index for _, _, color_index in lines if color_index < 2)
+    for label, current, color_index in lines:
+        names, torques = (
             (f"{label}, lowest", f"{label}, highest"),
             torque_limits(drive, speeds, current),
         )
-        curves += envelope(names, speeds, ends, place == peak, colour=place, dashed=place == 2)
-    off = " (off the picture)" if can.stall_torque > height else ""
-    stall = f"stall, {can.stall_torque:,.4g} N·m, {can.stall_current:,.4g} A{off}"
-    free = f"no load, {can.no_load_speed:.4g} rad/s"
+        curves += envelope(
+            names, speeds, torques, color_index == peak, colour=color_index, dashed=color_index == 2
+        )
+    remark = " (outside the plot)" if drive_abilities.stall_torque > height else ""
+    stall = (
+        f"stall, {drive_abilities.stall_torque:,.4g} N·m,"
+        f" {drive_abilities.stall_current:,.4g} A{remark}"
+    )
+    no_load = f"no load, {drive_abilities.no_load_speed:.4g} rad/s"
     curves += [
         Curve(
-            stall, np.zeros(2), can.stall_torque * np.array([1.0, -1.0]), style="trail", colour=4
+            stall,
+            np.zeros(2),
+            drive_abilities.stall_torque * np.array([1.0, -1.0]),
+            style="trail",
+            colour=4,
         ),
         Curve(
-            free, can.no_load_speed * np.array([1.0, -1.0]), np.zeros(2), style="trail", colour=3
+            no_load,
+            drive_abilities.no_load_speed * np.array([1.0, -1.0]),
+            np.zeros(2),
+            style="trail",
+            colour=3,
         ),
     ]
     if len(points):
@@ -91,99 +110,123 @@ def torque_speed_diagram(drive: Drive, numbers: Any = None, points: Any = None) 
         )
     ratio = drive.motor.gear_ratio
     gear = f"behind a gear of {ratio:g}:1" if ratio != 1.0 else "without a gear"
-    title = f"Torque and speed {gear}, friction taken off"
+    title = f"Torque and speed {gear}, friction subtracted"
     corners = "braking", "driving", "driving", "braking"
-    return Plot(title, *TORQUE_SPEED, tuple(curves), y_most=height, corners=corners)
+    return Plot(title, *TORQUE_SPEED, tuple(curves), y_limit=height, corners=corners)
 
 
 def envelope(
     labels: tuple[str, str],
     speeds: np.ndarray,
-    ends: tuple[np.ndarray, np.ndarray],
+    torques: tuple[np.ndarray, np.ndarray],
     filled: bool = True,
     **style: Any,
 ) -> list[Curve]:
-    """The lowest and the highest torque [N*m] over speeds [rad/s], and what lies between."""
+    """Return the curves of the lowest and highest torque [N*m] over speeds [rad/s]."""
     lowest, highest = labels
     return [
-        Curve(lowest, speeds, ends[0], **style),
-        Curve(highest, speeds, ends[1], filled=filled, **style),
+        Curve(lowest, speeds, torques[0], **style),
+        Curve(highest, speeds, torques[1], filled=filled, **style),
     ]
 
 
 def episode_diagram(lines: Sequence[Any]) -> Plot | None:
-    """The points of episodes in the plane of speed and torque, within what the motors (`episode._MotorLine`) can do."""
+    """Return the torque-speed points of episodes within the limits of their motors.
+
+    The lines are `episode._MotorSeries`.
+    """
     curves: list[Curve] = []
     highest = 0.0
-    own = [line for line in lines if not isinstance(line.actuator, Ideal)]
-    if not own:
+    motor_lines = [line for line in lines if not isinstance(line.actuator, Ideal)]
+    if not motor_lines:
         return None
-    for line in own:
+    for line in motor_lines:
         ratio = line.actuator.motor.gear_ratio if isinstance(line.actuator, Drive) else 1.0
         speed, torque = line.turning / ratio, line.actual * ratio
-        free = no_load_speed(line.actuator)
+        no_load = no_load_speed(line.actuator)
         width = max(
-            1.15 * free if np.isfinite(free) else 0.0, 1.1 * float(np.abs(speed).max()), 1e-6
+            1.15 * no_load if np.isfinite(no_load) else 0.0, 1.1 * float(np.abs(speed).max()), 1e-6
         )
-        most = max(float(np.abs(torque).max()), float(np.abs(line.desired).max()) * ratio, 1e-9)
+        max_torque = max(
+            float(np.abs(torque).max()), float(np.abs(line.desired).max()) * ratio, 1e-9
+        )
         grid = np.linspace(-width, width, 401)
-        ends = limits(line.actuator, grid)
+        torques = torque_range(line.actuator, grid)
         highest = max(
-            highest, min(3.0 * most, 1.1 * float(np.abs(ends[1]).max()) if ends else most)
+            highest,
+            min(3.0 * max_torque, 1.1 * float(np.abs(torques[1]).max()) if torques else max_torque),
         )
-        belongs: Any = {"shared": line.place, "tags": line.tags}
-        if ends is not None:
-            labels = f"{line.before}lowest possible", f"{line.before}highest possible"
-            curves += envelope(labels, grid, ends, colour=0, dashed=True, **belongs)
-        kept = slice(None, None, max(line.stride, len(speed) // 3000, 1))
-        times = line.timestep * np.arange(len(speed))[kept]
-        label = f"{line.before}episode"
+        owner: Any = {"shared": line.color_index, "tags": line.tags}
+        if torques is not None:
+            labels = f"{line.label_prefix}lowest possible", f"{line.label_prefix}highest possible"
+            curves += envelope(labels, grid, torques, colour=0, dashed=True, **owner)
+        selection = slice(None, None, max(line.stride, len(speed) // 3000, 1))
+        times = line.timestep * np.arange(len(speed))[selection]
+        label = f"{line.label_prefix}episode"
         curves.append(
-            Curve(label, speed[kept], torque[kept], style="trail", colour=1, times=times, **belongs)
+            Curve(
+                label,
+                speed[selection],
+                torque[selection],
+                style="trail",
+                colour=1,
+                times=times,
+                **owner,
+            )
         )
-    title = "Torque and speed, within what the motor can do"
-    return Plot(title, *TORQUE_SPEED, tuple(curves), y_most=highest)
+    title = "Torque and speed, within the limits of the motor"
+    return Plot(title, *TORQUE_SPEED, tuple(curves), y_limit=highest)
 
 
-def limits(actuator: Any, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Lowest and highest torque [N*m] that an actuator delivers at speeds [rad/s]; None where it has no such limits.
+def torque_range(actuator: Any, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the lowest and highest torque [N*m] of an actuator at speeds [rad/s], or None.
 
-    The joint's friction, which the model has, is not taken off.
+    None means that there are no such limits. The friction of the joint is part of the model and is
+    not subtracted.
     """
     if isinstance(actuator, Drive):
-        free = {
+        no_friction = {
             f"motor.{name}": 0.0
             for name in ("coulomb_friction", "viscous_friction", "stribeck_friction")
         }
-        return torque_limits(actuator.replaced(free), speeds, actuator.controller.max_current)
+        return torque_limits(
+            actuator.replaced(no_friction), speeds, actuator.controller.max_current
+        )
     if isinstance(actuator, TorqueSpeed):
-        ends = (
+        lines = (
             actuator.stall_torque * (side - speeds / actuator.no_load_speed) for side in (-1.0, 1.0)
         )
-        most = actuator.max_torque if math.isfinite(actuator.max_torque) else actuator.stall_torque
-        low, high = (np.clip(end, -most, most) for end in ends)
+        max_value = (
+            actuator.max_torque if math.isfinite(actuator.max_torque) else actuator.stall_torque
+        )
+        low, high = (np.clip(end, -max_value, max_value) for end in lines)
         return low, high
     if isinstance(actuator, DCMotorActuator) and actuator.voltage_limit is not None:
-        motor, supply, most = (
+        motor, supply, max_value = (
             actuator.motor,
             actuator.supply or Supply(),
             actuator.controller.max_voltage,
         )
+        # The controller's limit applies to the motor's voltage. The supply's limit includes the
+        # voltage drop over its resistance.
         limited = (
-            (most, 0.0),
-            (supply.voltage if math.isfinite(supply.voltage) else most, supply.resistance),
+            (max_value, 0.0),
+            (supply.voltage if math.isfinite(supply.voltage) else max_value, supply.resistance),
         )
         sides = []
         for side in (-1.0, 1.0):
             back_emf = side * motor.back_emf_constant * speeds
-            currents = [highest_current(motor.resistance, *one, back_emf) for one in limited]
+            currents = [
+                highest_current(motor.resistance, *supply_limit, back_emf)
+                for supply_limit in limited
+            ]
             sides.append(side * motor.torque_constant * np.minimum(*currents))
         return sides[0], sides[1]
     return None
 
 
 def no_load_speed(actuator: Any) -> float:
-    """Where the voltage makes no more torque [rad/s], before friction; infinite where nothing is known of it."""
+    """Return the speed without torque, before friction [rad/s]; infinite if it is unknown."""
     if isinstance(actuator, TorqueSpeed):
         return float(actuator.no_load_speed)
     if isinstance(actuator, Drive | DCMotorActuator) and actuator.voltage_limit is not None:
@@ -193,48 +236,51 @@ def no_load_speed(actuator: Any) -> float:
 
 
 def bode_diagram(drive: Drive) -> list[Plot]:
-    """Gain and phase of a drive's current loop, open and closed, with its margins and its bandwidth.
+    """Return gain and phase of a drive's current loop, open and closed, with margins and bandwidth.
 
     Raises:
         ValueError: the loop is unstable.
     """
-    one = design(drive)
-    gain, phase = bode({"": (drive, None)}, {"": one})
-    late = "a sample of delay" if one.delayed else "no delay"
-    gains = f"kp = {one.kp:.4g} V/A, ki = {one.ki:,.5g} V/(A·s)"
+    loop_design = design(drive)
+    gain, phase = bode_plots({"": (drive, None)}, {"": loop_design})
+    delay_text = "a sample of delay" if loop_design.delayed else "no delay"
+    gains = f"kp = {loop_design.kp:.4g} V/A, ki = {loop_design.ki:,.5g} V/(A·s)"
     return [
         dataclasses.replace(
-            gain, title=f"Current loop at {one.sample_rate / 1e3:g} kHz, {late}: {gains}"
+            gain,
+            title=f"Current loop at {loop_design.sample_rate / 1e3:g} kHz, {delay_text}: {gains}",
         ),
         phase,
     ]
 
 
-def bode(loops: Loops, designed: Mapping[str, LoopDesign]) -> list[Plot]:
-    """Gain and phase of loops, open and closed; of one alone its margins and its bandwidth."""
+def bode_plots(loops: Loops, designed: Mapping[str, LoopDesign]) -> list[Plot]:
+    """Return gain and phase of loops, open and closed; for a single loop with its margins."""
     gains, phases = [], []
-    for place, (name, loop) in enumerate(loops.items()):
-        one = designed[name]
-        lowest = np.nanmin([1e-3 * one.sample_rate, 0.02 * one.crossover])
-        frequencies = np.geomspace(lowest, 0.49999 * one.sample_rate, 500)
-        before = f"{name}: " if len(loops) > 1 else ""
+    for index, (name, loop) in enumerate(loops.items()):
+        loop_design = designed[name]
+        lowest = np.nanmin([1e-3 * loop_design.sample_rate, 0.02 * loop_design.crossover])
+        # The phase of a sampled loop jumps at half the sample rate, so the curves end just below
+        # it.
+        frequencies = np.geomspace(lowest, 0.49999 * loop_design.sample_rate, 500)
+        prefix = f"{name}: " if len(loops) > 1 else ""
         for label, function, dashed in (
             ("open loop", open_loop, True),
             ("closed loop", closed_loop, False),
         ):
-            values = function(*loop)(np.exp(2j * math.pi * frequencies / one.sample_rate))
-            more: dict[str, Any] = {
-                "colour": place if len(loops) > 1 else int(not dashed),
+            values = function(*loop)(np.exp(2j * math.pi * frequencies / loop_design.sample_rate))
+            style: dict[str, Any] = {
+                "colour": index if len(loops) > 1 else int(not dashed),
                 "dashed": dashed,
             }
             decibels, degrees = (
                 20.0 * np.log10(np.abs(values)),
                 np.degrees(np.unwrap(np.angle(values))),
             )
-            gains.append(Curve(before + label, frequencies, decibels, **more))
-            phases.append(Curve(before + label, frequencies, degrees, **more))
+            gains.append(Curve(prefix + label, frequencies, decibels, **style))
+            phases.append(Curve(prefix + label, frequencies, degrees, **style))
     if len(loops) == 1:
-        gain, phase = _margins(one, frequencies[[0, -1]])
+        gain, phase = _margins(loop_design, frequencies[[0, -1]])
         gains, phases = gains + gain, phases + phase
     axis = "frequency [Hz]"
     return [
@@ -243,112 +289,143 @@ def bode(loops: Loops, designed: Mapping[str, LoopDesign]) -> list[Plot]:
     ]
 
 
-def _margins(one: LoopDesign, ends: np.ndarray) -> tuple[list[Curve], list[Curve]]:
-    """What a loop's gain and phase are judged by, between the ends of the axis [Hz]."""
-    margin = 20.0 * math.log10(one.gain_margin)
+def _margins(loop_design: LoopDesign, ends: np.ndarray) -> tuple[list[Curve], list[Curve]]:
+    """Return curves that mark margins and bandwidth in the plots of gain and phase.
+
+    Args:
+        loop_design: the loop.
+        ends: ends of the frequency axis [Hz].
+    """
+    margin = 20.0 * math.log10(loop_design.gain_margin)
     gains = [
         Curve("0 dB", ends, np.zeros(2), reference=True),
-        _upright(f"gain margin {margin:.1f} dB", one.phase_crossover, -margin, 0.0),
+        _vertical_line(f"gain margin {margin:.1f} dB", loop_design.phase_crossover, -margin, 0.0),
     ]
     phases = [Curve("\N{MINUS SIGN}180°", ends, np.full(2, -180.0), reference=True)]
-    if math.isfinite(one.bandwidth):
-        label = f"bandwidth {one.bandwidth:.4g} Hz at \N{MINUS SIGN}3 dB"
+    if math.isfinite(loop_design.bandwidth):
+        label = f"bandwidth {loop_design.bandwidth:.4g} Hz at \N{MINUS SIGN}3 dB"
         gains.append(
-            Curve(label, np.array([one.bandwidth]), np.array([-3.0103]), style="dots", colour=1)
+            Curve(
+                label,
+                np.array([loop_design.bandwidth]),
+                np.array([-3.0103]),
+                style="dots",
+                colour=1,
+            )
         )
-    if math.isfinite(one.phase_margin):
-        label = f"phase margin {one.phase_margin:.1f}° at {one.crossover:.4g} Hz"
-        phases.append(_upright(label, one.crossover, -180.0, one.phase_margin - 180.0))
+    if math.isfinite(loop_design.phase_margin):
+        label = f"phase margin {loop_design.phase_margin:.1f}° at {loop_design.crossover:.4g} Hz"
+        phases.append(
+            _vertical_line(label, loop_design.crossover, -180.0, loop_design.phase_margin - 180.0)
+        )
     return gains, phases
 
 
-def _upright(label: str, x: float, low: float, high: float) -> Curve:
+def _vertical_line(label: str, x: float, low: float, high: float) -> Curve:
+    # uPlot needs increasing x: the upper end is minimally shifted.
     return Curve(label, np.array([x, x * (1.0 + 1e-6)]), np.array([low, high]), colour=3)
 
 
-def small_steps(loops: Loops) -> list[Plot]:
-    """Small steps of the current, the shaft held, as shares of what is asked for; of one alone with its voltage."""
+def small_step_plots(loops: Loops) -> list[Plot]:
+    """Return small steps of the current with the shaft held, as shares of the reference.
+
+    For a single loop the voltage is plotted too.
+    """
     curves = []
-    for place, (name, loop) in enumerate(loops.items()):
+    for index, (name, loop) in enumerate(loops.items()):
         step = small_step(*loop)
-        settled, asked = step.settling_time(), float(step.reference[-1])
-        shown = max(int(3.0 * np.searchsorted(step.time, settled)), 20)
-        step = Response(*(column[:shown] for column in step))
-        time, share = 1e3 * step.time, step.current / asked
+        settled, reference = step.settling_time(), float(step.reference[-1])
+        num_samples = max(int(3.0 * np.searchsorted(step.time, settled)), 20)
+        step = Response(*(column[:num_samples] for column in step))
+        time, share = 1e3 * step.time, step.current / reference
         if len(loops) > 1:
-            curves.append(Curve(f"{name}: current", time, share, colour=place))
-    title, scaled, voltage = "A small step of the current, the shaft held", None, []
+            curves.append(Curve(f"{name}: current", time, share, colour=index))
+    title, second_axis, voltage = "A small step of the current, the shaft held", None, []
     if len(loops) == 1:
         within = (
             f"within 2 % in {1e3 * settled:.3g} ms" if math.isfinite(settled) else "not settled"
         )
-        torque = f"{loop[0].motor.torque_constant * asked:.3g} N·m at the rotor"
-        curves = [Curve(f"current, of {asked:.3g} A, {torque}: {within}", time, share, colour=1)]
-        scaled, voltage = ("current [A]", asked), [_voltages(loop[0], {"voltage": step})]
-    curves.append(Curve("asked for", time, np.ones(len(time)), reference=True))
+        torque = f"{loop[0].motor.torque_constant * reference:.3g} N·m at the rotor"
+        curves = [
+            Curve(f"current, of {reference:.3g} A, {torque}: {within}", time, share, colour=1)
+        ]
+        second_axis, voltage = ("current [A]", reference), [_voltages(loop[0], {"voltage": step})]
+    curves.append(Curve("reference", time, np.ones(len(time)), reference=True))
     return [
-        Plot(title, "time [ms]", "share of what is asked for", tuple(curves), scaled=scaled),
+        Plot(title, "time [ms]", "share of the reference", tuple(curves), second_axis=second_axis),
         *voltage,
     ]
 
 
-def recoveries(drive: Drive, steps: Steps) -> list[Plot]:
-    """Current and voltage out of a demand that the voltage cannot meet, by kind of anti-windup; and the same close."""
-    told = {}
-    for kind, one in steps.recoveries.items():
-        back = one.settling_time(0.05)
-        took = f"{1e3 * back:.2g} ms" if math.isfinite(back) else "over 100 ms"
-        told[f"{kind.replace('_', ' ')}: back in {took}"] = one
-    at = f"at {steps.speed:.4g} rad/s of the rotor"
-    title = f"{steps.unreachable:.3g} A, out of reach, then {steps.reachable:.3g} A, {at}"
+def recovery_plots(drive: Drive, steps: Steps) -> list[Plot]:
+    """Return the recovery from an unreachable reference for each anti-windup, and a close-up."""
+    responses = {}
+    for kind, response in steps.recoveries.items():
+        recovery_time = response.settling_time(0.05)
+        time_text = (
+            f"{1e3 * recovery_time:.2g} ms" if math.isfinite(recovery_time) else "over 100 ms"
+        )
+        responses[f"{kind.replace('_', ' ')}: back in {time_text}"] = response
+    speed_text = f"at {steps.speed:.4g} rad/s of the rotor"
+    title = f"{steps.unreachable:.3g} A, out of reach, then {steps.reachable:.3g} A, {speed_text}"
     return [
-        *_responses(drive, title, told, _SHOWN),
-        *_responses(drive, "The same, close", told, _CLOSE),
+        *_responses(drive, title, responses, _RECOVERY_SPAN),
+        *_responses(drive, "Close-up", responses, _CLOSE_UP_SPAN),
     ]
 
 
 def _responses(
     drive: Drive, title: str, responses: Mapping[str, Response], span: tuple[float, float]
 ) -> list[Plot]:
-    """Current, with the rotor's torque, and voltage of responses to one reference, within a span [ms]."""
-    shown = {}
-    for label, one in responses.items():
-        within = (1e3 * one.time >= span[0]) & (1e3 * one.time <= span[1])
-        shown[label] = Response(*(column[within] for column in one))
-    currents = [Curve(label, 1e3 * one.time, one.current) for label, one in shown.items()]
-    last = list(shown.values())[-1]
-    asked = Curve("asked for", 1e3 * last.time, last.reference, reference=True, style="step")
+    """Return current and voltage of responses to one reference, within a span [ms]."""
+    cropped = {}
+    for label, response in responses.items():
+        is_within = (1e3 * response.time >= span[0]) & (1e3 * response.time <= span[1])
+        cropped[label] = Response(*(column[is_within] for column in response))
+    currents = [
+        Curve(label, 1e3 * response.time, response.current) for label, response in cropped.items()
+    ]
+    last = list(cropped.values())[-1]
+    reference = Curve("reference", 1e3 * last.time, last.reference, reference=True, style="step")
     torque = "torque of the rotor [N·m]", drive.motor.torque_constant
     return [
-        Plot(title, "time [ms]", "current [A]", (*currents, asked), scaled=torque),
-        _voltages(drive, {label.partition(":")[0]: one for label, one in shown.items()}),
+        Plot(title, "time [ms]", "current [A]", (*currents, reference), second_axis=torque),
+        _voltages(
+            drive, {label.partition(":")[0]: response for label, response in cropped.items()}
+        ),
     ]
 
 
 def _voltages(loop: Looped, responses: Mapping[str, Response]) -> Plot:
-    """Voltage of responses, within a supply."""
-    colour = None if len(responses) > 1 else 1
+    """Return the voltage of responses, with the limits of the supply."""
+    color = None if len(responses) > 1 else 1
     curves = [
-        Curve(label, 1e3 * one.time, one.voltage, style="step", colour=colour)
-        for label, one in responses.items()
+        Curve(label, 1e3 * response.time, response.voltage, style="step", colour=color)
+        for label, response in responses.items()
     ]
     if (limit := loop.voltage_limit) is not None:
         ends = curves[0].x[[0, -1]]
         curves += [
             Curve("supply", ends, np.full(2, side * limit), reference=True) for side in (1.0, -1.0)
         ]
-    return Plot("Its voltage", "time [ms]", "voltage [V]", tuple(curves))
+    return Plot("Voltage", "time [ms]", "voltage [V]", tuple(curves))
 
 
-def held_step(steps: Mapping[str, tuple[ActuatorModel, float, float]]) -> Plot | None:
-    """The torque after a step of what is asked for, the shaft held; None where nothing is of interest.
+def torque_step_plot(steps: Mapping[str, tuple[ActuatorModel, float, float]]) -> Plot | None:
+    """Return the torque after a step of the desired torque, with the shaft held.
 
-    By name: the actuator, the torque that is asked of it [N*m], the mechanical step [s].
+    Actuators without a state, or whose torque depends on the motion, are left out.
+
+    Args:
+        steps: name -> the actuator, the desired torque [N*m], and the mechanical step [s].
+
+    Returns:
+        None if no actuator is left.
     """
     curves = []
-    for name, (actuator, asked, timestep) in steps.items():
+    for name, (actuator, desired, timestep) in steps.items():
         kind: Any = type(actuator)
-        if not actuator.tracks or actuator.MOTION or not kind.State._fields or asked == 0.0:
+        if not actuator.tracks or actuator.MOTION or not kind.State._fields or desired == 0.0:
             continue
         parameters, state = (
             parameters_type(kind)(*actuator.numbers),
@@ -356,21 +433,21 @@ def held_step(steps: Mapping[str, tuple[ActuatorModel, float, float]]) -> Plot |
         )
         share = [0.0]
         for tick in range(100):
-            inputs = Inputs(asked, 0.0, 0.0, tick * timestep, 0.0)
+            inputs = Inputs(desired, 0.0, 0.0, tick * timestep, 0.0)
             state, torque, _ = kind.advance(parameters, timestep, state, inputs)
-            share.append(torque / asked)
+            share.append(torque / desired)
         time = timestep * np.arange(len(share))
-        within = np.flatnonzero(np.abs(np.array(share) - share[-1]) > 0.02)
-        shown = min(max(3 * (within[-1] + 1) if len(within) else 0, 20), len(share))
+        unsettled = np.flatnonzero(np.abs(np.array(share) - share[-1]) > 0.02)
+        num_points = min(max(3 * (unsettled[-1] + 1) if len(unsettled) else 0, 20), len(share))
         label = f"{name}, at steps of {1e3 * timestep:.3g} ms"
-        curves.append(Curve(label, time[:shown], np.array(share[:shown])))
+        curves.append(Curve(label, time[:num_points], np.array(share[:num_points])))
     if not curves:
         return None
     longest = max((curve.x for curve in curves), key=lambda time: time[-1])
-    curves.append(Curve("asked for", longest, np.ones(len(longest)), reference=True))
+    curves.append(Curve("reference", longest, np.ones(len(longest)), reference=True))
     return Plot(
         "A step of the torque, the shaft held",
         "time [s]",
-        "share of what is asked for",
+        "share of the reference",
         tuple(curves),
     )

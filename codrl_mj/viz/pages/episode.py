@@ -1,4 +1,4 @@
-"""One episode of each of some runs: film and plots on one clock."""
+"""One episode of each of several runs: films and plots on one clock."""
 
 import dataclasses
 import itertools
@@ -15,68 +15,70 @@ from codrl_mj.evaluation.evaluate import Driven, driven_in
 from codrl_mj.viz.films.film import Clip, clip, record
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.diagrams import episode_diagram
-from codrl_mj.viz.pages.plots import POINTS, Curve, Plot, Shade, spans
+from codrl_mj.viz.pages.plots import MAX_POINTS, Curve, Plot, Shade, flagged_intervals
 
 _SIZE = 480, 360
-_BUDGET = 400_000
-"""Points of all curves of an episode: two megabytes."""
-_MANY = 3
-"""Of more motors than this only one is shown at first."""
-_MOST_STATES = 12
-"""Lines of a plot of states."""
+_MAX_EPISODE_POINTS = 400_000
+"""Maximum number of points of all curves of an episode: two megabytes."""
+_MAX_SHOWN_MOTORS = 3
+"""With more motors than this, only one is shown at first."""
+_MAX_STATES = 12
+"""Maximum number of lines in a plot of states."""
 
 
-class Shown(NamedTuple):
-    """A run, and an episode of it as far as there is one."""
+class RunEpisode(NamedTuple):
+    """A run with an episode, as far as one could be run."""
 
     name: str
-    """The run's."""
+    """Name of the run."""
     env: Any
-    """The `EnvConfig` that it runs in; None where that cannot be read."""
+    """`EnvConfig` of the run; None if it cannot be read."""
     episode: Any
-    """What happened, an `Episode`; None: `problem`."""
+    """Recorded `Episode`; None if there is a problem."""
     film: Clip | None
-    """The scene; None: `problem`."""
+    """Film of the scene; None if there is a problem."""
     problem: str | None
-    """Why there is no episode, or no film of it."""
+    """Reason why there is no episode, or no film."""
     seed: int
-    """Of the episode."""
+    """Seed of the episode."""
     best: bool = False
-    """Whether the policy of its best evaluation acts."""
+    """True if the policy is that of the best evaluation."""
     summary: Any = None
-    """What its folder says: a `RunSummary`."""
+    """`RunSummary` of the run folder."""
     rank: str = ""
-    """How its return compares with those of the run's evaluation."""
+    """Comparison of the episode's return with the run's evaluation."""
 
 
-def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Shown:
-    """Run an episode in a run's environment, an `EnvConfig`, and film it where that works."""
-    episode, film, problem = None, None, None if filmed else "none was asked for"
-    if filmed:
+def run_and_film(name: str, env: Any, policy: Any, seed: int, with_film: bool = True) -> RunEpisode:
+    """Run an episode in a run's environment, an `EnvConfig`, and film it if possible."""
+    episode, film, problem = None, None, None if with_film else "not requested"
+    if with_film:
         try:
             panel = record(policy, env, seed, *_SIZE)
             episode = panel.episode
             film = clip(panel, *_SIZE)
         except (
+            # Each renderer, and each missing library, raises its own kind of error. The report is
+            # written without the film.
             Exception
-        ) as error:  # each renderer raises its own kind, and so do libraries that are not installed
+        ) as error:
             problem = f"{type(error).__name__}: {error}"
-    return Shown(
+    return RunEpisode(
         name, env, episode or run_episodes(policy, env.make, 1, seed)[0], film, problem, seed
     )
 
 
 @dataclasses.dataclass(frozen=True)
-class _MotorLine(Driven):
-    """What one motor of one run did; what its curves are called, and when they are shown."""
+class _MotorSeries(Driven):
+    """Signals of one motor of one run, with the style of their curves."""
 
-    before: str
-    """Of their labels."""
-    place: int | None
-    """Among all of them; None where it is the only one. Its colour beside others."""
+    label_prefix: str
+    """Prefix of the curves' labels."""
+    color_index: int | None
+    """Index of the motor among those of all runs, for its color; None for a single motor."""
     tags: tuple[str, ...]
     stride: int
-    """Every so many integration steps are drawn."""
+    """Number of integration steps per drawn point."""
 
     @property
     def turning(self) -> np.ndarray:
@@ -84,132 +86,163 @@ class _MotorLine(Driven):
         return self.speed[1:] / self.actuator.arm_radius
 
     def has(self, *names: str) -> bool:
-        """Whether its family has these signals."""
+        """Return True if the motor's family has these signals."""
         return not isinstance(self.actuator, Ideal) and set(names) <= self.signals.keys()
 
     def curve(
-        self, label: str, values: np.ndarray, colour: int, held: bool = True, dashed: bool = False
+        self, label: str, values: np.ndarray, color: int, held: bool = True, dashed: bool = False
     ) -> Curve:
-        """A curve over the integration steps; what is held begins with them, what is not is at their ends."""
-        kept = slice(None, None, self.stride)
+        """Return a curve over the integration steps.
+
+        Values that are `held` apply from the start of each step, others at its end.
+        """
+        selection = slice(None, None, self.stride)
         values = np.asarray(values, dtype=float)
         time = self.timestep * (np.arange(len(values)) + (not held))
+        # A held value needs the end of the last step too, to be drawn over its whole length.
         if held:
             time, values = (
-                np.append(time[kept], time[-1] + self.timestep),
-                np.append(values[kept], values[-1]),
+                np.append(time[selection], time[-1] + self.timestep),
+                np.append(values[selection], values[-1]),
             )
         else:
-            time, values = time[kept], values[kept]
-        style: Any = {"style": "step" if held else "line", "colour": colour, "dashed": dashed}
-        return Curve(self.before + label, time, values, shared=self.place, tags=self.tags, **style)
+            time, values = time[selection], values[selection]
+        style: Any = {"style": "step" if held else "line", "colour": color, "dashed": dashed}
+        return Curve(
+            self.label_prefix + label,
+            time,
+            values,
+            shared=self.color_index,
+            tags=self.tags,
+            **style,
+        )
 
 
-def episode_section(shown: Sequence[Shown], joined: Iterable[Markup] = ()) -> Markup:
-    """Films, controls and plots of some episodes side by side, and what else follows the clock (`page.clocked`)."""
-    motors = list(dict.fromkeys(name for one in shown for name in one.episode.motors or ("motor",)))
-    lines = _lines(shown, motors)
-    end = max(float(one.episode.time[-1]) for one in shown)
+def episode_section(runs: Sequence[RunEpisode], extra_parts: Iterable[Markup] = ()) -> Markup:
+    """Return films, controls and plots of episodes side by side.
+
+    Args:
+        runs: the runs with their episodes.
+        extra_parts: further parts on the same clock (`page.clocked_part`).
+    """
+    motors = list(dict.fromkeys(name for run in runs for name in run.episode.motors or ("motor",)))
+    series = _motor_series(runs, motors)
+    end = max(float(run.episode.time[-1]) for run in runs)
     films = [
-        page.part("film", _caption(one, len(shown) > 1), *one.film)
-        for one in shown
-        if one.film is not None
+        page.render_part("film", _caption(run, len(runs) > 1), *run.film)
+        for run in runs
+        if run.film is not None
     ]
-    boxes = (
-        [page.part("selector", "Runs", "run", [one.name for one in shown], None)]
-        if len(shown) > 1
+    selectors = (
+        [page.render_part("selector", "Runs", "run", [run.name for run in runs], None)]
+        if len(runs) > 1
         else []
     )
     if len(motors) > 1:
-        boxes.append(
-            page.part("selector", "Motors", "motor", motors, 0 if len(motors) > _MANY else None)
+        selectors.append(
+            page.render_part(
+                "selector",
+                "Motors",
+                "motor",
+                motors,
+                0 if len(motors) > _MAX_SHOWN_MOTORS else None,
+            )
         )
-    notes = [
-        page.note(f"No film of {one.name}: {one.problem}") for one in shown if one.film is None
-    ]
+    notes = [page.note(f"No film of {run.name}: {run.problem}") for run in runs if run.film is None]
     stage = [
         *notes,
         Markup('<div class="pinned">{}{}</div>').format(
-            Markup('<div class="films">{}</div>').format(page.joined(films)) if films else "",
-            page.part(
-                "transport", f"{end:.6g}", f"{min(float(one.episode.time[0]) for one in shown):.6g}"
+            Markup('<div class="films">{}</div>').format(page.join(films)) if films else "",
+            page.render_part(
+                "transport", f"{end:.6g}", f"{min(float(run.episode.time[0]) for run in runs):.6g}"
             ),
         ),
-        Markup('<div class="selectors">{}</div>').format(page.joined(boxes)) if boxes else Markup(),
-        *joined,
+        Markup('<div class="selectors">{}</div>').format(page.join(selectors))
+        if selectors
+        else Markup(),
+        *extra_parts,
     ]
-    diagram = episode_diagram(lines)
+    diagram = episode_diagram(series)
     if diagram is not None:
         stage.append(page.plot(diagram))
-    right = [page.plot(one, low=True) for one in (*_motor_plots(lines), *_run_plots(shown))]
-    ends = [page.paragraph(_caption(one, True), "soft") for one in shown] if not films else []
-    if lines and lines[0].stride > 1:
-        ends.append(
-            page.paragraph(f"Plots have every {lines[0].stride}th integration step.", "soft")
+    plots = [page.plot(plot, low=True) for plot in (*_motor_plots(series), *_run_plots(runs))]
+    footnotes = [page.paragraph(_caption(run, True), "soft") for run in runs] if not films else []
+    if series and series[0].stride > 1:
+        footnotes.append(
+            page.paragraph(f"The plots show every {series[0].stride}th integration step.", "soft")
         )
-    return page.joined(
+    return page.join(
         (
             page.paragraph(
                 "Film and plots share a clock: play the film, or drag in any plot over time."
-                " Torque, current and speed are the motor's own, at its shaft."
+                " Torque, current and speed are those of the motor, at its shaft."
             ),
-            *ends,
+            *footnotes,
             Markup(
                 '<div class="episode"><div class="stage">{}</div><div class="stack">{}</div></div>'
-            ).format(page.joined(stage), page.joined(right)),
+            ).format(page.join(stage), page.join(plots)),
         )
     )
 
 
-def _caption(one: Shown, named: bool) -> str:
-    episode = one.episode
-    over = f"{'ended' if episode.terminated else 'time limit'} at {episode.time[-1]:.2f} s"
-    found = (
-        f"{one.name + ': ' if named else ''}seed {one.seed}, return {page.number(episode.total)},"
-        f" {over}"
+def _caption(run: RunEpisode, with_name: bool) -> str:
+    episode = run.episode
+    ending = f"{'ended' if episode.terminated else 'time limit'} at {episode.time[-1]:.2f} s"
+    caption = (
+        f"{run.name + ': ' if with_name else ''}seed {run.seed},"
+        f" return {page.format_number(episode.total)}, {ending}"
     )
-    return f"{found}; {one.rank}" if one.rank else found
+    return f"{caption}; {run.rank}" if run.rank else caption
 
 
-def _lines(shown: Sequence[Shown], motors: list[str]) -> list[_MotorLine]:
-    """Every motor of every run; by the names of all."""
+def _motor_series(runs: Sequence[RunEpisode], motors: list[str]) -> list[_MotorSeries]:
+    """Return the series of every motor of every run.
+
+    Args:
+        runs: the runs.
+        motors: names of the motors of all runs.
+    """
     pairs = [
-        (one, number, motor) for one in shown for number, motor in enumerate(driven_in(one.episode))
+        (run, motor_index, motor)
+        for run in runs
+        for motor_index, motor in enumerate(driven_in(run.episode))
     ]
-    most = max(POINTS // 4, _BUDGET // (10 * len(pairs)))
-    stride = max(-(-len(one.episode.trace["speed"]) // most) for one in shown)
-    made = []
-    for place, (one, number, motor) in enumerate(pairs):
-        names = one.episode.motors or ("motor",)
-        words = [one.name] * (len(shown) > 1) + [names[number]] * (len(names) > 1)
-        tags = f"run:{shown.index(one)}", f"motor:{motors.index(names[number])}"
-        before = f"{', '.join(words)}: " if words else ""
-        made.append(
-            _MotorLine(
+    max_points = max(MAX_POINTS // 4, _MAX_EPISODE_POINTS // (10 * len(pairs)))
+    # Both the points of each curve and those of the page are limited. All motors share a stride, so
+    # that their points are at the same times.
+    stride = max(-(-len(run.episode.trace["speed"]) // max_points) for run in runs)
+    series = []
+    for index, (run, motor_index, motor) in enumerate(pairs):
+        names = run.episode.motors or ("motor",)
+        prefix_parts = [run.name] * (len(runs) > 1) + [names[motor_index]] * (len(names) > 1)
+        tags = f"run:{runs.index(run)}", f"motor:{motors.index(names[motor_index])}"
+        prefix = f"{', '.join(prefix_parts)}: " if prefix_parts else ""
+        series.append(
+            _MotorSeries(
                 **vars(motor),
-                before=before,
-                place=place if len(pairs) > 1 else None,
+                label_prefix=prefix,
+                color_index=index if len(pairs) > 1 else None,
                 tags=tags,
                 stride=stride,
             )
         )
-    return made
+    return series
 
 
 _TIME = "time [s]"
 
 
-def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
-    """What the motors did."""
+def _motor_plots(lines: Sequence[_MotorSeries]) -> list[Plot]:
+    """Return the plots of torque, current, voltage, power and temperature of the motors."""
     ideal = [isinstance(line.actuator, Ideal) for line in lines]
-    force, unit = all(ideal), "torque [N·m]"
+    is_force, unit = all(ideal), "torque [N·m]"
     if any(ideal):
         unit = (
             "force [N] or torque [N·m]"
-            if force
+            if is_force
             else "torque [N·m], of the ideal actuator force [N]"
         )
-    torque, error, current, voltage, power, warmth = ([] for _ in range(6))  # type: ignore[var-annotated]
+    torque, error, current, voltage, power, temperature = ([] for _ in range(6))  # type: ignore[var-annotated]
     for line in lines:
         torque.append(line.curve("actual", line.actual, 1))
         if line.tracks:
@@ -235,16 +268,16 @@ def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
                     line.curve("heat in the winding", line.actuator.winding[0] * amperes**2, 4)
                 )
         if line.has("temperature") and np.ptp(line.signals["temperature"]) > 0.0:
-            warmth.append(line.curve("winding", line.signals["temperature"], 4, held=False))
-    title = "Force" if force else "Torque at the shaft"
-    found = [
+            temperature.append(line.curve("winding", line.signals["temperature"], 4, held=False))
+    title = "Force" if is_force else "Torque at the shaft"
+    plots = [
         Plot(title, _TIME, unit, tuple(torque), clock=True, shades=_shades(lines, "saturated"))
     ]
     if any(np.ptp(curve.y) > 0.0 or curve.y.any() for curve in error):
-        found.append(Plot("Error: desired less actual", _TIME, unit, tuple(error), clock=True))
+        plots.append(Plot("Error: desired less actual", _TIME, unit, tuple(error), clock=True))
     if current:
         shades = _shades(lines, "current_saturated", "temperature_saturated")
-        found.append(
+        plots.append(
             Plot(
                 "Current and its reference",
                 _TIME,
@@ -256,102 +289,116 @@ def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
         )
     if voltage:
         curves = (*voltage, *_voltage_limits(lines, voltage))
-        split = [
-            line for line in lines if line.has("voltage_saturated")
-        ]  # the only limit of others is the voltage's
-        others = [
+        # Families with several limits have a signal for each. The only limit of the others is the
+        # voltage.
+        multi_limit_lines = [line for line in lines if line.has("voltage_saturated")]
+        single_limit_lines = [
             line for line in lines if line.has("voltage") and not line.has("voltage_saturated")
         ]
-        shades = _shades(split, "voltage_saturated") + _shades(others, "saturated")
-        found.append(
+        shades = _shades(multi_limit_lines, "voltage_saturated") + _shades(
+            single_limit_lines, "saturated"
+        )
+        plots.append(
             Plot("Voltage and its limit", _TIME, "voltage [V]", curves, clock=True, shades=shades)
         )
-    found += _other_signals(lines)
-    if not force:
-        found.append(Plot("Power and losses", _TIME, "power [W]", tuple(power), clock=True))
-    if warmth:
-        found.append(Plot("Temperature", _TIME, "temperature [°C]", tuple(warmth), clock=True))
-    return found
+    plots += _other_signals(lines)
+    if not is_force:
+        plots.append(Plot("Power and losses", _TIME, "power [W]", tuple(power), clock=True))
+    if temperature:
+        plots.append(Plot("Temperature", _TIME, "temperature [°C]", tuple(temperature), clock=True))
+    return plots
 
 
-def _shades(lines: Sequence[_MotorLine], *names: str) -> tuple[Shade, ...]:
-    """Where the limits by these names were met."""
-    found = []
+def _shades(lines: Sequence[_MotorSeries], *names: str) -> tuple[Shade, ...]:
+    """Return the intervals in which the limits with these names were reached."""
+    shades = []
     for line, name in itertools.product(lines, names):
         if line.has(name):
             times = line.timestep * np.arange(len(line.signals[name]) + 1)
-            found.append(
+            shades.append(
                 Shade(
-                    line.before + name.replace("_", " "),
-                    spans(times, line.signals[name]),
+                    line.label_prefix + name.replace("_", " "),
+                    flagged_intervals(times, line.signals[name]),
                     line.tags,
                 )
             )
-    return tuple(found)
+    return tuple(shades)
 
 
-def _voltage_limits(lines: Sequence[_MotorLine], drawn: Sequence[Curve]) -> list[Curve]:
-    """The supply's voltages, where they come near: a limit far off would press the curve flat."""
-    highest = max(float(np.nanmax(np.abs(curve.y))) for curve in drawn)
-    each = {line.actuator.voltage_limit: line.tags for line in lines if line.has("voltage")}
-    found = []
-    for limit, tags in each.items():
+def _voltage_limits(lines: Sequence[_MotorSeries], voltage_curves: Sequence[Curve]) -> list[Curve]:
+    """Return lines at the supply voltages that are near the curves.
+
+    A limit far away would flatten the curves.
+    """
+    highest = max(float(np.nanmax(np.abs(curve.y))) for curve in voltage_curves)
+    tags_by_limit = {
+        line.actuator.voltage_limit: line.tags for line in lines if line.has("voltage")
+    }
+    curves = []
+    for limit, tags in tags_by_limit.items():
+        # An unlimited supply is infinite and is not drawn either.
         if limit is not None and limit < max(4.0 * highest, 1e-9):
-            ends = np.array([0.0, max(curve.x[-1] for curve in drawn)])
-            own = tags if len(each) > 1 else ()
-            found += [
+            ends = np.array([0.0, max(curve.x[-1] for curve in voltage_curves)])
+            limit_tags = tags if len(tags_by_limit) > 1 else ()
+            curves += [
                 Curve(
-                    f"{side}{limit:g} V", ends, np.full(2, float(f"{side}{limit}")), True, tags=own
+                    f"{side}{limit:g} V",
+                    ends,
+                    np.full(2, float(f"{side}{limit}")),
+                    True,
+                    tags=limit_tags,
                 )
                 for side in "+-"
             ]
-    return found
+    return curves
 
 
-_KNOWN = (
+_PLOTTED_SIGNALS = (
     *("current", "reference_current", "voltage", "temperature", "electrical_power", "copper_loss"),
     *("saturated", "voltage_saturated", "current_saturated", "temperature_saturated"),
 )
 
 
-def _other_signals(lines: Sequence[_MotorLine]) -> list[Plot]:
-    """Signals that only some families have."""
-    names = dict.fromkeys(name for line in lines for name in line.signals if name not in _KNOWN)
-    found = []
+def _other_signals(lines: Sequence[_MotorSeries]) -> list[Plot]:
+    """Return plots of signals that only some families have."""
+    names = dict.fromkeys(
+        name for line in lines for name in line.signals if name not in _PLOTTED_SIGNALS
+    )
+    plots = []
     for name in names:
-        own = [line for line in lines if line.has(name)]
-        unit = page.unit(own[0].actuator.SIGNAL_UNITS.get(name, "")) if own else ""
-        curves = tuple(line.curve(name.replace("_", " "), line.signals[name], 3) for line in own)
-        if own:
+        series = [line for line in lines if line.has(name)]
+        unit = page.format_unit(series[0].actuator.SIGNAL_UNITS.get(name, "")) if series else ""
+        curves = tuple(line.curve(name.replace("_", " "), line.signals[name], 3) for line in series)
+        if series:
             title = name.replace("_", " ").capitalize()
-            found.append(
+            plots.append(
                 Plot(title, _TIME, f"{name.replace('_', ' ')} [{unit}]", curves, clock=True)
             )
-    return found
+    return plots
 
 
-def _run_plots(shown: Sequence[Shown]) -> list[Plot]:
-    """States and reward of the runs."""
-    found: list[Plot] = []
+def _run_plots(runs: Sequence[RunEpisode]) -> list[Plot]:
+    """Return plots of the states and rewards of the runs."""
+    plots: list[Plot] = []
     groups: dict[str, list[Curve]] = {}
     rewards = []
-    several = len(shown) > 1
-    for place, one in enumerate(shown):
-        before = f"{one.name}: " if several else ""
-        own: Any = {"shared": place if several else None, "tags": (f"run:{place}",)}
-        time = np.concatenate([[0.0], one.episode.time])
+    has_several = len(runs) > 1
+    for run_index, run in enumerate(runs):
+        prefix = f"{run.name}: " if has_several else ""
+        owner: Any = {"shared": run_index if has_several else None, "tags": (f"run:{run_index}",)}
+        time = np.concatenate([[0.0], run.episode.time])
         counts: dict[str, int] = {}
-        for index, name in enumerate(one.env.source.state_names(one.env)):
+        for index, name in enumerate(run.env.source.state_names(run.env)):
             unit = (re.search(r"\[(.*)\]", name) or [name, "1"])[1]
             count = counts[unit] = counts.get(unit, -1) + 1
-            if count < _MOST_STATES:
-                more = {"colour": count, "dashed": several and count > 0, **own}
+            if count < _MAX_STATES:
+                style = {"colour": count, "dashed": has_several and count > 0, **owner}
                 curve = Curve(
-                    before + name.partition(" [")[0], time, one.episode.state[:, index], **more
+                    prefix + name.partition(" [")[0], time, run.episode.state[:, index], **style
                 )
                 groups.setdefault(unit, []).append(curve)
-        held = np.append(one.episode.reward, one.episode.reward[-1])
-        rewards.append(Curve(f"{before}reward", time, held, style="step", colour=5, **own))
+        held = np.append(run.episode.reward, run.episode.reward[-1])
+        rewards.append(Curve(f"{prefix}reward", time, held, style="step", colour=5, **owner))
     for unit, curves in groups.items():
         names = list(
             dict.fromkeys(curve.label.rpartition(": ")[2].replace("_", " ") for curve in curves)
@@ -361,6 +408,6 @@ def _run_plots(shown: Sequence[Shown]) -> list[Plot]:
             if len(names) < 4
             else f"States {'without a unit' if unit == '1' else f'in {unit}'}"
         )
-        found.append(Plot(title, _TIME, f"state [{unit}]", tuple(curves), clock=True))
-    found.append(Plot("Reward of each step", _TIME, "reward", tuple(rewards), clock=True))
-    return found
+        plots.append(Plot(title, _TIME, f"state [{unit}]", tuple(curves), clock=True))
+    plots.append(Plot("Reward of each step", _TIME, "reward", tuple(rewards), clock=True))
+    return plots

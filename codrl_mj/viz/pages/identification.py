@@ -1,4 +1,4 @@
-"""What identification found: data and fit, residuals, intervals, correlations, and what to do better on the bench."""
+"""Page of an identification: fits, residuals, intervals, correlations, and advice for the bench."""
 
 import itertools
 import math
@@ -13,8 +13,8 @@ from codrl_mj.identify.uncertainty import CAUSES
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.plots import Curve, Plot
 
-_LAGS = 400
-_STRONG = 0.9
+_MAX_LAGS = 400
+_STRONG_CORRELATION = 0.9
 _ADVICE = {
     "resistance": (
         "lock the rotor, drive it with steps of voltage (PRBS), log voltage and current at the"
@@ -41,202 +41,242 @@ _ADVICE = {
 }
 
 
-def identification_page(found: Identified, out: Path) -> Path:
-    """Write the page of what identification found."""
-    winding = [one for one in found.traces if one.part == "winding"]
-    shaft = [one for one in found.traces if one.part == "shaft"]
-    predicted = [one.trace for one in found.held_out if one.trace is not None]
+def identification_page(result: Identified, out: Path) -> Path:
+    """Write the page of an identification."""
+    winding = [trace for trace in result.traces if trace.part == "winding"]
+    shaft = [trace for trace in result.traces if trace.part == "shaft"]
+    predicted = [prediction.trace for prediction in result.held_out if prediction.trace is not None]
     fits = (
-        [page.heading("Winding: the current under the logged voltage"), *map(_looked_at, winding)]
+        [page.heading("Winding: the current under the logged voltage"), *map(_fit_plots, winding)]
         if winding
         else []
     )
-    fits += [page.heading("Shaft, piece by piece"), *map(_looked_at, shaft)] if shaft else []
+    fits += [page.heading("Shaft, piece by piece"), *map(_fit_plots, shaft)] if shaft else []
     sections = [
-        page.Section("parameters", "Parameters", _parameters(found)),
-        page.Section("better", "What to do better on the bench", _advice(found)),
-        page.Section("errors", "Errors of the simulation", _errors(found)),
-        page.Section("fits", "Logs that were fitted", page.joined(fits)),
-        page.Section(
-            "held-out", "Logs that were only predicted", page.joined(map(_looked_at, predicted))
-        ),
-        page.Section(
-            "correlations", "Which parameters can stand for each other", _correlations(found)
-        ),
+        page.Section("parameters", "Parameters", _parameters(result)),
+        page.Section("better", "Advice for the next experiment", _advice(result)),
+        page.Section("errors", "Errors of the simulation", _errors(result)),
+        page.Section("fits", "Fitted logs", page.join(fits)),
+        page.Section("held-out", "Predicted logs", page.join(map(_fit_plots, predicted))),
+        page.Section("correlations", "Correlated parameters", _correlations(result)),
     ]
-    title = f"Identified from {', '.join(found.logs)}"
-    return page.write(out, page.page(title, "A motor from its bench logs", _top(found), sections))
+    title = f"Identified from {', '.join(result.logs)}"
+    return page.write(out, page.page(title, "A motor from its bench logs", _top(result), sections))
 
 
-def _top(found: Identified) -> Markup:
-    problem = found.problem()
-    by = f", driven by its {found.driven_by}" if found.driven_by else ""
-    good = sum(one.status in USABLE for one in found.estimates)
-    late = [
-        f"the input of the {part} is late by {rows:g} row{'s' * (abs(rows) != 1)}, which is"
-        " allowed for"
-        for part, rows in found.delays.items()
+def _top(result: Identified) -> Markup:
+    problem = result.problem()
+    input_text = f", driven by its {result.driven_by}" if result.driven_by else ""
+    num_usable = sum(estimate.status in USABLE for estimate in result.estimates)
+    delay_texts = [
+        f"the input of the {part} is late by {rows:g} row{'s' * (abs(rows) != 1)}, which the"
+        " fit accounts for"
+        for part, rows in result.delays.items()
         if rows
     ]
-    told = (
-        f"{good} of {len(found.estimates)} numbers can be relied on. Rig: {found.rig}{by};"
-        f" friction: {found.friction}"
+    summary = (
+        f"{num_usable} of {len(result.estimates)} parameters are reliable. Rig:"
+        f" {result.rig}{input_text}; friction: {result.friction}"
         + "".join(
             f"; {text}"
-            for text in (found.friction_reason, found.supply_text, found.base_text)
+            for text in (result.friction_reason, result.supply_text, result.base_text)
             if text
         )
     )
     usable = "usable as an actuator" if problem is None else "not to be used as an actuator"
     parts = [
-        page.judged(problem is None, usable, "p", "verdict"),
-        page.paragraph("; ".join([told, *late]) + ".", "lead"),
+        page.mark_verdict(problem is None, usable, "p", "verdict"),
+        page.paragraph("; ".join([summary, *delay_texts]) + ".", "lead"),
     ]
     parts += [page.note(problem, bad=True)] if problem is not None else []
-    return page.joined((*parts, *map(page.note, found.warnings)))
+    return page.join((*parts, *map(page.note, result.warnings)))
 
 
-def _parameters(found: Identified) -> Markup:
+def _parameters(result: Identified) -> Markup:
     rows = []
-    for one in found.estimates:
+    for estimate in result.estimates:
         interval = (
-            "" if one.status == "given" else f"{page.number(one.low)} to {page.number(one.high)}"
+            ""
+            if estimate.status == "given"
+            else f"{page.format_number(estimate.low)} to {page.format_number(estimate.high)}"
         )
-        half = 50.0 * (one.high - one.low) / abs(one.value) if one.value else math.nan
-        worst = max(one.causes, key=lambda cause: one.causes[cause]) if one.causes else ""
-        good = one.status in USABLE
-        share = f"{half:.2g} %" if interval and math.isfinite(half) else ""
-        unit, name = page.unit(one.unit), one.name.replace("_", " ")
+        half_width = (
+            50.0 * (estimate.high - estimate.low) / abs(estimate.value)
+            if estimate.value
+            else math.nan
+        )
+        main_cause = (
+            max(estimate.causes, key=lambda cause: estimate.causes[cause])
+            if estimate.causes
+            else ""
+        )
+        is_usable = estimate.status in USABLE
+        share = f"{half_width:.2g} %" if interval and math.isfinite(half_width) else ""
+        unit, name = page.format_unit(estimate.unit), estimate.name.replace("_", " ")
         cells = (
             name,
-            page.number(one.value),
+            page.format_number(estimate.value),
             interval,
             share,
             unit,
-            page.judged(good, one.status),
-            one.why,
-            CAUSES.get(worst, ""),
+            page.mark_verdict(is_usable, estimate.status),
+            estimate.why,
+            CAUSES.get(main_cause, ""),
         )
         rows.append(cells)
     columns = (
         "parameter",
         "value",
         "95 % interval",
-        "half of it",
+        "half width",
         "unit",
         "status",
-        "why",
-        "mostly because",
+        "reason",
+        "main cause",
     )
-    failed = (place for place, one in enumerate(found.estimates) if one.status not in USABLE)
+    failed = (
+        index for index, estimate in enumerate(result.estimates) if estimate.status not in USABLE
+    )
     return page.table("Parameters with 95 % intervals", columns, rows, (1, 2, 3), True, failed)
 
 
-def _advice(found: Identified) -> Markup:
+def _advice(result: Identified) -> Markup:
     texts = [
         Markup("<b>{}</b> is {}: {}.").format(
-            one.name.replace("_", " "), one.status, _ADVICE[one.name]
+            name.name.replace("_", " "), name.status, _ADVICE[name.name]
         )
-        for one in found.estimates
-        if one.status not in ("identified", "given") and one.name in _ADVICE
+        for name in result.estimates
+        if name.status not in ("identified", "given") and name.name in _ADVICE
     ]
-    told = Markup(
-        "<b>{}</b> and <b>{}</b> stand for each other (correlation {:+.2f}): give one of them with"
-        " --known, or excite what tells them apart."
+    pair_text = Markup(
+        "<b>{}</b> and <b>{}</b> cannot be separated (correlation {:+.2f}): give one of them with"
+        " --known, or use an excitation on which they act differently."
     )
     texts += [
-        told.format(one.replace("_", " "), other.replace("_", " "), table[one][other])
-        for table in found.correlations.values()
-        for one, other in itertools.combinations(table, 2)
-        if abs(table[one][other]) >= _STRONG
+        pair_text.format(
+            name.replace("_", " "), other_name.replace("_", " "), table[name][other_name]
+        )
+        for table in result.correlations.values()
+        for name, other_name in itertools.combinations(table, 2)
+        if abs(table[name][other_name]) >= _STRONG_CORRELATION
     ]
-    if not found.held_out and found.driven_by:
+    if not result.held_out and result.driven_by:
         texts.append(
             Markup(
-                "No log was held out: keep one back with --holdout, to see what the numbers"
-                " predict."
+                "No log was held out: pass one with --holdout, to see how well the parameters"
+                " predict it."
             )
         )
-    if len(found.logs) < 2:
-        texts.append(Markup("A single log: a second one shows what differs from day to day."))
+    if len(result.logs) < 2:
+        texts.append(Markup("A single log: a second one shows differences from day to day."))
     if not texts:
         return page.paragraph(
-            "Nothing stands out: every number is identified or given, and a log was held out."
+            "No advice: every parameter is identified or given, and a log was held out."
         )
-    texts.append(Markup("<code>codrl-mj identify plan</code> says which excitation tells what."))
+    texts.append(
+        Markup("<code>codrl-mj identify plan</code> lists the excitation for each parameter.")
+    )
     return Markup("<ul>{}</ul>").format(
-        page.joined(Markup("<li>{}</li>").format(text) for text in texts)
+        page.join(Markup("<li>{}</li>").format(text) for text in texts)
     )
 
 
-def _errors(found: Identified) -> Markup:
+def _errors(result: Identified) -> Markup:
     rows = []
-    for kind, several in (("fitted", found.fitted), ("held out", found.held_out)):
-        for one in several:
-            errors = (page.number(error, 3) for error in (one.open_loop, one.closed_loop))
-            rows.append((one.log, kind, f"{one.output} [{SIGNALS[one.output]}]", *errors))
+    for kind, predictions in (("fitted", result.fitted), ("held out", result.held_out)):
+        for prediction in predictions:
+            errors = (
+                page.format_number(error, 3)
+                for error in (prediction.open_loop, prediction.closed_loop)
+            )
+            rows.append(
+                (
+                    prediction.log,
+                    kind,
+                    f"{prediction.output} [{SIGNALS[prediction.output]}]",
+                    *errors,
+                )
+            )
     if not rows:
         return Markup()
     columns = ("log", "", "of", "open loop, half a second", "closed loop")
-    told = page.paragraph(
-        "Mean absolute errors. Open loop: the simulation begins from where the shaft was and runs"
-        " half a second under the logged input. Closed loop: over the whole log under the servo's"
-        " own law, where the log has a command."
+    explanation = page.paragraph(
+        "Mean absolute errors. Open loop: the simulation starts at the measured state of the shaft"
+        " and runs half a second with the logged input. Closed loop: the whole log, with the"
+        " servo's control law, if the log has a command."
     )
-    return told + page.table("Errors of the simulation", columns, rows, numbers=(3, 4))
+    return explanation + page.table("Errors of the simulation", columns, rows, numbers=(3, 4))
 
 
-def _looked_at(one: Trace) -> Markup:
-    """Data and simulation of a log, residuals and their autocorrelation, which is small of noise."""
+def _fit_plots(trace: Trace) -> Markup:
+    """Return plots of measurement and simulation of a log, residuals and their autocorrelation.
+
+    Noise has a small autocorrelation.
+    """
     from scipy.signal import correlate
 
-    unit, what = SIGNALS[one.output], f"{one.log}: {one.output}"
-    gaps = one.starts[1:]
-    time, simulated = (np.insert(values, gaps, np.nan) for values in (one.time, one.simulated))
+    unit, label = SIGNALS[trace.output], f"{trace.log}: {trace.output}"
+    gaps = trace.starts[1:]
+    # The simulation restarts at these rows: NaN interrupts its curve there.
+    time, simulated = (np.insert(values, gaps, np.nan) for values in (trace.time, trace.simulated))
     time = np.where(
         np.isnan(time),
-        np.interp(np.arange(len(time)), np.flatnonzero(~np.isnan(time)), one.time),
+        np.interp(np.arange(len(time)), np.flatnonzero(~np.isnan(time)), trace.time),
         time,
     )
-    residuals = one.measured - one.simulated
+    residuals = trace.measured - trace.simulated
     curves = (
-        Curve("measured", one.time, one.measured, colour=0),
+        Curve("measured", trace.time, trace.measured, colour=0),
         Curve("simulated", time, simulated, colour=1),
     )
-    off = Curve("residual", time, np.insert(residuals, gaps, np.nan), colour=4)
+    residual_curve = Curve("residual", time, np.insert(residuals, gaps, np.nan), colour=4)
     centred = residuals - residuals.mean()
-    whole = correlate(centred, centred, method="fft")[len(centred) - 1 :]
-    count, bound = min(_LAGS, len(centred) // 2), 1.96 / math.sqrt(len(centred))
-    lags = float(np.median(np.diff(one.time))) * np.arange(count + 1)
-    shares = (
-        Curve("autocorrelation", lags, whole[: count + 1] / max(whole[0], 1e-300), colour=3),
+    autocorrelation = correlate(centred, centred, method="fft")[len(centred) - 1 :]
+    count, bound = min(_MAX_LAGS, len(centred) // 2), 1.96 / math.sqrt(len(centred))
+    lags = float(np.median(np.diff(trace.time))) * np.arange(count + 1)
+    autocorrelation_curves = (
+        Curve(
+            "autocorrelation",
+            lags,
+            autocorrelation[: count + 1] / max(autocorrelation[0], 1e-300),
+            colour=3,
+        ),
         Curve("95 % of noise", lags[[0, -1]], np.full(2, bound), reference=True),
         Curve("95 % of noise, below", lags[[0, -1]], np.full(2, -bound), reference=True),
     )
     return page.plots(
         (
-            Plot(what, "time [s]", f"{one.output} [{unit}]", curves),
-            Plot(f"{what}, residuals", "time [s]", f"measured less simulated [{unit}]", (off,)),
-            Plot(f"{what}, autocorrelation of residuals", "lag [s]", "share", shares),
+            Plot(label, "time [s]", f"{trace.output} [{unit}]", curves),
+            Plot(
+                f"{label}, residuals",
+                "time [s]",
+                f"measured less simulated [{unit}]",
+                (residual_curve,),
+            ),
+            Plot(
+                f"{label}, autocorrelation of residuals", "lag [s]", "share", autocorrelation_curves
+            ),
         )
     )
 
 
-def _correlations(found: Identified) -> Markup:
+def _correlations(result: Identified) -> Markup:
     parts = []
-    for part, table in found.correlations.items():
+    for part, table in result.correlations.items():
         if len(table) > 1:
             names = [name.replace("_", " ") for name in table]
-            shares = [
+            cells = [
                 [
                     Markup(
-                        "<b>{:+.2f}</b>" if _STRONG <= abs(one) < 1.0 - 1e-9 else "{:+.2f}"
-                    ).format(one)
-                    for one in row
+                        "<b>{:+.2f}</b>"
+                        if _STRONG_CORRELATION <= abs(share) < 1.0 - 1e-9
+                        else "{:+.2f}"
+                    ).format(share)
+                    for share in row
                 ]
                 for row in (row.values() for row in table.values())
             ]
-            rows = [(name, *row) for name, row in zip(names, shares, strict=True)]
+            rows = [(name, *row) for name, row in zip(names, cells, strict=True)]
             caption = f"Correlations of the {part}'s parameters"
             parts.append(page.table(caption, ("", *names), rows, numbers=range(1, 1 + len(names))))
-    return page.joined(parts)
+    return page.join(parts)

@@ -1,4 +1,4 @@
-"""A motor's page: its numbers and where they are from, what it can do, its current loop."""
+"""Page of a motor: its numbers with their sources, its abilities, and its current loop."""
 
 import math
 from collections.abc import Mapping
@@ -11,9 +11,15 @@ from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import MotorEntry
 from codrl_mj.sizing import LoopDesign, design, designs, explain, step, unknown_in_words
 from codrl_mj.viz.pages import page
-from codrl_mj.viz.pages.diagrams import Loops, bode, recoveries, small_steps, torque_speed_diagram
+from codrl_mj.viz.pages.diagrams import (
+    Loops,
+    bode_plots,
+    recovery_plots,
+    small_step_plots,
+    torque_speed_diagram,
+)
 
-_RIGHTS = (
+_LOOP_ROWS = (
     ("sample_rate", "sample rate", "Hz"),
     ("kp", "proportional gain", "V/A"),
     ("ki", "integral gain", "V/(A·s)"),
@@ -28,70 +34,105 @@ _SCALES = {"settling_time": 1e3, "overshoot": 100.0}
 
 
 def loop_section(loops: Loops) -> Markup:
-    """Margins, Bode's diagram and a small step of some current loops."""
-    found: dict[str, LoopDesign] = {}
+    """Return margins, Bode plots and small steps of current loops."""
+    designs_by_name: dict[str, LoopDesign] = {}
     notes = []
-    for name, (one, timestep) in loops.items():
+    for name, (loop, timestep) in loops.items():
         try:
-            found[name] = design(one, timestep)
+            designs_by_name[name] = design(loop, timestep)
         except ValueError as error:
             notes.append(page.note(f"{name}: {error}", bad=True))
-    if not found:
-        return page.joined(notes)
+    if not designs_by_name:
+        return page.join(notes)
     rows = [
-        (label, *(page.number(_right(one, field)) for one in found.values()), unit)
-        for field, label, unit in _RIGHTS
-    ]
-    late = {name: "a sample of delay" if one.delayed else "no delay" for name, one in found.items()}
-    rows.append(("the voltage comes with", *late.values(), ""))
-    table = page.table("Current loop", ("", *found, "unit"), rows, numbers=range(1, 1 + len(found)))
-    if any(math.isnan(_right(one, field)) for one in found.values() for field, _, _ in _RIGHTS):
-        notes.append(
-            page.paragraph("–: not below half the sample rate, or not within sight.", "soft")
+        (
+            label,
+            *(page.format_number(_display_value(loop, field)) for loop in designs_by_name.values()),
+            unit,
         )
-    known = {name: loops[name] for name in found}
-    return page.joined((table, *notes, page.plots((*bode(known, found), *small_steps(known)))))
+        for field, label, unit in _LOOP_ROWS
+    ]
+    delay_texts = {
+        name: "a sample of delay" if loop.delayed else "no delay"
+        for name, loop in designs_by_name.items()
+    }
+    rows.append(("voltage applied with", *delay_texts.values(), ""))
+    table = page.table(
+        "Current loop",
+        ("", *designs_by_name, "unit"),
+        rows,
+        numbers=range(1, 1 + len(designs_by_name)),
+    )
+    if any(
+        math.isnan(_display_value(loop, field))
+        for loop in designs_by_name.values()
+        for field, _, _ in _LOOP_ROWS
+    ):
+        notes.append(
+            page.paragraph(
+                "–: above half the sample rate, or not reached in the simulated time.", "soft"
+            )
+        )
+    stable_loops = {name: loops[name] for name in designs_by_name}
+    return page.join(
+        (
+            table,
+            *notes,
+            page.plots(
+                (*bode_plots(stable_loops, designs_by_name), *small_step_plots(stable_loops))
+            ),
+        )
+    )
 
 
-def _right(one: LoopDesign, field: str) -> float:
-    value = getattr(one, field)
+def _display_value(loop_design: LoopDesign, field: str) -> float:
+    value = getattr(loop_design, field)
     return 20.0 * math.log10(value) if field == "gain_margin" else value * _SCALES.get(field, 1.0)
 
 
 def motor_page(name: str, drive: Drive, entry: MotorEntry | None, out: Path) -> Path:
-    """Write the page of a motor with its drive, and its datasheet where it has one, to an .html file; return that."""
-    known = explain(drive, entry)
+    """Write the page of a motor with its drive, and its datasheet if it has one.
+
+    Return the file.
+    """
+    explanation = explain(drive, entry)
     sections = [
-        page.Section("abilities", "What it can do", _abilities(known, drive, entry)),
-        page.Section("loop", "Its current loop", _loop(name, drive)),
-        page.Section("numbers", "The motor, at its rotor", _numbers(known)),
-        page.Section("drive", "As it is simulated", _values("Fields of the drive", known["drive"])),
+        page.Section("abilities", "Abilities", _abilities(explanation, drive, entry)),
+        page.Section("loop", "Current loop", _loop(name, drive)),
+        page.Section("numbers", "The motor, at its rotor", _numbers(explanation)),
+        page.Section(
+            "drive", "As it is simulated", _values("Fields of the drive", explanation["drive"])
+        ),
     ]
     top = Markup()
     if entry is not None:
         top = page.paragraph(f"{entry.title}.", "lead")
         if entry.notes:
             top += page.paragraph(" ".join(entry.notes.split()))
-        for text in known["disagreements"]:
+        for text in explanation["disagreements"]:
             top += page.note(f"The datasheet disagrees with itself: {text}")
     return page.write(out, page.page(name, "A motor", top, sections))
 
 
 def _values(caption: str, rows: Any) -> Markup:
-    made = [
-        (row["name"].replace("_", " "), page.number(row["value"]), page.unit(row["unit"]))
+    cells = [
+        (
+            row["name"].replace("_", " "),
+            page.format_number(row["value"]),
+            page.format_unit(row["unit"]),
+        )
         for row in rows
     ]
-    return page.table(caption, ("number", "value", "unit"), made, numbers=(1,))
+    return page.table(caption, ("number", "value", "unit"), cells, numbers=(1,))
 
 
-def _abilities(known: Mapping[str, Any], drive: Drive, entry: MotorEntry | None) -> Markup:
+def _abilities(explanation: Mapping[str, Any], drive: Drive, entry: MotorEntry | None) -> Markup:
     table = _values(
-        f"At the output of its gear, past friction, at {drive.voltage_limit:g} V",
-        known["abilities"],
+        f"At the output of the gear, friction subtracted, at {drive.voltage_limit:g} V",
+        explanation["abilities"],
     )
-    if known["assumed"]:
-        table += page.paragraph(f"{known['assumed']}.", "soft")
+    if explanation["assumed"]:
+        table += page.paragraph(f"{explanation['assumed']}.", "soft")
     try:
         plots = page.plots([torque_speed_diagram(drive, entry and entry.numbers)])
     except ValueError as error:
@@ -100,54 +141,66 @@ def _abilities(known: Mapping[str, Any], drive: Drive, entry: MotorEntry | None)
 
 
 def _loop(name: str, drive: Drive) -> Markup:
-    """The loop as it is, out of saturation, and at other sample rates, with and without delay."""
+    """Return the loop as designed, out of saturation, and at other sample rates and delays."""
     parts = [loop_section({name: (drive, None)})]
     try:
         parts += [
             page.heading("Out of saturation, by kind of anti-windup"),
-            page.plots(recoveries(drive, step(drive))),
+            page.plots(recovery_plots(drive, step(drive))),
         ]
     except ValueError as error:
         parts = [parts[0], page.note(str(error))]
-    own = drive.controller.sample_rate, drive.controller.delayed
+    current_setting = drive.controller.sample_rate, drive.controller.delayed
     rows = []
-    for (rate, delayed), one in designs(drive).items():
+    for (rate, delayed), candidate in designs(drive).items():
         name = (
             f"{rate / 1e3:g} kHz, {'a sample' if delayed else 'no'}"
-            f" delay{' (as it is)' * ((rate, delayed) == own)}"
+            f" delay{' (as it is)' * ((rate, delayed) == current_setting)}"
         )
-        if isinstance(one, str):
-            rows.append((name, "not possible: " + one, *[""] * 5))
+        if isinstance(candidate, str):
+            rows.append((name, "not possible: " + candidate, *[""] * 5))
         else:
-            rows.append((name, *(page.number(_right(one, field)) for field, _, _ in _RIGHTS[3:])))
-    columns = ("the loop at", *(f"{label} [{unit}]" for _, label, unit in _RIGHTS[3:]))
-    return page.joined(
+            rows.append(
+                (
+                    name,
+                    *(
+                        page.format_number(_display_value(candidate, field))
+                        for field, _, _ in _LOOP_ROWS[3:]
+                    ),
+                )
+            )
+    columns = ("the loop at", *(f"{label} [{unit}]" for _, label, unit in _LOOP_ROWS[3:]))
+    return page.join(
         (*parts, page.table("Other sample rates", columns, rows, numbers=range(1, 7), cards=True))
     )
 
 
-def _numbers(known: Mapping[str, Any]) -> Markup:
-    """Every number of a datasheet with its origin."""
-    if "numbers" not in known:
+def _numbers(explanation: Mapping[str, Any]) -> Markup:
+    """Return every number of a datasheet with its source."""
+    if "numbers" not in explanation:
         return Markup()
     rows = []
-    for row in known["numbers"]:
-        how = row["how"] + (" (estimated)" if row["name"] in known["estimated"] else "")
+    for row in explanation["numbers"]:
+        derivation = row["how"] + (
+            " (estimated)" if row["name"] in explanation["estimated"] else ""
+        )
         cells = (
             row["name"].replace("_", " "),
-            page.number(row["value"]),
-            page.unit(row["unit"]),
-            how,
+            page.format_number(row["value"]),
+            page.format_unit(row["unit"]),
+            derivation,
             row["places"],
         )
         rows.append(cells)
-    columns = ("number", "value", "unit", "how it came about", "source")
-    parts = [page.table("Numbers and where they are from", columns, rows, numbers=(1,), cards=True)]
+    columns = ("number", "value", "unit", "derivation", "source")
+    parts = [page.table("Numbers and their sources", columns, rows, numbers=(1,), cards=True)]
     parts.append(
-        page.definitions((str(place), source) for place, source in enumerate(known["cited"], 1))
+        page.definitions(
+            (str(index), source) for index, source in enumerate(explanation["cited"], 1)
+        )
     )
-    if known["estimated"]:
-        parts += [page.heading("Estimated"), page.definitions(known["estimated"].items())]
-    if known["unknown"]:
-        parts.append(page.paragraph(unknown_in_words(known["unknown"]), "soft"))
-    return page.joined(parts)
+    if explanation["estimated"]:
+        parts += [page.heading("Estimated"), page.definitions(explanation["estimated"].items())]
+    if explanation["unknown"]:
+        parts.append(page.paragraph(unknown_in_words(explanation["unknown"]), "soft"))
+    return page.join(parts)

@@ -1,5 +1,5 @@
 "use strict";
-/* The page's clock, its films, and its plots. Plots are drawn by uPlot when they come into sight. */
+/* Clock, films and plots of a page. uPlot draws each plot when it becomes visible. */
 const codrl = (() => {
   const root = document.documentElement;
   const css = (name) => getComputedStyle(root).getPropertyValue(name).trim();
@@ -36,7 +36,7 @@ const codrl = (() => {
       if (theme) localStorage.setItem("codrl-theme", theme);
       return localStorage.getItem("codrl-theme");
     } catch {
-      return null; // pages of some places may not remember
+      return null; // a browser may forbid storage, for example to local files
     }
   };
   const dark = () => (root.dataset.theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light")) === "dark";
@@ -56,7 +56,7 @@ const codrl = (() => {
     named();
   }
 
-  /* -- the clock: films, plots and whatever else joins show the same instant --------------------------------- */
+  /* -- the clock: films, plots and other parts show the same instant ------------------------------------------ */
 
   const clock = { time: 0, end: 0, playing: false, speed: 1, followers: new Set(), told: new Set() };
   clock.set = (time, from = null) => {
@@ -84,9 +84,9 @@ const codrl = (() => {
     } else requestAnimationFrame(advance);
   }
 
-  /** Let something join the clock.
-   * @param element what is shown; handed on to `join`
-   * @param join (element, seek) -> setTime: shows the instant `setTime(seconds)`, calls `seek(seconds)` when scrubbed
+  /** Let a part of the page follow the clock.
+   * @param element the part; passed to `join`
+   * @param join (element, seek) -> setTime: `setTime(seconds)` shows that instant; the part calls `seek(seconds)`
    */
   function clocked(element, join) {
     const setTime = join(element, (time) => clock.set(time, setTime));
@@ -116,10 +116,10 @@ const codrl = (() => {
     clock.followers.add(own.follow);
     clock.told.add(drive);
     const loaded = () => {
-      video.currentTime = frame / 2;  // sought, it shows its own frame in place of the poster
+      video.currentTime = frame / 2;  // seeking replaces the poster by a frame of the film
       own.follow(clock.time);
     };
-    if (video.readyState >= HTMLMediaElement.HAVE_METADATA) loaded();  // known before this script ran: there is no event more
+    if (video.readyState >= HTMLMediaElement.HAVE_METADATA) loaded();  // loaded before this script ran: no event will follow
     else video.addEventListener("loadedmetadata", loaded);
     video.addEventListener("click", () => clock.play(!clock.playing));
     films.push(own);
@@ -150,7 +150,7 @@ const codrl = (() => {
     }
   }
 
-  /* -- what is shown: runs and motors ---------------------------------------------------------------------------- */
+  /* -- selection of runs and motors ------------------------------------------------------------------------------ */
 
   const hiddenTags = new Set();
   function selector(box) {
@@ -229,7 +229,7 @@ const codrl = (() => {
       this.choose();
     }
 
-    /** What is shown; one run and motor alone has its signals in different colours, several have one colour each. */
+    /** Show and hide curves. Signals of a single run and motor differ in color; several runs or motors have one color each. */
     choose() {
       const shown = this.curves.filter((curve) => curve.on && seen(curve.tags));
       this.several = new Set(shown.filter((curve) => curve.shared != null).map((curve) => curve.tags.join())).size > 1;
@@ -297,7 +297,7 @@ const codrl = (() => {
       this.ready = true;
     }
 
-    /** A second vertical axis, whose values are those of the first times a scale. */
+    /** A second vertical axis, whose values are a multiple of those of the first. */
     beside(axis, label, scale) {
       return { ...axis, side: 1, scale: "y", grid: { show: false }, space: 24, size: 56, label, labelSize: 20, labelGap: 0,
         labelFont: "12px system-ui, sans-serif", values: (u, ticks) => ticks.map((value) => tick(scale * value)) };
@@ -416,7 +416,7 @@ const codrl = (() => {
       return low;
     }
 
-    /** Values under the pointer, or else at the page's time. */
+    /** Show the values under the pointer, or else those at the page's time. */
     read() {
       if (!this.u) return;
       let index = this.u.cursor.idx;
@@ -448,7 +448,7 @@ const codrl = (() => {
 
     redraw() { this.u?.redraw(false, true); }
 
-    /* zooming and panning: both along x, by shares of what is seen */
+    /* Zooming and panning along x, by shares of the visible range. */
     window(low, high) {
       const [least, most] = this.limits;
       const flat = this.spec.x.log ? Math.log : (x) => x, back = this.spec.x.log ? Math.exp : (x) => x;
@@ -539,7 +539,7 @@ const codrl = (() => {
         .map((one) => `${one.label} ${one.value.textContent}`).join(", ")}`;
     }
 
-    /** The clock has moved: the line goes along, and a zoomed window after it. */
+    /** Move the line to the clock's time, and a zoomed window with it. */
     follow(time) {
       if (!this.u) return;
       const { min, max } = this.u.scales.x;

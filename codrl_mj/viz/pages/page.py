@@ -1,7 +1,6 @@
-"""The builder of every page: sections of text, tables, plots and films, in one file that asks nothing of any server.
+"""Builder of all pages: sections of text, tables, plots and films in one self-contained file.
 
-All text is escaped; what is to stand as markup is `markupsafe.Markup`, which only this builder
-makes.
+All text is escaped. Markup is `markupsafe.Markup`, which only this builder creates.
 """
 
 import base64
@@ -17,7 +16,7 @@ from markupsafe import Markup
 
 from codrl_mj import __version__
 from codrl_mj.runs.files import check_page, writing
-from codrl_mj.viz.pages.plots import Plot, as_json, description, still
+from codrl_mj.viz.pages.plots import Plot, describe, to_json, to_svg
 
 _HERE = Path(__file__).parent
 _POLICY = (
@@ -25,7 +24,7 @@ _POLICY = (
     " script-src 'unsafe-inline' blob:; worker-src blob:; frame-src data: blob:; connect-src data:"
     " blob:"
 )
-"""What the browser itself holds the page to: nothing is fetched."""
+"""Content security policy, by which the browser itself forbids the page to fetch anything."""
 
 
 class Section(NamedTuple):
@@ -35,7 +34,7 @@ class Section(NamedTuple):
     title: str
     body: Markup
     mark: Any = ""
-    """Beside its entry in the contents."""
+    """Markup beside the section's entry in the contents."""
 
 
 @functools.cache
@@ -47,82 +46,89 @@ def _template(name: str) -> jinja2.Template:
         "lstrip_blocks": True,
     }
     templates = jinja2.Environment(loader=jinja2.FileSystemLoader(_HERE), **options)
-    templates.filters["data"] = _data
+    templates.filters["data"] = _data_url
     return templates.get_template(name)
 
 
-def part(name: str, *arguments: Any) -> Markup:
-    """A macro of `parts.html.jinja`, filled in, which says there what it takes."""
+def render_part(name: str, *arguments: Any) -> Markup:
+    """Return a macro of `parts.html.jinja`, which documents its arguments, filled in."""
     return Markup(getattr(_template("parts.html.jinja").module, name)(*arguments))
 
 
-def _text(name: str) -> Markup:
+def _read_markup(name: str) -> Markup:
     return Markup((_HERE / name).read_text(encoding="utf-8"))
 
 
-def _data(content: bytes, kind: str) -> Markup:
+def _data_url(content: bytes, kind: str) -> Markup:
     return Markup("data:{};base64,{}").format(kind, base64.b64encode(content).decode())
 
 
 def page(title: str, kicker: str, top: Markup, sections: Sequence[Section]) -> str:
-    """A page: above its heading what kind it is, `top` before the first section; those without a body are left out."""
+    """Return a page as HTML.
+
+    Args:
+        title: heading.
+        kicker: kind of the page, above the heading.
+        top: markup before the first section.
+        sections: sections; those without a body are left out.
+    """
     return _template("page.html.jinja").render(
         title=title,
         kicker=kicker,
         top=top,
         sections=[section for section in sections if section.body],
         policy=Markup(_POLICY),
-        style=_text("uplot/uPlot.min.css") + _text("page.css"),
-        uplot=Markup("/* uPlot. {} */\n").format(_text("uplot/LICENSE").strip())
-        + _text("uplot/uPlot.iife.min.js"),
-        script=_text("page.js"),
+        style=_read_markup("uplot/uPlot.min.css") + _read_markup("page.css"),
+        uplot=Markup("/* uPlot. {} */\n").format(_read_markup("uplot/LICENSE").strip())
+        + _read_markup("uplot/uPlot.iife.min.js"),
+        script=_read_markup("page.js"),
         version=__version__,
         made=time.strftime("%Y-%m-%d, %H:%M UTC", time.gmtime()),
     )
 
 
 def write(path: Path, text: str) -> Path:
-    """Write a page, whole or not at all, to a file with the suffix of one."""
+    """Write a page to an .html file, which is replaced only when the page is complete."""
     check_page(path)
     with writing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
 
 
-def joined(parts: Iterable[Any]) -> Markup:
-    """Parts one after the other; what is no markup is escaped."""
+def join(parts: Iterable[Any]) -> Markup:
+    """Return parts one after the other; those that are no markup are escaped."""
     return Markup().join(parts)
 
 
 def paragraph(text: Any, kind: str = "") -> Markup:
-    """A paragraph, with a CSS class."""
+    """Return a paragraph, with a CSS class."""
     return Markup('<p class="{}">{}</p>' if kind else "<p>{1}</p>").format(kind, text)
 
 
 def note(text: Any, bad: bool = False) -> Markup:
-    """What is to be noticed."""
+    """Return a highlighted paragraph, for an error if `bad`."""
     return paragraph(text, "note bad" if bad else "note")
 
 
 def heading(text: Any) -> Markup:
-    """A heading within a section."""
+    """Return a heading within a section."""
     return Markup("<h3>{}</h3>").format(text)
 
 
 def definitions(entries: Iterable[tuple[Any, Any]]) -> Markup:
-    """Names and what they are."""
+    """Return a definition list of names and their values."""
     return Markup("<dl>{}</dl>").format(
-        joined(Markup("<dt>{}</dt><dd>{}</dd>").format(*entry) for entry in entries)
+        join(Markup("<dt>{}</dt><dd>{}</dd>").format(*entry) for entry in entries)
     )
 
 
-def folded(summary: Any, body: Markup) -> Markup:
-    """Something to be unfolded."""
+def details(summary: Any, body: Markup) -> Markup:
+    """Return a block that the reader can unfold."""
     return Markup("<details><summary>{}</summary>{}</details>").format(summary, body)
 
 
-def judged(good: bool, text: Any, element: str = "strong", kind: str = "") -> Markup:
-    """A word in a table, or a paragraph, said to be good or bad not by colour alone."""
+def mark_verdict(good: bool, text: Any, element: str = "strong", kind: str = "") -> Markup:
+    """Return a word or a paragraph marked as good or bad, by a sign as well as by color."""
     word, sign = ("good", "✓") if good else ("bad", "✗")
     return Markup('<{0} class="{1}">{2} {3}</{0}>').format(
         element, f"{kind} {word}".strip(), sign, text
@@ -137,53 +143,70 @@ def table(
     cards: bool = False,
     failed: Iterable[int] = (),
 ) -> Markup:
-    """A table of rows, which the first column names; some may have failed.
+    """Return a table whose first column has the names of the rows.
 
-    Columns at the places `numbers` hold numbers. With `cards` a phone shows each row as a card;
-    otherwise it scrolls.
+    Args:
+        caption: caption.
+        columns: headers.
+        rows: cells of each row.
+        numbers: indices of columns that hold numbers.
+        cards: show each row as a card on a phone; otherwise the table scrolls.
+        failed: indices of rows that are marked as failed.
     """
-    return part("table", caption, columns, list(rows), cards, set(numbers), set(failed))
+    return render_part("table", caption, columns, list(rows), cards, set(numbers), set(failed))
 
 
-def plot(what: Plot, low: bool = False) -> Markup:
-    """A plot; less high where it is `low`."""
-    picture = _data(still(what, height=2.2 if low else 3.2).encode(), "image/svg+xml")
-    axes = f"{what.y_label} over {what.x_label}" if what.clock else what.y_label
-    return part(
-        "plot", what.title, axes, description(what), Markup(as_json(what)), picture, what.clock, low
+def plot(content: Plot, low: bool = False) -> Markup:
+    """Return a plot as markup; a `low` one is less high."""
+    # Without JavaScript the page shows this picture instead of the interactive plot.
+    picture = _data_url(to_svg(content, height=2.2 if low else 3.2).encode(), "image/svg+xml")
+    axes = f"{content.y_label} over {content.x_label}" if content.clock else content.y_label
+    return render_part(
+        "plot",
+        content.title,
+        axes,
+        describe(content),
+        Markup(to_json(content)),
+        picture,
+        content.clock,
+        low,
     )
 
 
-def plots(several: Iterable[Plot]) -> Markup:
-    """Plots side by side, where there is room."""
-    drawn = [plot(one) for one in several]
-    return Markup('<div class="plots">{}</div>').format(joined(drawn)) if drawn else Markup("")
+def plots(contents: Iterable[Plot]) -> Markup:
+    """Return plots side by side, if there is room."""
+    figures = [plot(content) for content in contents]
+    return Markup('<div class="plots">{}</div>').format(join(figures)) if figures else Markup("")
 
 
-def clocked(label: str, fragment: str, script: str) -> Markup:
-    """Something that shares the page's clock with films and plots, such as a replay in three dimensions.
+def clocked_part(label: str, fragment: str, script: str) -> Markup:
+    """Return a part that shares the page's clock with films and plots, such as a replay in 3D.
 
     Args:
-        label: what it is.
-        fragment: its HTML, taken as it is.
+        label: description of the part.
+        fragment: HTML of the part, inserted without escaping.
         script: JavaScript that defines a function `setTime(seconds)`, which shows that instant. It
-            sees `element`, the fragment's parent, and `seek(seconds)`, to be called when the
+            can use `element`, the parent of the fragment, and call `seek(seconds)` when the
             fragment itself is scrubbed.
     """
-    return part("clocked", label, Markup(fragment), Markup(script))
+    return render_part("clocked", label, Markup(fragment), Markup(script))
 
 
-def unit(text: str) -> str:
-    """A unit as it is printed."""
+def format_unit(text: str) -> str:
+    """Return a unit with typographic signs."""
     return text.replace("*", "·").replace("^2", "²").replace("ohm", "Ω").replace("degC", "°C")
 
 
-def number(value: Any, digits: int = 4) -> str:
-    """A number as text, or a mean or a median with its interval; a dash where there is none."""
+def format_number(value: Any, digits: int = 4) -> str:
+    """Return a number as text, with an interval if it has one; a dash for a missing value."""
     if isinstance(value, Mapping):
         middle, low, high = (
-            number(one, digits)
-            for one in (value.get("mean", value.get("median")), value.get("low"), value.get("high"))
+            format_number(part, digits)
+            for part in (
+                value.get("mean", value.get("median")),
+                value.get("low"),
+                value.get("high"),
+            )
         )
         return f"{middle} [{low}, {high}]"
     if value is None or (isinstance(value, float) and math.isnan(value)):

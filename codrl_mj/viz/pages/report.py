@@ -1,4 +1,4 @@
-"""A run's report, or that of several side by side: what they are, learned, achieved, and what their motors did."""
+"""Report of a run, or of several side by side: training, evaluation, an episode, current loops."""
 
 import dataclasses
 import json
@@ -29,12 +29,12 @@ from codrl_mj.training.folder import load_config
 from codrl_mj.training.history import learning_curves, read_episodes
 from codrl_mj.viz.pages import certificate as certificates
 from codrl_mj.viz.pages import page
-from codrl_mj.viz.pages.diagrams import held_step
-from codrl_mj.viz.pages.episode import Shown, episode_section, show
+from codrl_mj.viz.pages.diagrams import torque_step_plot
+from codrl_mj.viz.pages.episode import RunEpisode, episode_section, run_and_film
 from codrl_mj.viz.pages.motor import loop_section
 from codrl_mj.viz.pages.plots import Curve, Plot
 
-_MOST_LOOPS = 4
+_MAX_LOOPS = 4
 
 
 def report(
@@ -44,9 +44,9 @@ def report(
     which: str = "last",
     seed: int | None = None,
     trust: bool = False,
-    filmed: bool = True,
+    with_film: bool = True,
     certificate: Path | None = None,
-    joined: Callable[[Sequence[Shown]], Sequence[Markup]] = lambda _: (),
+    extra_parts: Callable[[Sequence[RunEpisode]], Sequence[Markup]] = lambda _: (),
     on_part: Callable[[str], None] = lambda _: None,
 ) -> Path:
     """Write a report.
@@ -54,151 +54,167 @@ def report(
     Args:
         runs: run folders, at least one; also unfinished and damaged ones.
         out: the page, an .html file.
-        which: `last` or `best`: whose policy acts in the episode. An unfinished run has only its
-            best so far.
-        seed: of the episode; None: that of the evaluated episode with the median return, or 0 where
-            there is none.
-        trust: whether to import modules that a run folder names as its task, agent or actuator,
-            which executes them.
-        filmed: whether to film the episode.
-        certificate: a `certificate.json`, or the folder of one; None: that in a run folder, if
-            there is one.
-        joined: (episodes) -> parts that follow the clock of film and plots, made by
-            `codrl_mj.viz.pages.page.clocked`; `replays` shows them in three dimensions.
-        on_part: called with what is being done.
+        which: policy of the episode, `last` or `best`. An unfinished run has only its best one.
+        seed: seed of the episode; None: that of the evaluated episode with the median return, or 0
+            without an evaluation.
+        trust: import custom modules that a run folder names as its task, agent or actuator, which
+            executes their code.
+        with_film: film the episode.
+        certificate: a `certificate.json`, or its folder; None: the one in a run folder, if any.
+        extra_parts: function that returns, for the episodes, parts that follow the clock of film
+            and plots (`codrl_mj.viz.pages.page.clocked_part`); `replay_parts` shows them in 3D.
+        on_part: called with a description of each part of the work.
 
     Returns:
         `out`.
 
     Raises:
-        FileNotFoundError: a folder is no run folder, or there is no such certificate.
-        ValueError: no run, a seed below 0, `out` is no .html file, or the certificate that is given
-            is damaged.
+        FileNotFoundError: a folder is no run folder, or the certificate does not exist.
+        ValueError: no run, a seed below 0, `out` is no .html file, or the given certificate is
+            damaged.
     """
     if not runs:
-        raise ValueError("runs: none was given; give one run folder or more")
+        raise ValueError("runs: none was given; give one or more run folders")
     if seed is not None and seed < 0:
         raise ValueError(f"seed = {seed}: must be >= 0")
     check_page(out)
+    # Read the certificate first: a wrong path is reported before any episode is run.
     certified = _certificate(runs, certificate)
     summaries = [read_run(path) for path in runs]
-    found = [
-        _run(one, name, which, seed, trust, filmed, on_part)
-        for one, name in zip(summaries, told_apart([one.path for one in summaries]), strict=True)
+    reported = [
+        _run_episode(summary, name, which, seed, trust, with_film, on_part)
+        for summary, name in zip(
+            summaries, told_apart([summary.path for summary in summaries]), strict=True
+        )
     ]
     on_part("page")
-    shown = [run for run in found if run.episode is not None]
+    runs_with_episode = [run for run in reported if run.episode is not None]
     notes = [
         page.note(f"No episode of {run.name}: {run.problem}", bad=True)
-        for run in found
+        for run in reported
         if run.episode is None
     ]
     notes += [
         page.note(f"{run.name}: the policy of its best evaluation acts.")
-        for run in found
+        for run in reported
         if run.best
     ]
-    episode = episode_section(shown, joined(shown)) if shown else Markup()
+    episode = (
+        episode_section(runs_with_episode, extra_parts(runs_with_episode))
+        if runs_with_episode
+        else Markup()
+    )
     sections = [
-        page.Section("learning", "Learning", _learning(found)),
-        page.Section("evaluation", "Evaluation", _evaluation(found)),
-        page.Section("episode", "An episode", page.joined((*notes, episode))),
-        page.Section("loop", "The loop between", _loop(found)),
+        page.Section("learning", "Learning", _learning(reported)),
+        page.Section("evaluation", "Evaluation", _evaluation(reported)),
+        page.Section("episode", "An episode", page.join((*notes, episode))),
+        page.Section("loop", "Current loop", _loop(reported)),
         page.Section("certificate", "Certificate", certified),
-        page.Section("settings", "Settings", _settings(found)),
+        page.Section("settings", "Settings", _settings(reported)),
     ]
-    kinds = "Report of a run" if len(found) == 1 else f"Report of {len(found)} runs"
-    title = ", ".join(run.name for run in found)
-    return page.write(out, page.page(title, kinds, _top(found, shown), sections))
+    kicker = "Report of a run" if len(reported) == 1 else f"Report of {len(reported)} runs"
+    title = ", ".join(run.name for run in reported)
+    return page.write(out, page.page(title, kicker, _top(reported, runs_with_episode), sections))
 
 
-def _run(
+def _run_episode(
     summary: RunSummary,
     name: str,
     which: str,
-    given: int | None,
+    seed_given: int | None,
     trust: bool,
-    filmed: bool,
+    with_film: bool,
     on_part: Callable[[str], None],
-) -> Shown:
-    """A run with an episode, as far as there is one."""
+) -> RunEpisode:
+    """Return a run with an episode, if it can be run."""
     best = which == "best" or not finished(summary.path)
     evaluation = read_evaluation(summary.path, best)
-    seed = given if given is not None else typical_seed(evaluation) or 0
+    seed = seed_given if seed_given is not None else typical_seed(evaluation) or 0
     try:
         config = load_config(summary.path, trust)
     except (ValueError, OSError, ImportError) as error:
-        return Shown(name, None, None, None, str(error), seed, summary=summary)
+        return RunEpisode(name, None, None, None, str(error), seed, summary=summary)
     env = config.evaluation_env
     policy = summary.path / BEST if best else summary.path
     if not (policy / "policy.json").is_file():
-        yet = "best policy" if finished(summary.path) else "policy yet"
-        return Shown(
+        missing = "best policy" if finished(summary.path) else "policy yet"
+        return RunEpisode(
             name,
             env,
             None,
             None,
-            f"the run has no {yet}: none was evaluated so far",
+            f"the run has no {missing}: none was evaluated so far",
             seed,
             summary=summary,
         )
     try:
         on_part(f"{name}: episode")
-        shown = show(name, env, load_policy(policy, trust), seed, filmed)
-        return shown._replace(
-            best=best, summary=summary, rank=rank(evaluation, shown.episode.total)
+        result = run_and_film(name, env, load_policy(policy, trust), seed, with_film)
+        return result._replace(
+            best=best, summary=summary, rank=rank(evaluation, result.episode.total)
         )
-    except Exception as error:  # environments and actuators of others raise what they like
-        return Shown(
+    # Third-party environments and actuators may raise any error. The report names it and shows the
+    # rest.
+    except Exception as error:
+        return RunEpisode(
             name, env, None, None, f"{type(error).__name__}: {error}", seed, summary=summary
         )
 
 
-def _top(runs: Sequence[Shown], shown: Sequence[Shown]) -> Markup:
-    """What it is, in sentences and a picture."""
-    told: list[Markup] = []
+def _top(runs: Sequence[RunEpisode], runs_with_episode: Sequence[RunEpisode]) -> Markup:
+    """Return an introduction: sentences about each run, and a picture."""
+    paragraphs: list[Markup] = []
     for run in runs:
         text = (
             Markup("<b>{}</b>: {}").format(run.name, _sentence(run.summary))
             if len(runs) > 1
             else _sentence(run.summary)
         )
-        told.append(page.paragraph(text, "lead"))
+        paragraphs.append(page.paragraph(text, "lead"))
         if run.summary.state == "unfinished":
-            told.append(page.note("The training is not finished. Here is what there is so far."))
+            paragraphs.append(
+                page.note("The training is not finished. This report shows its results so far.")
+            )
         if run.summary.state == "damaged":
-            told.append(page.note(f"The run folder is damaged: {run.summary.problem}", bad=True))
-    told += [
-        page.paragraph(_about(task), "soft")
+            paragraphs.append(
+                page.note(f"The run folder is damaged: {run.summary.problem}", bad=True)
+            )
+    paragraphs += [
+        page.paragraph(_task_summary(task), "soft")
         for task in dict.fromkeys(run.summary.task for run in runs)
         if task
     ]
-    for one in shown:
-        if one.film is not None:
-            picture = page.part("image", one.film.still, f"{one.env.task}: the scene of an episode")
-            return Markup('<div class="intro"><div>{}</div>{}</div>').format(
-                page.joined(told), picture
+    for run_episode in runs_with_episode:
+        if run_episode.film is not None:
+            picture = page.render_part(
+                "image", run_episode.film.still, f"{run_episode.env.task}: the scene of an episode"
             )
-    return page.joined(told)
+            return Markup('<div class="intro"><div>{}</div>{}</div>').format(
+                page.join(paragraphs), picture
+            )
+    return page.join(paragraphs)
 
 
 def _sentence(run: RunSummary) -> str:
-    """What a run is and came to."""
+    """Return a sentence about the training of a run and its results."""
     agent = run.agent.upper() if run.agent else "An agent"
     steps = f", trained for {run.steps:,} environment steps" if run.steps else ", not trained yet"
     if run.steps and run.total_steps and run.state == "unfinished":
         steps += f" of {run.total_steps:,}"
-    named = {
+    actuator_texts = {
         "ideal": "the ideal actuator",
-        "custom": "an actuator of its own",
+        "custom": "a custom actuator",
         "drive": "a motor behind a drive",
     }
-    actuator = named.get(
+    actuator = actuator_texts.get(
         run.actuator or "", f"the actuator{'s' * (', ' in (run.actuator or ''))} {run.actuator}"
     )
     text = f"{agent} on {run.task or 'an unknown task'} through {actuator}{steps}, seed {run.seed}."
     if run.evaluation is not None and run.evaluation_return is not None:
-        returns, episodes = page.number(run.evaluation["returns"]), run.evaluation.get("episodes")
+        returns, episodes = (
+            page.format_number(run.evaluation["returns"]),
+            run.evaluation.get("episodes"),
+        )
         text += f" Its policy returns {returns} over {episodes} episodes"
         if isinstance(success := run.evaluation.get("success"), Mapping):
             text += f" and succeeds in {100 * success['mean']:.3g} % of them"
@@ -206,65 +222,72 @@ def _sentence(run: RunSummary) -> str:
     return text
 
 
-def _about(task: str) -> str:
-    """The first line of what a task says of itself."""
+def _task_summary(task: str) -> str:
+    """Return the first line of a task's documentation."""
     import importlib
 
     try:
         text = importlib.import_module(f"codrl_mj.tasks.{task}").__doc__ or ""
-    except ImportError:  # somebody else's
+    # Only our tasks are modules of the package; other environments have just a name.
+    except ImportError:
         return f"The environment {task}."
     return text.strip().partition("\n")[0]
 
 
-def _learning(runs: Sequence[Shown]) -> Markup:
-    """Curves from the runs' tables; beside others a run has one colour and no dots."""
+def _learning(runs: Sequence[RunEpisode]) -> Markup:
+    """Return learning curves from the runs' tables.
+
+    Beside other runs, each run has one color and no dots.
+    """
     notes: list[Markup] = []
     returns: list[Curve] = []
     evaluations: list[Curve] = []
     errors: list[Curve] = []
-    for place, run in enumerate(runs):
+    for index, run in enumerate(runs):
         reports = read_reports(run.summary.path / PROGRESS, [])
         columns = [
             [row.get(name, "nan") for row in reports]
             for name in ("steps", "evaluation_return", "torque_error")
         ]
         try:
-            steps, evaluated, off = np.array(columns, dtype=np.float64)
-        except ValueError:  # a cell is no number
-            steps, evaluated, off = np.empty((3, 0))
+            steps, evaluated, torque_errors = np.array(columns, dtype=np.float64)
+        # A damaged table has a cell that is no number.
+        except ValueError:
+            steps, evaluated, torque_errors = np.empty((3, 0))
         try:
             episodes = read_episodes(run.summary.path / EPISODES)
         except (ValueError, OSError) as error:
             episodes = np.empty((0, 4))
             notes.append(page.note(f"No curve of {run.name}'s training episodes: {error}"))
-        known = np.isfinite(off)
-        off_torque = (
-            [Curve("torque error", steps[known], off[known], colour=4)] if known.any() else []
+        is_known = np.isfinite(torque_errors)
+        error_curves = (
+            [Curve("torque error", steps[is_known], torque_errors[is_known], colour=4)]
+            if is_known.any()
+            else []
         )
-        for curve in (*learning_curves(episodes, steps, evaluated), *off_torque):
-            into = {"evaluations": evaluations, "torque error": errors}.get(curve.label, returns)
+        for curve in (*learning_curves(episodes, steps, evaluated), *error_curves):
+            target = {"evaluations": evaluations, "torque error": errors}.get(curve.label, returns)
             if len(runs) == 1:
-                into.append(curve)
+                target.append(curve)
             elif curve.style != "dots":
-                label, dashed = f"{run.name}: {curve.label}", into is not returns
-                into.append(dataclasses.replace(curve, label=label, colour=place, dashed=dashed))
-    found = []
+                label, dashed = f"{run.name}: {curve.label}", target is not returns
+                target.append(dataclasses.replace(curve, label=label, colour=index, dashed=dashed))
+    plots = []
     if returns or evaluations:
-        found.append(
+        plots.append(
             Plot("Return while learning", "environment steps", "return", (*returns, *evaluations))
         )
     if any(np.any(curve.y) for curve in errors):
-        title = "Torque asked for less torque delivered at the ends of environment steps, rms"
-        found.append(Plot(title, "environment steps", "torque error [N·m]", tuple(errors)))
-    if not found and not notes:
+        title = "Desired minus delivered torque at the ends of environment steps, rms"
+        plots.append(Plot(title, "environment steps", "torque error [N·m]", tuple(errors)))
+    if not plots and not notes:
         notes.append(page.note("No learning curve yet: no training episode has ended."))
-    return page.joined((*notes, page.plots(found)))
+    return page.join((*notes, page.plots(plots)))
 
 
-def _evaluation(runs: Sequence[Shown]) -> Markup:
-    """Measures with their intervals."""
-    known = [run for run in runs if run.summary.evaluation is not None]
+def _evaluation(runs: Sequence[RunEpisode]) -> Markup:
+    """Return the measures of the evaluations, with their intervals."""
+    evaluated = [run for run in runs if run.summary.evaluation is not None]
     notes = [
         page.note(
             f"{run.name} has no evaluation: its last policy is evaluated when the training ends."
@@ -272,50 +295,51 @@ def _evaluation(runs: Sequence[Shown]) -> Markup:
         for run in runs
         if run.summary.evaluation is None
     ]
-    if not known:
-        return page.joined(notes)
-    every = [dict(run.summary.evaluation or {}) for run in known]
-    count = " and ".join(dict.fromkeys(str(one.get("episodes")) for one in every))
-    names = [run.name if len(known) > 1 else "value" for run in known]
+    if not evaluated:
+        return page.join(notes)
+    evaluations = [dict(run.summary.evaluation or {}) for run in evaluated]
+    episode_counts = " and ".join(
+        dict.fromkeys(str(evaluation.get("episodes")) for evaluation in evaluations)
+    )
+    names = [run.name if len(evaluated) > 1 else "value" for run in evaluated]
     table = _measures(
-        f"Last policy, {count} episodes; 95 % intervals in brackets",
-        dict(zip(names, every, strict=True)),
+        f"Last policy, {episode_counts} episodes; 95 % intervals in brackets",
+        dict(zip(names, evaluations, strict=True)),
     )
     curves = []
-    for place, (run, one) in enumerate(zip(known, every, strict=True)):
-        returns = np.sort(np.array(one.get("episode_returns") or [], dtype=float))
+    for index, (run, evaluation) in enumerate(zip(evaluated, evaluations, strict=True)):
+        returns = np.sort(np.array(evaluation.get("episode_returns") or [], dtype=float))
         if len(returns) > 1:
             share = 100.0 * (np.arange(len(returns)) + 0.5) / len(returns)
             curves.append(
                 Curve(
-                    run.name if len(known) > 1 else "episodes",
+                    run.name if len(evaluated) > 1 else "episodes",
                     share,
                     returns,
-                    colour=place,
+                    colour=index,
                     style="dots",
                 )
             )
     title = "Returns of the evaluation's episodes, in order"
-    beside = page.plots(
+    plots = page.plots(
         [Plot(title, "share of episodes below [%]", "return", tuple(curves))] if curves else []
     )
-    layout = (
-        '<div class="beside">{}{}</div>' if len(known) == 1 else "{}{}"
-    )  # a table of several needs the width
-    of_motors = [
-        (f"{run.name}: motor by motor", one.get("motors"))
-        for run, one in zip(known, every, strict=True)
+    # A table of several runs needs the whole width.
+    template = '<div class="beside">{}{}</div>' if len(evaluated) == 1 else "{}{}"
+    motor_tables = [
+        (f"{run.name}: motor by motor", evaluation.get("motors"))
+        for run, evaluation in zip(evaluated, evaluations, strict=True)
     ]
     folded = [
-        page.folded(about, _measures(about, motors))
-        for about, motors in of_motors
+        page.details(caption, _measures(caption, motors))
+        for caption, motors in motor_tables
         if isinstance(motors, Mapping) and motors
     ]
-    return page.joined((*notes, Markup(layout).format(table, beside), *folded))
+    return page.join((*notes, Markup(template).format(table, plots), *folded))
 
 
 def _measures(caption: str, columns: Mapping[str, Mapping[str, Any]]) -> Markup:
-    """A row for each measure that one of the columns has."""
+    """Return a table with a row for each measure that at least one column has."""
     rows = []
     for name, field in MEASURES.items():
         values = [column.get(name) for column in columns.values()]
@@ -323,8 +347,8 @@ def _measures(caption: str, columns: Mapping[str, Mapping[str, Any]]) -> Markup:
             rows.append(
                 (
                     field.metadata["label"],
-                    *map(page.number, values),
-                    page.unit(field.metadata["unit"]),
+                    *map(page.format_number, values),
+                    page.format_unit(field.metadata["unit"]),
                 )
             )
     return page.table(
@@ -332,27 +356,27 @@ def _measures(caption: str, columns: Mapping[str, Mapping[str, Any]]) -> Markup:
     )
 
 
-def replays(shown: Sequence[Shown]) -> list[Markup]:
-    """The episodes in three dimensions, to be turned and zoomed: what `joined` of a report may return."""
-    from codrl_mj.viz.replay import SCRIPT, library, motion_of_episode, replay
+def replay_parts(runs: Sequence[RunEpisode]) -> list[Markup]:
+    """Return the episodes as interactive 3D replays, for `extra_parts` of a report."""
+    from codrl_mj.viz.replay import SCRIPT, library_script, motion_of_episode, replay_html
 
-    parts = [Markup("<script>{}</script>").format(Markup(library()))]
-    for one in shown:
-        fragment = replay(motion_of_episode(one.episode, one.env), one.name)
+    parts = [Markup("<script>{}</script>").format(Markup(library_script()))]
+    for run in runs:
+        fragment = replay_html(motion_of_episode(run.episode, run.env), run.name)
         parts.append(
             Markup("<figure>{}</figure>").format(
-                page.clocked(f"Replay: {one.name}", fragment, SCRIPT)
+                page.clocked_part(f"Replay: {run.name}", fragment, SCRIPT)
             )
         )
     return parts
 
 
-def _loop(runs: Sequence[Shown]) -> Markup:
-    """Current loops, and steps of actuators without one; each different one once."""
+def _loop(runs: Sequence[RunEpisode]) -> Markup:
+    """Return the different current loops, and torque steps of actuators without one."""
     loops: dict[str, tuple[Looped, float | None]] = {}
-    others: dict[str, tuple[ActuatorModel, float, float]] = {}
-    without: dict[str, None] = {}
-    seen: list[Any] = []
+    steps: dict[str, tuple[ActuatorModel, float, float]] = {}
+    notes: dict[str, None] = {}
+    known_loops: list[Any] = []
     for run in runs:
         driven = run.env.actuators_by_name if run.env is not None else {}
         for motor, actuator in driven.items():
@@ -366,84 +390,92 @@ def _loop(runs: Sequence[Shown]) -> Markup:
             name = "motor" if name == ".*" else name
             timestep = run.episode.timestep if run.episode is not None else None
             if actuator.assumed:
-                without[f"{name}: {actuator.assumed}."] = None
+                notes[f"{name}: {actuator.assumed}."] = None
             if isinstance(actuator, Drive | DCMotorActuator) and is_closed(actuator):
                 loop = actuator, None if isinstance(actuator, Drive) else timestep
-                known = isinstance(actuator, Drive) or timestep is not None
-                same = (actuator.winding, actuator.controller, actuator.voltage_limit, loop[1])
-                if known and same not in seen:
-                    seen.append(same)
+                is_comparable = isinstance(actuator, Drive) or timestep is not None
+                identity = (actuator.winding, actuator.controller, actuator.voltage_limit, loop[1])
+                # Two runs with the same loop get one Bode plot. A loop that is not sampled by a
+                # drive also depends on the mechanical step.
+                if is_comparable and identity not in known_loops:
+                    known_loops.append(identity)
                     loops[name] = loop
                 continue
             if isinstance(actuator, DCMotorActuator):
-                why = (
-                    "no gain on the error of the current, feed-forward alone: there is no loop to"
-                    " be judged."
+                reason = (
+                    "feed-forward only, without a gain on the current's error: there is no loop to"
+                    " analyze."
                 )
             else:
-                about = (
+                description = (
                     (type(actuator).__doc__ or type(actuator).__name__).strip().partition("\n")[0]
                 )
-                why = f"{about} There is no current loop in it."
-            without[f"{name}: {why}"] = None
+                reason = f"{description} It has no current loop."
+            notes[f"{name}: {reason}"] = None
             if timestep is None or isinstance(actuator, Ideal):
                 continue
-            if all((actuator, timestep) != (one, step) for one, _, step in others.values()):
-                others[name] = actuator, _asked(actuator, run.episode), timestep
-    parts = [page.paragraph(text, "soft") for text in without]
-    if len(loops) > _MOST_LOOPS:
-        left = ", ".join(list(loops)[_MOST_LOOPS:])
+            if all(
+                (actuator, timestep) != (known_actuator, step)
+                for known_actuator, _, step in steps.values()
+            ):
+                steps[name] = actuator, _step_torque(actuator, run.episode), timestep
+    parts = [page.paragraph(text, "soft") for text in notes]
+    if len(loops) > _MAX_LOOPS:
+        omitted = ", ".join(list(loops)[_MAX_LOOPS:])
         parts.append(
             page.note(
-                f"The first {_MOST_LOOPS} of {len(loops)} different loops are shown; not those of"
-                f" {left}"
+                f"Only the first {_MAX_LOOPS} of {len(loops)} different loops are shown, without"
+                f" those of {omitted}"
             )
         )
     if loops:
-        parts.append(loop_section(dict(list(loops.items())[:_MOST_LOOPS])))
-    plot = held_step(others)
-    return page.joined((*parts, page.plots([plot] if plot is not None else [])))
+        parts.append(loop_section(dict(list(loops.items())[:_MAX_LOOPS])))
+    plot = torque_step_plot(steps)
+    return page.join((*parts, page.plots([plot] if plot is not None else [])))
 
 
-def _asked(actuator: ActuatorModel, episode: Episode) -> float:
-    """Half of the largest torque that was asked of an actuator in an episode [N*m]; of all, where it was drawn anew."""
+def _step_torque(actuator: ActuatorModel, episode: Episode) -> float:
+    """Return half of the largest desired torque of an actuator in an episode [N*m].
+
+    If the actuator was randomized, that is the largest over all motors.
+    """
     forces = np.atleast_2d(np.abs(np.asarray(episode.signals["desired_force"], dtype=float)).T)
-    driven = episode.actuator if isinstance(episode.actuator, tuple) else (episode.actuator,)
-    own = [one == actuator for one in driven]
-    return 0.5 * actuator.arm_radius * float(forces[own if any(own) else slice(None)].max())
+    actuators = episode.actuator if isinstance(episode.actuator, tuple) else (episode.actuator,)
+    is_own = [candidate == actuator for candidate in actuators]
+    return 0.5 * actuator.arm_radius * float(forces[is_own if any(is_own) else slice(None)].max())
 
 
-def _certificate(runs: Sequence[Path], given: Path | None) -> Markup:
-    """What the certificate says, if there is one."""
-    known = [place for path in runs if (place := path / certificates.JSON_NAME).is_file()]
-    if given is not None:
-        known = [given / certificates.JSON_NAME if given.is_dir() else given]
-    for place in known[:1]:
+def _certificate(runs: Sequence[Path], path_given: Path | None) -> Markup:
+    """Return a summary of the certificate, if there is one."""
+    paths = [file for path in runs if (file := path / certificates.JSON_NAME).is_file()]
+    if path_given is not None:
+        paths = [path_given / certificates.JSON_NAME if path_given.is_dir() else path_given]
+    for file in paths[:1]:
         try:
-            return certificates.summary(read_json(place, "certificate"))
+            return certificates.summary(read_json(file, "certificate"))
         except (KeyError, TypeError, ValueError) as error:
-            problem = f"{place} is no certificate: {type(error).__name__}: {error}"
-            if given is not None:
+            problem = f"{file} is no certificate: {type(error).__name__}: {error}"
+            if path_given is not None:
                 raise ValueError(problem) from None
             return page.note(problem, bad=True)
     return Markup()
 
 
-def _settings(runs: Sequence[Shown]) -> Markup:
-    """What differs between the runs, and all that they were made with."""
+def _settings(runs: Sequence[RunEpisode]) -> Markup:
+    """Return the settings that differ between the runs, and all settings of each run."""
     parts = []
     if len(runs) > 1:
         differing = compare([run.summary for run in runs]).configuration
-        rows = [(name, *map(_setting, values)) for name, values in differing.items()]
+        rows = [(name, *map(_setting_text, values)) for name, values in differing.items()]
         columns = ("setting", *(run.name for run in runs))
         parts.append(page.table("What differs between the runs", columns, rows, cards=True))
     for run in runs:
-        rows = [(name, _setting(value)) for name, value in run.summary.configuration.items()]
+        rows = [(name, _setting_text(value)) for name, value in run.summary.configuration.items()]
         label = f"All settings of {run.name}"
         if rows:
-            parts.append(page.folded(label, page.table(label, ("setting", "value"), rows)))
-    return page.joined(parts)
+            parts.append(page.details(label, page.table(label, ("setting", "value"), rows)))
+    return page.join(parts)
 
 
-def _setting(value: Any) -> str:
+def _setting_text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)

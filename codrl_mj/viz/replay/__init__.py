@@ -1,13 +1,21 @@
-"""Replays of episodes in three dimensions: one HTML file, to be turned, scrubbed and played at any speed."""
+"""Interactive 3D replays of episodes: one HTML file, to be turned, scrubbed and played."""
 
 from codrl_mj.viz.replay.page import (
     SCRIPT,
     Motion,
-    library,
+    library_script,
     motion,
     motion_of_episode,
-    replay,
+    replay_html,
     write_replay,
 )
 
-__all__ = ["SCRIPT", "Motion", "library", "motion", "motion_of_episode", "replay", "write_replay"]
+__all__ = [
+    "SCRIPT",
+    "Motion",
+    "library_script",
+    "motion",
+    "motion_of_episode",
+    "replay_html",
+    "write_replay",
+]

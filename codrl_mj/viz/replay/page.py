@@ -1,4 +1,4 @@
-"""A motion of a model's bodies, and its replay: a part of a page or a page of its own, which asks no server."""
+"""Motion of a model's bodies, and its replay as a part of a page or a self-contained page."""
 
 import base64
 import dataclasses
@@ -16,11 +16,11 @@ from codrl_mj.runs.files import check_page, writing
 from codrl_mj.viz.replay.scene import (
     TRIANGLES,
     Shape,
-    first_view,
-    mesh,
+    initial_view,
+    read_mesh,
     read_poses,
-    shapes,
-    thinned,
+    simplify_mesh,
+    visible_shapes,
 )
 
 _HERE = Path(__file__).parent
@@ -28,33 +28,36 @@ _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
     " blob:; connect-src blob:"
 )
-"""What the browser itself holds the page to: nothing is fetched."""
+"""Content security policy, by which the browser itself forbids the page to fetch anything."""
 SCRIPT = "const setTime = codrlReplay(element);"
-"""JavaScript that defines `setTime(seconds)`, which shows that instant; it needs `library` before
-it in the page, and sees `element`, which a replay stands in. It follows a clock, and moves none.
+"""JavaScript that defines `setTime(seconds)`, which shows that instant. The page must contain
+`library_script` before it, and define `element`, the parent of the replay. The script follows a
+clock but never moves it.
 """
-_MOST_PER_SECOND = 30
-"""Instants; between them a viewer goes straight, and turns evenly."""
+_MAX_RATE = 30
+"""Maximum number of stored instants per second. The viewer interpolates between them."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """What a replay shows."""
+    """Content of a replay."""
 
     model: mujoco.MjModel
     """The model."""
     shapes: list[Shape]
-    """What is seen of it."""
+    """Visible shapes of the model."""
     time: np.ndarray
     """Instants [s], shape (T,)."""
     bodies: np.ndarray
-    """Those that move and are seen, shape (n,)."""
+    """Indices of the visible bodies that move, shape (n,)."""
     poses: np.ndarray
-    """Of these: position [m] and orientation (quaternion w, x, y, z), shape (T, n, 7), float32."""
-    still: np.ndarray
-    """Of all bodies: the same at the first instant, shape (bodies, 7)."""
+    """Poses of these bodies: position [m] and orientation (quaternion w, x, y, z), shape (T, n, 7),
+    float32.
+    """
+    initial_poses: np.ndarray
+    """Poses of all bodies at the first instant, shape (bodies, 7)."""
     camera: str | None = None
-    """Of the model, from which it is first seen; None: MuJoCo's free camera."""
+    """Camera of the initial view; None: MuJoCo's free camera."""
 
 
 def motion(
@@ -64,24 +67,25 @@ def motion(
     camera: str | None = None,
     show: Callable[[np.ndarray], mujoco.MjData] | None = None,
 ) -> Motion:
-    """The motion of any model.
+    """Return the motion of any model.
 
     Args:
         model: the model.
-        states: one for each instant; what `show` takes, or else rows that begin with `qpos`.
-        time: instants [s], ascending, shape (T,); the motion begins at the first.
-        camera: of the model, from which it is first seen.
-        show: brings a simulation of the model into a state.
+        states: one state for each instant, as `show` takes it; by default rows that start with
+            `qpos`.
+        time: instants [s], increasing, shape (T,). The motion starts at the first one.
+        camera: camera of the initial view.
+        show: function that sets a simulation of the model to a state.
 
     Raises:
-        ValueError: `states` and `time` do not fit each other or the model, `time` does not ascend,
-            or the model has no such camera.
+        ValueError: `states` and `time` do not match each other or the model, `time` does not
+            increase, or the model has no such camera.
     """
     time = np.asarray(time, dtype=float)
     if len(states) != len(time) or not len(time):
         raise ValueError(
             f"states: there are {len(states)} for {len(time)} instants: must be one for each, and"
-            " some"
+            " at least one"
         )
     if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
         raise ValueError("time: must be finite, and ascend from each instant to the next")
@@ -95,34 +99,37 @@ def motion(
         raise ValueError(f"states: {have}: must begin with the model's {model.nq} of qpos")
     data = mujoco.MjData(model)
 
-    def by_positions(state: np.ndarray) -> mujoco.MjData:
+    def show_positions(state: np.ndarray) -> mujoco.MjData:
         data.qpos[:] = state[: model.nq]
         mujoco.mj_kinematics(model, data)
         return data
 
-    seen, show, time = shapes(model), show or by_positions, time - time[0]
+    # Times start at zero, as the page's clock does.
+    shapes, show, time = visible_shapes(model), show or show_positions, time - time[0]
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    stride = max(1, int(1.0 / (_MOST_PER_SECOND * step) + 1e-9))
-    chosen = np.unique(
-        [*range(0, len(time), stride), len(time) - 1]
-    )  # the last, and as many others as are needed
-    poses = np.empty((len(chosen), model.nbody, 7))
-    for row, index in zip(poses, chosen, strict=True):
-        read_poses(show(states[index]), seen, row)
+    stride = max(1, int(1.0 / (_MAX_RATE * step) + 1e-9))
+    # The last instant, and as many others as the maximum rate requires.
+    indices = np.unique([*range(0, len(time), stride), len(time) - 1])
+    poses = np.empty((len(indices), model.nbody, 7))
+    for row, index in zip(poses, indices, strict=True):
+        read_poses(show(states[index]), shapes, row)
     spread = np.ptp(poses, axis=0).max(axis=1)
     bodies = np.array(
-        [body for body in sorted({one.body for one in seen}) if spread[body] > 1e-9], dtype=int
+        [body for body in sorted({shape.body for shape in shapes}) if spread[body] > 1e-9],
+        dtype=int,
     )
-    moved = poses[:, bodies]
-    for before, after in zip(moved[:-1, :, 3:], moved[1:, :, 3:], strict=True):
-        after[
-            (before * after).sum(axis=1) < 0
-        ] *= -1  # a quaternion and its negative are one turn: no jumps
-    return Motion(model, seen, time[chosen], bodies, moved.astype(np.float32), poses[0], camera)
+    body_poses = poses[:, bodies]
+    for previous, following in zip(body_poses[:-1, :, 3:], body_poses[1:, :, 3:], strict=True):
+        # A quaternion and its negative are the same rotation. Equal signs avoid jumps in the
+        # viewer's interpolation.
+        following[(previous * following).sum(axis=1) < 0] *= -1
+    return Motion(
+        model, shapes, time[indices], bodies, body_poses.astype(np.float32), poses[0], camera
+    )
 
 
 def motion_of_episode(episode: Episode, env: Any) -> Motion:
-    """The motion of an episode that `codrl_mj.evaluation.run_episodes` recorded.
+    """Return the motion of an episode that `codrl_mj.evaluation.run_episodes` recorded.
 
     Args:
         episode: the episode.
@@ -132,16 +139,21 @@ def motion_of_episode(episode: Episode, env: Any) -> Motion:
     return motion(model, episode.state, np.concatenate([[0.0], episode.time]), camera, show)
 
 
-def replay(what: Motion, label: str) -> str:
-    """HTML of a replay, where it is seen and its data, with a label for those who do not see it; `SCRIPT` runs it."""
-    data = json.dumps(_content(what)).replace("<", "\\u003c")
+def replay_html(content: Motion, label: str) -> str:
+    """Return a replay as HTML with its data; `SCRIPT` runs it.
+
+    Args:
+        content: motion to show.
+        label: description for readers who do not see it.
+    """
+    data = json.dumps(_content(content)).replace("<", "\\u003c")
     return (
-        f"<style>{_text('replay.css')}</style>\n"
+        f"<style>{_read_text('replay.css')}</style>\n"
         f'<div class="replay"><canvas tabindex="0" role="img" aria-label="{html.escape(label)}:'
         " three-dimensional, "
-        "drag to turn, wheel to zoom, right button to move; keys R: view from the beginning, F:"
+        "drag to turn, wheel to zoom, right button to move; keys R: initial view, F:"
         ' follow"></canvas>\n'
-        f'<p class="replay-none" hidden>This browser shows no WebGL, which a replay needs.</p>\n'
+        f'<p class="replay-none" hidden>This browser has no WebGL, which a replay needs.</p>\n'
         '<div class="replay-view"><button type="button" data-do="reset" title="R">view</button>'
         '<button type="button" data-do="follow" title="F"'
         ' aria-pressed="false">follow</button></div>\n'
@@ -149,104 +161,117 @@ def replay(what: Motion, label: str) -> str:
     )
 
 
-def library() -> str:
-    """JavaScript that all replays of a page share."""
-    return f"/* three.js\n{_text('three/LICENSE').strip()}\n*/\n{_text('three/three.min.js')}\n{_text('replay.js')}"
+def library_script() -> str:
+    """Return the JavaScript that all replays of a page share."""
+    return (
+        f"/* three.js\n{_read_text('three/LICENSE').strip()}\n*/\n"
+        f"{_read_text('three/three.min.js')}\n{_read_text('replay.js')}"
+    )
 
 
-def write_replay(what: Motion, path: Path, title: str) -> Path:
-    """Write a page that holds a replay, with play, time and speed.
+def write_replay(content: Motion, path: Path, title: str) -> Path:
+    """Write a page with a replay and controls for play, time and speed.
 
     Args:
-        what: the motion.
+        content: motion to show.
         path: the file.
-        title: its heading; text, not markup.
+        title: heading; text, not markup.
 
     Raises:
-        ValueError: the suffix is none of a page.
+        ValueError: the suffix is not that of a page.
     """
     check_page(path)
     entries = {
         "TITLE": html.escape(title),
         "POLICY": _POLICY,
-        "FRAGMENT": replay(what, title),
-        "LIBRARY": library(),
+        "FRAGMENT": replay_html(content, title),
+        "LIBRARY": library_script(),
         "SCRIPT": SCRIPT,
-        "END": f"{what.time[-1]:.6g}",
+        "END": f"{content.time[-1]:.6g}",
     }
-    text = _text("page.html")
-    before, *rest = text.split("{{")
-    filled = before + "".join(
-        entries[name] + after for name, after in (one.split("}}", 1) for one in rest)
+    text = _read_text("page.html")
+    # Only fields of the template itself are filled: a title that contains {{SCRIPT}} stays as it
+    # is.
+    filled_start, *pieces = text.split("{{")
+    filled = filled_start + "".join(
+        entries[name] + after for name, after in (piece.split("}}", 1) for piece in pieces)
     )
     with writing(path) as temporary:
         temporary.write_text(filled, encoding="utf-8")
     return path
 
 
-def _text(name: str) -> str:
+def _read_text(name: str) -> str:
     return (_HERE / name).read_text(encoding="utf-8")
 
 
-def _content(what: Motion) -> dict[str, Any]:
-    """What the viewer reads; numbers of which there are many as base64."""
-    places = {int(body): place for place, body in enumerate(what.bodies)}
-    used = list(dict.fromkeys(one.mesh for one in what.shapes if one.mesh is not None))
-    view = first_view(what.model, what.shapes, what.still, set(what.bodies.tolist()), what.camera)
+def _content(motion: Motion) -> dict[str, Any]:
+    """Return the data that the viewer reads; large arrays are base64."""
+    body_index = {int(body): index for index, body in enumerate(motion.bodies)}
+    meshes = list(dict.fromkeys(shape.mesh for shape in motion.shapes if shape.mesh is not None))
+    view = initial_view(
+        motion.model,
+        motion.shapes,
+        motion.initial_poses,
+        set(motion.bodies.tolist()),
+        motion.camera,
+    )
     return {
         "extent": view.extent,
-        "camera": {"eye": _rounded(view.eye), "at": _rounded(view.at), "fovy": view.fovy},
-        "time": _packed(what.time.astype(np.float32)),
-        "bodies": [what.model.body(int(body)).name for body in what.bodies],
-        "poses": _packed(what.poses),
-        "meshes": _meshes(what.model, used),
+        "camera": {"eye": _rounded(view.eye), "at": _rounded(view.target), "fovy": view.fovy},
+        "time": _to_base64(motion.time.astype(np.float32)),
+        "bodies": [motion.model.body(int(body)).name for body in motion.bodies],
+        "poses": _to_base64(motion.poses),
+        "meshes": _meshes(motion.model, meshes),
         "shapes": [
             {
-                "kind": one.kind,
-                "size": _rounded(one.size),
-                "colour": _rounded(one.colour),
-                "at": _rounded([*one.position, *one.orientation]),
-                "chequered": one.chequered,
-                **({"mesh": used.index(one.mesh)} if one.mesh is not None else {}),
+                "kind": shape.kind,
+                "size": _rounded(shape.size),
+                "colour": _rounded(shape.colour),
+                "at": _rounded([*shape.position, *shape.orientation]),
+                "chequered": shape.chequered,
+                **({"mesh": meshes.index(shape.mesh)} if shape.mesh is not None else {}),
                 **(
-                    {"body": places[one.body]}
-                    if one.body in places
-                    else {"frame": _rounded(what.still[one.body])}
+                    {"body": body_index[shape.body]}
+                    if shape.body in body_index
+                    else {"frame": _rounded(motion.initial_poses[shape.body])}
                 ),
             }
-            for one in what.shapes
+            for shape in motion.shapes
         ],
     }
 
 
-def _meshes(model: mujoco.MjModel, used: list[tuple[str, int]]) -> list[dict[str, Any]]:
-    """Each on a grid of 16 bits over its own extent."""
-    whole = [mesh(model, *one) for one in used]
-    total = sum(len(triangles) for _, triangles in whole)
-    made = []
-    for vertices, triangles in whole:
-        few, corners = thinned(
+def _meshes(model: mujoco.MjModel, mesh_ids: list[tuple[str, int]]) -> list[dict[str, Any]]:
+    """Return the meshes, with vertices on a 16-bit grid over the extent of each."""
+    meshes = [read_mesh(model, *mesh_id) for mesh_id in mesh_ids]
+    total = sum(len(triangles) for _, triangles in meshes)
+    entries = []
+    for vertices, triangles in meshes:
+        simple_vertices, corners = simplify_mesh(
             vertices, triangles, max(32, int(TRIANGLES * len(triangles) / max(total, 1)))
         )
-        low, span = few.min(axis=0), max(float(np.ptp(few, axis=0).max()), 1e-12)
-        grid = np.round((few - low) / span * 65535).astype(np.uint16)
-        index = corners.astype(np.uint16 if len(few) < 65536 else np.uint32)
-        made.append(
+        low, span = (
+            simple_vertices.min(axis=0),
+            max(float(np.ptp(simple_vertices, axis=0).max()), 1e-12),
+        )
+        grid = np.round((simple_vertices - low) / span * 65535).astype(np.uint16)
+        index = corners.astype(np.uint16 if len(simple_vertices) < 65536 else np.uint32)
+        entries.append(
             {
                 "low": _rounded(low),
                 "span": span,
-                "vertices": _packed(grid),
-                "triangles": _packed(index),
+                "vertices": _to_base64(grid),
+                "triangles": _to_base64(index),
                 "wide": index.dtype == np.uint32,
             }
         )
-    return made
+    return entries
 
 
-def _packed(values: np.ndarray) -> str:
-    return base64.b64encode(
-        np.ascontiguousarray(values).tobytes()
-    ).decode()  # little-endian, as browsers are
+def _to_base64(values: np.ndarray) -> str:
+    # The arrays are little-endian, as typed arrays in browsers are.
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
 
 
 def _rounded(values: Any) -> list[float]:

@@ -1,6 +1,6 @@
 "use strict";
-/* Shows a motion in three dimensions: codrlReplay(element) reads the data within the element and returns
-   setTime(seconds). Between recorded instants bodies go straight and turn evenly. */
+/* Shows a motion in 3D: codrlReplay(element) reads the data within the element and returns setTime(seconds).
+   Between recorded instants positions and rotations are interpolated. */
 function codrlReplay(element) {
   const box = element.querySelector(".replay"), canvas = box.querySelector("canvas");
   const data = JSON.parse(box.querySelector("script").textContent);
@@ -34,8 +34,8 @@ function codrlReplay(element) {
     geometry.setIndex(new THREE.BufferAttribute(mesh.wide ? new Uint32Array(corners) : new Uint16Array(corners), 1));
     return THREE.toCreasedNormals(geometry, 0.6);
   });
-  const along = (geometry) => geometry.rotateX(Math.PI / 2); // three.js has its axes along y, MuJoCo along z
-  const wide = (half) => (half > 0 ? 2 * half : 40 * extent); // a plane of size 0 has no end
+  const along = (geometry) => geometry.rotateX(Math.PI / 2); // the axis of a cylinder is y in three.js, z in MuJoCo
+  const wide = (half) => (half > 0 ? 2 * half : 40 * extent); // size 0 means infinite in MuJoCo
   const geometries = {
     plane: ([x, y]) => new THREE.PlaneGeometry(wide(x), wide(y)),
     ellipsoid: (size) => new THREE.SphereGeometry(1, 40, 24).scale(...size),
@@ -81,7 +81,7 @@ function codrlReplay(element) {
   const camera = new THREE.PerspectiveCamera(data.camera.fovy, 1, 0.005 * extent, 100 * extent);
   camera.up.set(0, 0, 1);
   const controls = new THREE.OrbitControls(camera, canvas);
-  const shift = new THREE.Vector3(); // of what is followed, since the beginning
+  const shift = new THREE.Vector3(); // displacement of the followed body since the start
   const towards = new THREE.Vector3(-0.35, -0.7, 1).normalize().multiplyScalar(4 * extent);
   function resetView() {
     camera.position.set(...data.camera.eye).add(shift);
@@ -147,7 +147,7 @@ function codrlReplay(element) {
     renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     renderer.setSize(width, height, false);
     camera.aspect = width / height;
-    // in a narrow frame the sides stay in sight
+    // In a narrow frame a larger angle keeps the sides visible.
     camera.fov = camera.aspect >= 4 / 3 ? data.camera.fovy
       : 2 * Math.atan((Math.tan((data.camera.fovy * Math.PI) / 360) * 4) / 3 / camera.aspect) * (180 / Math.PI);
     camera.updateProjectionMatrix();

@@ -1,4 +1,4 @@
-"""The scene of a model: geoms and sites as shapes, meshes, where its bodies are, and whence it is first seen."""
+"""Scene of a model: geoms and sites as shapes, meshes, poses of bodies, and the initial view."""
 
 import dataclasses
 from collections.abc import Collection
@@ -8,9 +8,11 @@ import mujoco
 import numpy as np
 
 _MUJOCO_ELEVATION, _ELEVATION = -45.0, -20.0
-"""Of a free camera [degrees]: MuJoCo's, of models that say nothing, which looks down on a robot; ours for these."""
+"""Elevation of the free camera [degrees]: MuJoCo's default, which looks down on a robot, and the
+value that replaces it here.
+"""
 _GEOM = mujoco.mjtGeom
-_NAMES = {
+_KIND_OF_GEOM = {
     int(_GEOM.mjGEOM_PLANE): "plane",
     int(_GEOM.mjGEOM_SPHERE): "ellipsoid",
     int(_GEOM.mjGEOM_CAPSULE): "capsule",
@@ -21,10 +23,11 @@ _NAMES = {
     int(_GEOM.mjGEOM_MESH): "mesh",
     int(_GEOM.mjGEOM_SDF): "mesh",
 }
-_SHOWN_GROUPS = 3  # as in MuJoCo's viewers, the first of six
-_UNPAINTED = (0.5, 0.5, 0.5, 1.0)
+# MuJoCo's viewers show the first three of six groups by default.
+_NUM_VISIBLE_GROUPS = 3
+_DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
 TRIANGLES = 60_000
-"""That all meshes of a replay have at most, together."""
+"""Maximum number of triangles of all meshes of a replay together."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,81 +37,88 @@ class Shape:
     kind: str
     """`plane`, `ellipsoid`, `capsule`, `cylinder`, `box` or `mesh`."""
     size: tuple[float, ...]
-    """As MuJoCo has it: half sizes [m]."""
+    """Half sizes as in MuJoCo [m]."""
     colour: tuple[float, ...]
     """Red, green, blue, opacity, each from 0 to 1."""
     body: int
-    """Whose it is."""
+    """Index of its body."""
     position: np.ndarray
-    """In its body's frame [m], shape (3,)."""
+    """Position in the frame of its body [m], shape (3,)."""
     orientation: np.ndarray
-    """In its body's frame: quaternion w, x, y, z."""
+    """Orientation in the frame of its body: quaternion w, x, y, z."""
     geom: int | None = None
-    """Its index, of a geom."""
+    """Index of the geom; None for a site."""
     mesh: tuple[str, int] | None = None
-    """Of a mesh: `mesh` or `hfield`, and its index."""
+    """Kind of a mesh, `mesh` or `hfield`, and its index."""
     chequered: bool = False
-    """Whether the model has a picture on it."""
+    """True if the model has a texture on it."""
 
 
-def shapes(model: mujoco.MjModel) -> list[Shape]:
-    """What MuJoCo's viewers show of a model by default: geoms and sites of groups 0 to 2 that are not transparent."""
-    found = []
+def visible_shapes(model: mujoco.MjModel) -> list[Shape]:
+    """Return the geoms and sites that MuJoCo's viewers show by default.
+
+    These are groups 0 to 2, without transparent ones.
+    """
+    shapes = []
     for kind in ("geom", "site"):
-        column = {
+        columns = {
             name: getattr(model, f"{kind}_{name}")
             for name in ("type", "size", "rgba", "matid", "bodyid", "pos", "quat", "group")
         }
-        for index in range(len(column["type"])):
-            one = {name: values[index] for name, values in column.items()}
-            colour, pictured = _colour(model, one["rgba"], int(one["matid"]))
-            name = _NAMES.get(int(one["type"]))
-            if name is None or colour[3] == 0.0 or one["group"] >= _SHOWN_GROUPS:
+        for index in range(len(columns["type"])):
+            row = {name: values[index] for name, values in columns.items()}
+            colour, has_texture = _shape_color(model, row["rgba"], int(row["matid"]))
+            name = _KIND_OF_GEOM.get(int(row["type"]))
+            if name is None or colour[3] == 0.0 or row["group"] >= _NUM_VISIBLE_GROUPS:
                 continue
             size = (
-                np.repeat(one["size"][:1], 3) if one["type"] == _GEOM.mjGEOM_SPHERE else one["size"]
+                np.repeat(row["size"][:1], 3) if row["type"] == _GEOM.mjGEOM_SPHERE else row["size"]
             )
             mesh = None
             if name == "mesh":
                 mesh = (
-                    "hfield" if one["type"] == _GEOM.mjGEOM_HFIELD else "mesh",
+                    "hfield" if row["type"] == _GEOM.mjGEOM_HFIELD else "mesh",
                     int(model.geom_dataid[index]),
                 )
             geom = index if kind == "geom" else None
-            place = one["pos"].copy(), one["quat"].copy()
-            found.append(
+            pose = row["pos"].copy(), row["quat"].copy()
+            shapes.append(
                 Shape(
                     name,
                     tuple(size.tolist()),
                     colour,
-                    int(one["bodyid"]),
-                    *place,
+                    int(row["bodyid"]),
+                    *pose,
                     geom,
                     mesh,
-                    pictured,
+                    has_texture,
                 )
             )
-    return found
+    return shapes
 
 
-def _colour(model: mujoco.MjModel, rgba: Any, material: int) -> tuple[tuple[float, ...], bool]:
-    """A shape's colour, as MuJoCo chooses it, times the mean of its picture; and whether it has one."""
-    own = np.array(rgba, dtype=float)
+def _shape_color(model: mujoco.MjModel, rgba: Any, material: int) -> tuple[tuple[float, ...], bool]:
+    """Return a shape's color, times the mean color of its texture, and True if it has a texture.
+
+    The color is chosen as in MuJoCo.
+    """
+    color = np.array(rgba, dtype=float)
     if material < 0:
-        return tuple(own.tolist()), False
-    if tuple(own) == _UNPAINTED:
-        own = np.array(model.mat_rgba[material], dtype=float)
-    textures = [int(one) for one in model.mat_texid[material] if one >= 0]
+        return tuple(color.tolist()), False
+    # MuJoCo uses the material's color only if the geom has the default one.
+    if tuple(color) == _DEFAULT_RGBA:
+        color = np.array(model.mat_rgba[material], dtype=float)
+    textures = [int(texture) for texture in model.mat_texid[material] if texture >= 0]
     if textures:
         begin, channels = int(model.tex_adr[textures[0]]), int(model.tex_nchannel[textures[0]])
         count = int(model.tex_width[textures[0]] * model.tex_height[textures[0]])
         pixels = model.tex_data[begin : begin + count * channels].reshape(count, channels)
-        own[:3] *= pixels[:, : min(channels, 3)].mean(axis=0) / 255
-    return tuple(own.tolist()), bool(textures)
+        color[:3] *= pixels[:, : min(channels, 3)].mean(axis=0) / 255
+    return tuple(color.tolist()), bool(textures)
 
 
-def mesh(model: mujoco.MjModel, kind: str, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [m], shape (n, 3), and triangles, shape (m, 3), of a mesh or of a height field."""
+def read_mesh(model: mujoco.MjModel, kind: str, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices [m], shape (n, 3), and triangles, shape (m, 3), of a mesh or height field."""
     if kind == "hfield":
         rows, columns = int(model.hfield_nrow[index]), int(model.hfield_ncol[index])
         begin, (x, y, top, _) = int(model.hfield_adr[index]), model.hfield_size[index]
@@ -129,92 +139,106 @@ def mesh(model: mujoco.MjModel, kind: str, index: int) -> tuple[np.ndarray, np.n
     )
 
 
-def thinned(
-    vertices: np.ndarray, triangles: np.ndarray, most: int
+def simplify_mesh(
+    vertices: np.ndarray, triangles: np.ndarray, max_triangles: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh of at most some number of triangles: vertices that share a cell of a grid become one, in their midst.
+    """Return a mesh with a maximum number of triangles, by merging vertices.
 
-    (Rossignac and Borrel, Multi-resolution 3D approximations for rendering complex scenes, 1993.)
+    All vertices in a cell of a grid are replaced by their mean (Rossignac and Borrel,
+    Multi-resolution 3D approximations for rendering complex scenes, 1993).
     """
     cells = 512
-    while len(triangles) > most and cells > 2:
+    while len(triangles) > max_triangles and cells > 2:
         low, span = vertices.min(axis=0), max(float(np.ptp(vertices, axis=0).max()), 1e-12)
         grid = np.minimum((vertices - low) * (cells / span), cells - 1).astype(np.int64)
-        _, places, counts = np.unique(
+        _, cell_of_vertex, counts = np.unique(
             grid @ [1, cells, cells**2], return_inverse=True, return_counts=True
         )
-        middles = np.stack([np.bincount(places, column) / counts for column in vertices.T], axis=1)
-        merged = places[triangles]
-        whole = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
-        if whole.sum() <= most:
-            return middles, np.unique(merged[whole], axis=0)
+        means = np.stack(
+            [np.bincount(cell_of_vertex, column) / counts for column in vertices.T], axis=1
+        )
+        merged = cell_of_vertex[triangles]
+        # A triangle with two corners in one cell has collapsed to a line.
+        is_triangle = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
+        if is_triangle.sum() <= max_triangles:
+            return means, np.unique(merged[is_triangle], axis=0)
         cells = int(cells / 1.25)
     return vertices, triangles
 
 
-def read_poses(data: mujoco.MjData, seen: list[Shape], poses: np.ndarray) -> None:
-    """Fill `poses` (positions and quaternions, shape (bodies, 7)) with where the bodies that are seen are.
+def read_poses(data: mujoco.MjData, shapes: list[Shape], poses: np.ndarray) -> None:
+    """Write the poses of all bodies into `poses` (positions and quaternions, shape (bodies, 7)).
 
-    The kinematics are up to date. A body is where its first geom is, which may have been moved
-    along a hill.
+    The kinematics must be up to date. The pose of a body is derived from its first geom, because a
+    callback may have moved the geom along a hill.
     """
     poses[:, :3], poses[:, 3:] = data.xpos, data.xquat
-    first = {one.body: one for one in reversed(seen) if one.geom is not None and one.body != 0}
-    for body, one in first.items():
-        turned, back, back_turned = np.empty(4), np.empty(3), np.empty(4)
-        mujoco.mju_mat2Quat(turned, data.geom_xmat[one.geom])
-        mujoco.mju_negPose(back, back_turned, one.position, one.orientation)
+    first_shape = {
+        shape.body: shape
+        for shape in reversed(shapes)
+        if shape.geom is not None and shape.body != 0
+    }
+    for body, shape in first_shape.items():
+        rotation, inverse_position, inverse_rotation = np.empty(4), np.empty(3), np.empty(4)
+        mujoco.mju_mat2Quat(rotation, data.geom_xmat[shape.geom])
+        mujoco.mju_negPose(inverse_position, inverse_rotation, shape.position, shape.orientation)
         mujoco.mju_mulPose(
-            poses[body, :3], poses[body, 3:], data.geom_xpos[one.geom], turned, back, back_turned
+            poses[body, :3],
+            poses[body, 3:],
+            data.geom_xpos[shape.geom],
+            rotation,
+            inverse_position,
+            inverse_rotation,
         )
 
 
 class Viewpoint(NamedTuple):
-    """A camera that looks at something."""
+    """Position, target and field of view of a camera."""
 
     eye: np.ndarray
-    """Where it is [m]."""
-    at: np.ndarray
-    """What it looks at [m]."""
+    """Position [m]."""
+    target: np.ndarray
+    """Target [m]."""
     fovy: float
     """Vertical field of view [degrees]."""
     extent: float
-    """How far what moves reaches from its middle [m]."""
+    """Radius of the moving bodies around their center [m]."""
 
 
-def first_view(
+def initial_view(
     model: mujoco.MjModel,
     shapes: list[Shape],
     poses: np.ndarray,
     moving: Collection[int],
     camera: str | None,
 ) -> Viewpoint:
-    """A named camera of the model; else MuJoCo's free one, near enough to the bodies that move.
+    """Return the view of a named camera, or of MuJoCo's free camera moved near the moving bodies.
 
-    Poses are of all bodies, position and quaternion, shape (bodies, 7).
+    The poses are of all bodies, position and quaternion, shape (bodies, 7).
     """
-    reaches = []
-    for one in shapes:
-        if one.geom is not None and one.body in moving:
+    bounds = []
+    for shape in shapes:
+        if shape.geom is not None and shape.body in moving:
             offset = np.empty(3)
-            mujoco.mju_rotVecQuat(offset, one.position, poses[one.body, 3:])
-            middle, radius = poses[one.body, :3] + offset, model.geom_rbound[one.geom]
-            reaches += [middle - radius, middle + radius]
-    centre, extent = np.array(model.stat.center), float(model.stat.extent)
-    if reaches:  # the middle of what moves, and how far it reaches from there
-        low, high = np.min(reaches, axis=0), np.max(reaches, axis=0)
-        centre, extent = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+            mujoco.mju_rotVecQuat(offset, shape.position, poses[shape.body, 3:])
+            middle, radius = poses[shape.body, :3] + offset, model.geom_rbound[shape.geom]
+            bounds += [middle - radius, middle + radius]
+    center, extent = np.array(model.stat.center), float(model.stat.extent)
+    # Center on the bounding box of the moving bodies; static scenery may be much larger.
+    if bounds:
+        low, high = np.min(bounds, axis=0), np.max(bounds, axis=0)
+        center, extent = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     if camera is not None:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
         index = model.camera(camera).id
         eye, forward = data.cam_xpos[index].copy(), -data.cam_xmat[index].reshape(3, 3)[:, 2]
-        ahead = max(float((centre - eye) @ forward), 0.5 * extent)
+        ahead = max(float((center - eye) @ forward), 0.5 * extent)
         return Viewpoint(eye, eye + ahead * forward, float(model.cam_fovy[index]), extent)
     free = model.vis.global_
-    down = _ELEVATION if free.elevation == _MUJOCO_ELEVATION else free.elevation
-    azimuth, elevation = np.radians([free.azimuth, down])
+    elevation_degrees = _ELEVATION if free.elevation == _MUJOCO_ELEVATION else free.elevation
+    azimuth, elevation = np.radians([free.azimuth, elevation_degrees])
     forward = np.array(
         [
             np.cos(elevation) * np.cos(azimuth),
@@ -222,4 +246,4 @@ def first_view(
             np.sin(elevation),
         ]
     )
-    return Viewpoint(centre - 2.6 * extent * forward, centre, 45.0, extent)
+    return Viewpoint(center - 2.6 * extent * forward, center, 45.0, extent)

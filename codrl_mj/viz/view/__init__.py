@@ -1,1 +1,1 @@
-"""A simulation to be watched and disturbed while it runs: in a browser, or in MuJoCo's own viewer."""
+"""Live view of a running simulation, in a browser or in MuJoCo's own viewer."""

@@ -1,4 +1,4 @@
-"""viser's server, for this machine alone."""
+"""Server of viser that is reachable only from this machine."""
 
 import contextlib
 import functools
@@ -14,76 +14,85 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 HOST = "127.0.0.1"
-_NAMES = (HOST, "localhost")
-"""As which a browser may ask for it: a page of somebody else's, or a name that was made to lead here, may not."""
+_HOST_NAMES = (HOST, "localhost")
+"""Host names of allowed requests. Others come from foreign pages, or from names that point to this
+machine on purpose (DNS rebinding).
+"""
 
 
-_HEAD = b"""
-<script>window.__VISER_EMBED_CONFIG__ = {darkMode: matchMedia("(prefers-color-scheme: dark)").matches};</script>
+_HEAD_HTML = b"""
+<script>window.__VISER_EMBED_CONFIG__ =
+{darkMode: matchMedia("(prefers-color-scheme: dark)").matches};</script>
 <style>@media (max-width: 36em) {
 [style*="max-height: 60%"] { max-height: 38% !important }
-[style*="max-height: 60%"], [style*="max-height: 60%"] [style*="width: 20em"] { width: 100% !important }
+[style*="max-height: 60%"], [style*="max-height: 60%"] [style*="width: 20em"]
+{ width: 100% !important }
 }</style>"""
-"""Dark where the browser prefers it; on a phone the panel, at the bottom, leaves the scene in sight."""
+"""Dark theme if the browser prefers it; on a phone the panel is at the bottom and leaves the scene
+visible.
+"""
 
 
 class LocalServer(viser.ViserServer):
-    """Listens on the loopback interface, answers pages of its own origin, and shares nothing through other hosts."""
+    """Server on the loopback interface that answers only its own pages and shares nothing."""
 
     def __init__(self, port: int) -> None:
-        """Begin to listen at a port or, where it is taken, the next free one."""
+        """Start to listen at a port, or at the next free one if it is taken."""
         if not 0 <= port < 65536:
             raise ValueError(
-                f"port = {port}: must be 0 to 65535; 8080 is the default, 0 any that is free"
+                f"port = {port}: must be 0 to 65535; 8080 is the default, 0 any free port"
             )
+        # viser prints a table of addresses.
         with (
-            _checked_requests(),
+            _check_requests(),
             contextlib.redirect_stdout(io.StringIO()),
-        ):  # viser prints a table of addresses
+        ):
             super().__init__(host=HOST, port=port, verbose=False)
 
     def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
-        """Refused: a client may ask for a tunnel to viser's host."""
+        """Refuse to open a tunnel through viser's host, which a client may request."""
         return None
 
 
 @contextlib.contextmanager
-def _checked_requests() -> Iterator[None]:
-    """Let servers that begin in the block refuse requests of other origins, and give the page our head.
+def _check_requests() -> Iterator[None]:
+    """Make servers that start in the block refuse foreign requests, and add our head to the page.
 
     viser has no setting for either.
     """
-    plain = websockets.asyncio.server.serve
+    original = websockets.asyncio.server.serve
 
-    @functools.wraps(plain)
+    @functools.wraps(original)
     def serve(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
-        def checked(connection: Any, request: Request) -> Response | None:
-            if not allowed(request.headers):
+        def check_request(connection: Any, request: Request) -> Response | None:
+            if not is_allowed(request.headers):
                 return Response(
                     http.HTTPStatus.FORBIDDEN, "Forbidden", Headers({"Content-Length": "0"}), b""
                 )
             if request.path.partition("?")[0] != "/":
                 return process_request(connection, request)
-            request.headers.pop("Accept-Encoding", None)  # text is to be put into the page
+            # The page must arrive uncompressed, to insert text into it.
+            request.headers.pop("Accept-Encoding", None)
             response = process_request(connection, request)
-            if response is not None:  # no upgrade to a web socket
-                response.body = response.body.replace(b"<head>", b"<head>" + _HEAD, 1)
+            # None means an upgrade to a web socket.
+            if response is not None:
+                response.body = response.body.replace(b"<head>", b"<head>" + _HEAD_HTML, 1)
                 del response.headers["Content-Length"]
                 response.headers["Content-Length"] = str(len(response.body))
             return response
 
-        return plain(handler, *arguments, process_request=checked, **options)
+        return original(handler, *arguments, process_request=check_request, **options)
 
     websockets.asyncio.server.serve = serve  # type: ignore[assignment,misc]
     try:
         yield
     finally:
-        websockets.asyncio.server.serve = plain  # type: ignore[misc]
+        websockets.asyncio.server.serve = original  # type: ignore[misc]
 
 
-def allowed(headers: Any) -> bool:
-    """Whether a request comes from this machine's browser for this very server, or from no page at all."""
+def is_allowed(headers: Any) -> bool:
+    """Return True if a request comes from this server's own page, or from no page at all."""
     host, origins = headers.get_all("Host"), headers.get_all("Origin")
-    if len(host) != 1 or urlsplit(f"//{host[0]}").hostname not in _NAMES:
+    if len(host) != 1 or urlsplit(f"//{host[0]}").hostname not in _HOST_NAMES:
         return False
     return origins in ([], [f"http://{host[0]}"])

@@ -1,6 +1,6 @@
-"""A simulation under way: steps, pushes, other policies, and what can be set of actuators and disturbances meanwhile.
+"""Running simulation: steps, pushes, policies, and settings of actuators and disturbances.
 
-There is no server in it; its one window is MuJoCo's own viewer, on a machine with a display.
+It contains no server. Its only window is MuJoCo's own viewer, on a machine with a display.
 """
 
 import dataclasses
@@ -19,47 +19,47 @@ from codrl_mj.actuators import actuator_over
 from codrl_mj.evaluation import RandomPolicy
 from codrl_mj.fields import field_docs, parts
 
-_FOREVER = 10**9  # environment steps
-_DIVERGED = (
+_NO_LIMIT = 10**9  # environment steps
+_DIVERGENCE_WARNINGS = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
     mujoco.mjtWarning.mjWARN_BADQACC,
 )
 HISTORY = 10.0
-"""What of the signals is remembered [s]."""
+"""Duration of the stored signals [s]."""
 PUSH_DURATION = 0.1
-"""How long a push lasts [s]."""
+"""Duration of a push [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Control:
-    """A field that can be set."""
+    """A field that the user can set."""
 
     path: tuple[str, ...]
     """Names from the outermost part to the field."""
     unit: str
-    """Its unit; empty for none."""
+    """Unit; empty if there is none."""
     value: Any
-    """What it is now; None where it is not set."""
+    """Current value; None if the field is not set."""
     low: float | None = None
-    """Of a number: where its slider begins; the bound, or a little above one that is excluded."""
+    """Start of a number's slider: the bound, or a little above an excluded bound."""
     high: float | None = None
-    """Of a number: where its slider ends; None where a scale for it is not known, so that it is typed."""
+    """End of a number's slider; None if no scale is known, so that the number is typed."""
     options: tuple[str, ...] = ()
-    """Of a word: what it may be."""
+    """Choices of a text field."""
     about: str | None = None
-    """What its documentation says."""
+    """Documentation of the field."""
 
     @property
-    def endless(self) -> bool:
-        """Whether the end of the slider stands for infinity."""
+    def is_unlimited(self) -> bool:
+        """True if the end of the slider stands for infinity."""
         return self.value == math.inf
 
-    def parsed(self, shown: Any) -> Any:
-        """The field's value for what a slider shows."""
-        if self.endless and self.high is not None and shown >= self.high:
+    def from_slider(self, slider_value: Any) -> Any:
+        """Return the field's value for a value of the slider."""
+        if self.is_unlimited and self.high is not None and slider_value >= self.high:
             return math.inf
-        return shown
+        return slider_value
 
 
 def controls(
@@ -68,43 +68,58 @@ def controls(
     ends: Mapping[str, float] = MappingProxyType({}),
     path: tuple[str, ...] = (),
 ) -> list[Control]:
-    """Numbers, words and flags in an actuator or disturbances, and in its parts, of which `path` leads to this one.
+    """Return the numbers, texts and flags in an actuator or disturbances, and in their parts.
 
-    The slider of an infinite voltage ends at `scale` [V], without which infinite fields are left
-    out; that of a field that is 0 where `ends` says so by its name.
+    Args:
+        settings: the dataclass.
+        scale: end of the slider of an infinite voltage [V]; without it infinite fields are
+            omitted.
+        ends: field name -> end of its slider, for fields that are 0.
+        path: names of the parts that lead to `settings`.
     """
     kind: Any = type(settings)
-    found, nested, docs = [], parts(kind), field_docs(kind)
+    result, nested, docs = [], parts(kind), field_docs(kind)
     for field in dataclasses.fields(settings):
-        value, own, about = getattr(settings, field.name), (*path, field.name), docs.get(field.name)
+        value, field_path, documentation = (
+            getattr(settings, field.name),
+            (*path, field.name),
+            docs.get(field.name),
+        )
         if field.name in nested:
-            found += controls(
-                field.metadata.get("absent") if value is None else value, scale, ends, own
+            result += controls(
+                field.metadata.get("absent") if value is None else value, scale, ends, field_path
             )
         elif "options" in field.metadata:
-            found.append(Control(own, "", value, options=field.metadata["options"], about=about))
+            result.append(
+                Control(
+                    field_path, "", value, options=field.metadata["options"], about=documentation
+                )
+            )
         elif isinstance(value, bool):
-            found.append(Control(own, "", value, about=about))
+            result.append(Control(field_path, "", value, about=documentation))
         elif isinstance(value, int | float):
             unit = field.metadata.get("unit", "")
             low, high = field.metadata.get("between", (None, None))
-            low, high = _slider(value, low, high, scale if unit == "V" else None)
-            one = Control(
-                own,
+            low, high = _slider_range(value, low, high, scale if unit == "V" else None)
+            control = Control(
+                field_path,
                 unit,
                 value,
                 low,
                 ends.get(field.name, high) if value == 0 else high,
-                about=about,
+                about=documentation,
             )
-            found += [] if one.endless and one.high is None else [one]
-    return found
+            result += [] if control.is_unlimited and control.high is None else [control]
+    return result
 
 
-def _slider(
+def _slider_range(
     value: float, low: float | None, high: float | None, scale: float | None
 ) -> tuple[float | None, float | None]:
-    """From a twentieth of the value to four times it, within the bounds; of what is 0 the bounds alone."""
+    """Return the range of a slider: a twentieth to four times the value, within the bounds.
+
+    A value of 0 has only its bounds.
+    """
     if math.isinf(value):
         return (scale / 100, scale) if scale else (None, None)
     if value == 0:
@@ -114,11 +129,11 @@ def _slider(
 
 
 class Session:
-    """An environment, what acts in it, and what it did lately.
+    """An environment, the policy that acts in it, and its recent signals.
 
-    Settings that cannot be simulated, unstable ones among them, are not: `problem` says why, and
-    steps wait until they are set otherwise. So they do after a simulation left the finite numbers,
-    until a reset.
+    Invalid settings, unstable ones among them, are not simulated: `problem` has the reason, and
+    steps do nothing until the settings are changed. After a simulation has diverged, steps do
+    nothing until a reset.
     """
 
     def __init__(
@@ -127,68 +142,69 @@ class Session:
         """Build the environment and start an episode.
 
         Args:
-            config: its `EnvConfig`.
-            policies: by name, made when they are chosen; `random`, and `zero` where an action does
-                nothing, are there besides. The first one acts.
-            seed: of the first episode, and of random actions.
+            config: `EnvConfig` of the environment.
+            policies: name -> factory, called when the policy is chosen. `random` is added, and
+                `zero` if an action does nothing. The first policy acts.
+            seed: seed of the first episode, and of random actions.
 
         Raises:
-            ValueError: it cannot be built, or has no MuJoCo model.
+            ValueError: the environment cannot be built, or has no MuJoCo model.
         """
-        self.config = dataclasses.replace(config, max_episode_steps=_FOREVER)
-        self._limit = config.time_limit or _FOREVER
+        self.config = dataclasses.replace(config, max_episode_steps=_NO_LIMIT)
+        self._limit = config.time_limit or _NO_LIMIT
         self.problem: str | None = None
-        self.again = True
-        """Whether an episode that ended, or reached the time limit, begins anew by itself; otherwise it goes on."""
+        self.auto_reset = True
+        """True to reset after an episode has ended or reached its time limit, False to go on."""
         self.signals: deque[tuple[float, np.ndarray]] = deque()
-        """Time [s], and a row of the recorder's `trace_names` for each motor."""
+        """Time [s], and for each motor a row with the recorder's `trace_names`."""
         self._seed, self._diverged, self._pushes = seed, False, {}  # type: ignore[var-annotated]
-        self.env = self._made()
+        self.env = self._make_env()
         self.policies = {
             **policies,
             "random": lambda: RandomPolicy(self.env.action_space, self._seed),
         }
-        if (action := self._nothing()) is not None:
-            still = SimpleNamespace(
-                predict=lambda seen, **_: (np.array([action] * len(seen)), None)
+        if (action := self._zero_action()) is not None:
+            zero_policy = SimpleNamespace(
+                predict=lambda observations, **_: (np.array([action] * len(observations)), None)
             )
-            self.policies["zero"] = lambda: still
+            self.policies["zero"] = lambda: zero_policy
         self.choose(next(iter(self.policies)))
         self.reset()
 
-    # -- what is there ---------------------------------------------------------------------------------------
+    # -- state ------------------------------------------------------------------------------------
 
     @property
     def model(self) -> mujoco.MjModel:
-        """The model."""
+        """Model of the environment."""
         return self.env.unwrapped.model
 
     @property
     def data(self) -> mujoco.MjData:
-        """The simulation, with the poses of now."""
+        """Simulation data, with the current poses."""
         return self.env.unwrapped.data
 
     @property
     def bodies(self) -> list[str]:
         """Names of the bodies that can be pushed, the last of a chain first."""
         model = self.model
-        moves = [
+        movable = [
             body
             for body in range(1, model.nbody)
             if model.body_weldid[body] and model.body_subtreemass[body] > 0
         ]
-        return [model.body(body).name for body in reversed(moves) if model.body(body).name]
+        return [model.body(body).name for body in reversed(movable) if model.body(body).name]
 
     @property
-    def waits(self) -> bool:
-        """Whether nothing can be simulated at present."""
+    def is_stopped(self) -> bool:
+        """True if the simulation cannot continue at present."""
         return self.problem is not None
 
-    # -- what can be done ------------------------------------------------------------------------------------
+    # -- actions ----------------------------------------------------------------------------------
 
     def reset(self) -> None:
         """Start another episode."""
         if self._diverged:
+            # Settings that cannot be built stay a problem after a reset; a divergence does not.
             self._diverged, self.problem = False, None
         self.observation, _ = self.env.reset(seed=self._seed)
         self._seed += 1
@@ -197,15 +213,14 @@ class Session:
         self.signals.clear()
         self._pushes.clear()
         self.data.xfrc_applied[:] = 0.0
-        self._posed()
+        self._update_poses()
 
     def choose(self, name: str) -> None:
         """Let another policy act.
 
         Raises:
-            FileNotFoundError: its run has none.
-            ValueError: unknown, or it observes or commands something else than this environment
-                has.
+            FileNotFoundError: the run has no policy.
+            ValueError: the policy's observations or actions are not those of this environment.
         """
         policy = self.policies[name]()
         try:
@@ -218,26 +233,30 @@ class Session:
             raise ValueError(f"policy {name}: does not fit this environment: {error}") from None
         if not fits:
             raise ValueError(
-                f"policy {name}: its actions, such as {action[0]}, are none of"
+                f"policy {name}: its actions, such as {action[0]}, are not in"
                 f" {self.env.action_space}"
             )
-        self.policy, self.chosen = policy, name
+        self.policy, self.policy_name = policy, name
 
     def push(self, body: str, force: float, axis: int = 0) -> None:
-        """Push a body at its centre of mass for `PUSH_DURATION`.
+        """Push a body at its center of mass for `PUSH_DURATION`.
 
         Args:
-            body: its name.
-            force: [N].
-            axis: of the world, 0 to 2.
+            body: name of the body.
+            force: force [N].
+            axis: axis of the world frame, 0 to 2.
         """
         vector = np.zeros(3)
         vector[axis] = force
         self._pushes[self.model.body(body).id] = (self.time + PUSH_DURATION, vector)
 
     def set_actuator(self, pattern: str, path: tuple[str, ...], value: Any) -> None:
-        """Set a field of what drives a motor, or the motors of a pattern; the motion goes on, the motor is at rest."""
+        """Set an actuator's field of a motor, or of the motors of a pattern.
+
+        The motion continues, and the motor's state is reset.
+        """
         for name in reversed(path):
+            # `actuator_over` takes nested mappings: turn the path into one, from the inside out.
             value = {name: value}
         self._rebuild(
             lambda: {
@@ -256,18 +275,19 @@ class Session:
         )
 
     def step(self) -> bool:
-        """Advance by one environment step, if it can be simulated.
+        """Advance by one environment step, if possible.
 
         Returns:
-            Whether it was.
+            True if a step was simulated.
         """
-        if self.waits:
+        if self.is_stopped:
             return False
-        if self.ended and self.again:
+        if self.ended and self.auto_reset:
             self.reset()
         data = self.data
         for body, (end, force) in list(self._pushes.items()):
             data.xfrc_applied[body, :3] = force
+            # Step times are sums with rounding errors, so that the comparison needs a tolerance.
             if self.time + 1e-9 >= end:
                 del self._pushes[body]
                 data.xfrc_applied[body] = 0.0
@@ -276,12 +296,15 @@ class Session:
         )
         try:
             self.observation, reward, terminated, truncated, _ = self.env.step(action[0])
-            # from numbers that are none it begins anew by itself
-            began_anew = any(self.data.warning[kind].number for kind in _DIVERGED)
-            if began_anew or not np.isfinite(np.asarray(self.observation)).all():
-                raise ArithmeticError("the simulation left the finite numbers")
+            # MuJoCo resets a diverged simulation to its initial state by itself, with a warning.
+            was_reset = any(self.data.warning[kind].number for kind in _DIVERGENCE_WARNINGS)
+            if was_reset or not np.isfinite(np.asarray(self.observation)).all():
+                raise ArithmeticError("the simulation diverged to numbers that are not finite")
         except ArithmeticError as error:
-            self.problem, self._diverged = f"{error}; reset, and set what drives it otherwise", True
+            self.problem, self._diverged = (
+                f"{error}; reset it, and change the settings of the motor",
+                True,
+            )
             return False
         rows = self.recorder.trace
         for row in rows:
@@ -296,51 +319,54 @@ class Session:
             if terminated or truncated
             else "past the time limit" * (self._steps >= self._limit)
         )
-        self._posed()
+        self._update_poses()
         return True
 
-    # -- within ----------------------------------------------------------------------------------------------
+    # -- internal ---------------------------------------------------------------------------------
 
-    def _made(self) -> Any:
+    def _make_env(self) -> Any:
         env: Any = self.config.make()
         if getattr(env.unwrapped, "model", None) is None:
             raise ValueError(
-                f"{self.config.task} has no MuJoCo model to be shown; physics must be mujoco, its"
+                f"{self.config.task} has no MuJoCo model to show: physics must be mujoco, the"
                 " default"
             )
         self.recorder: Any = env.get_wrapper_attr("recorder")
         return env
 
-    def _rebuild(self, changed: Callable[[], dict[str, Any]]) -> None:
-        """Go on in an environment with other settings, or say why that cannot be."""
+    def _rebuild(self, make_changes: Callable[[], dict[str, Any]]) -> None:
+        """Continue in an environment with other settings, or set `problem` if that fails."""
         positions, speeds = self.data.qpos.copy(), self.data.qvel.copy()
-        old = self.env, self.recorder
+        # The old environment stays in use if the new one cannot be built.
+        previous = self.env, self.recorder
         try:
-            self.config = dataclasses.replace(self.config, **changed())
-            self.env = self._made()
+            self.config = dataclasses.replace(self.config, **make_changes())
+            self.env = self._make_env()
             self.env.reset(seed=self._seed)
         except ValueError as error:
-            self.env, self.recorder = old
+            self.env, self.recorder = previous
             self.problem = str(error)
             return
-        old[0].close()
+        previous[0].close()
         self.problem = None
         if self._diverged:
             self.reset()
         else:
             self.data.qpos[:], self.data.qvel[:] = positions, speeds
+            # Recompute everything that depends on the copied positions and speeds, such as
+            # contacts.
             mujoco.mj_forward(self.model, self.data)
 
-    def _posed(self) -> None:
-        """Bring the poses up to date: a step leaves those of its beginning."""
+    def _update_poses(self) -> None:
+        """Update the poses: after a step they are those of its start."""
         physics = getattr(self.env.unwrapped, "physics", None)
         if physics is None:
             mujoco.mj_kinematics(self.model, self.data)
         else:
             physics.show(physics.state)
 
-    def _nothing(self) -> Any:
-        """The action that does nothing; None if there is none."""
+    def _zero_action(self) -> Any:
+        """Return the action without force; None if there is none."""
         space, setup = self.env.action_space, getattr(self.env.unwrapped, "setup", None)
         if isinstance(space, spaces.Box):
             return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
@@ -348,19 +374,23 @@ class Session:
             forces = {
                 action: np.abs(setup.commands.force(action)).max() for action in range(int(space.n))
             }
-            least = min(forces, key=lambda action: forces[action])
-            return least if math.isclose(forces[least], 0.0, abs_tol=1e-12) else None
+            min_action = min(forces, key=lambda action: forces[action])
+            # A discrete action does nothing if its force is zero, for example the middle one of
+            # three.
+            return min_action if math.isclose(forces[min_action], 0.0, abs_tol=1e-12) else None
         return None
 
 
 def run_native(session: Session) -> None:
-    """Simulate in real time until the window is closed; there its mouse pushes bodies."""
+    """Simulate in real time until the window is closed; its mouse can push bodies."""
     from mujoco import viewer
 
     with viewer.launch_passive(session.model, session.data) as window:
         while window.is_running():
-            began = time.perf_counter()
+            step_start = time.perf_counter()
             with window.lock():
                 session.step()
             window.sync()
-            time.sleep(max(0.0, session.recorder.step_duration - (time.perf_counter() - began)))
+            time.sleep(
+                max(0.0, session.recorder.step_duration - (time.perf_counter() - step_start))
+            )

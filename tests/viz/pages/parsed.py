@@ -1,4 +1,4 @@
-"""A reader of pages: that elements close, what a browser would fetch, and what is said."""
+"""Parser of pages: checks that elements are closed, and collects links, data and text."""
 
 import json
 import re
@@ -7,11 +7,11 @@ from html.parser import HTMLParser
 VOID = ("meta", "br", "link", "img", "input", "hr")
 
 
-class Parsed(HTMLParser):
-    """Checks that elements close in order, and collects what a browser would fetch."""
+class ParsedPage(HTMLParser):
+    """Parser that checks the nesting of elements and collects what a browser would fetch."""
 
     def __init__(self, text):
-        """Parse at once."""
+        """Parse the text."""
         super().__init__()
         self.open, self.fetched, self.ids, self.targets, self.words, self.data = (
             [],
@@ -48,13 +48,13 @@ class Parsed(HTMLParser):
 
     @property
     def text(self):
-        """What is said, in one line."""
+        """Visible text, in one line."""
         return " ".join(" ".join(self.words).split())
 
 
-def check_alone(text):
-    """Check that a page fetches nothing; returns it parsed."""
-    parsed = Parsed(text)
+def check_self_contained(text):
+    """Check that a page fetches nothing, and return it parsed."""
+    parsed = ParsedPage(text)
     assert parsed.fetched == []
     assert {target[1:] for target in parsed.targets} <= set(parsed.ids)
     style = "".join(re.findall(r"<style>(.*?)</style>", text, re.DOTALL))

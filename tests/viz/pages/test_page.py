@@ -1,4 +1,4 @@
-"""The builder of pages: what is text stays text, what is embedded is there, and nothing is fetched."""
+"""Builder of pages: text is escaped, media are embedded, and nothing is fetched."""
 
 import base64
 
@@ -8,47 +8,51 @@ from markupsafe import Markup
 
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.plots import Curve, Plot
-from tests.viz.pages.parsed import check_alone
+from tests.viz.pages.parsed import check_self_contained
 
 EVIL = "<img src=http://there/x onerror='x()'> & \"y\""
 
 
 def small(*parts, title="t"):
-    return page.page(title, "k", Markup(""), [page.Section("s", "S", page.joined(parts))])
+    return page.page(title, "k", Markup(""), [page.Section("s", "S", page.join(parts))])
 
 
 def test_names_with_markup_show_as_text_everywhere():
     plot = Plot(EVIL, EVIL, EVIL, (Curve(EVIL, np.arange(3.0), np.arange(3.0)),), clock=True)
-    parts = [kind(EVIL) for kind in (page.paragraph, page.note, page.heading)]
+    parts = [builder(EVIL) for builder in (page.paragraph, page.note, page.heading)]
     parts += [
-        page.judged(True, EVIL, "p", "verdict"),
+        page.mark_verdict(True, EVIL, "p", "verdict"),
         page.plot(plot),
         page.definitions([(EVIL, EVIL)]),
     ]
     parts += [
-        page.folded(EVIL, page.paragraph("p")),
+        page.details(EVIL, page.paragraph("p")),
         page.table(EVIL, (EVIL, "b"), [(EVIL, EVIL)], cards=True),
     ]
     parts += [
-        page.part("selector", EVIL, "run", [EVIL], None),
-        page.part("film", EVIL, b"film", 20.0, None),
+        page.render_part("selector", EVIL, "run", [EVIL], None),
+        page.render_part("film", EVIL, b"film", 20.0, None),
     ]
-    parts += [page.part("image", b"image", EVIL), page.part("transport", "1", "0.1"), EVIL]
+    parts += [
+        page.render_part("image", b"image", EVIL),
+        page.render_part("transport", "1", "0.1"),
+        EVIL,
+    ]
     text = page.page(
-        EVIL, EVIL, page.paragraph(EVIL), [page.Section("s", EVIL, page.joined(parts), EVIL)]
+        EVIL, EVIL, page.paragraph(EVIL), [page.Section("s", EVIL, page.join(parts), EVIL)]
     )
-    parsed = check_alone(text)
+    parsed = check_self_contained(text)
     assert "<img src=http" not in text
     assert parsed.text.count("<img src=http://there/x onerror='x()'> & \"y\"") > 20
     assert parsed.data[0]["title"] == EVIL
 
 
-def test_a_page_has_what_it_was_given_and_its_licence():
+def test_a_page_embeds_its_media_and_licenses():
     text = small(
-        page.part("film", "a film", b"bytes of a film", 25.0, b"poster"),
-        page.part("image", b"picture", "about"),
+        page.render_part("film", "a film", b"bytes of a film", 25.0, b"poster"),
+        page.render_part("image", b"picture", "about"),
     )
-    check_alone(text)
+    check_self_contained(text)
     for content in (b"bytes of a film", b"poster", b"picture"):
         assert base64.b64encode(content).decode() in text
     assert 'data-frame="0.04"' in text
@@ -61,7 +65,7 @@ def test_a_section_without_a_body_is_left_out():
     assert 'id="s"' in small("x")
 
 
-def test_a_plot_is_a_picture_where_no_script_may_run():
+def test_a_plot_is_a_picture_without_scripts():
     text = small(
         page.plot(Plot("t", "x [s]", "y [V]", (Curve("a", np.arange(3.0), np.arange(3.0)),)))
     )
@@ -79,8 +83,8 @@ def test_tables_have_captions_and_headings():
     assert 'class="failed"' in text
 
 
-def test_what_joins_the_clock_stands_as_it_is():
-    part = page.clocked(
+def test_a_clocked_part_is_inserted_unchanged():
+    part = page.clocked_part(
         "a replay", "<canvas></canvas>", "function setTime(t) { element.title = t; }"
     )
     assert "<canvas></canvas>" in part
@@ -88,10 +92,10 @@ def test_what_joins_the_clock_stands_as_it_is():
         "codrl.clocked(own, (element, seek) => {\nfunction setTime(t) { element.title = t;"
         " }\nreturn setTime;" in part
     )
-    check_alone(small(part))
+    check_self_contained(small(part))
 
 
-def test_a_page_is_written_as_html_alone(tmp_path):
+def test_only_html_files_are_written(tmp_path):
     with pytest.raises(ValueError, match=r"the suffix is '.pdf', must be .html"):
         page.write(tmp_path / "page.pdf", "x")
     assert page.write(tmp_path / "new" / "page.html", "x").read_text() == "x"
@@ -99,8 +103,8 @@ def test_a_page_is_written_as_html_alone(tmp_path):
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(None, "–"), (float("nan"), "–"), (0.0001234567, "0.0001235"), (-2.5, "\N{MINUS SIGN}2.5"), (12345.6, "12,350"),
-     (float("inf"), "∞"), (3, "3"), ("V", "V")],
+    [(None, "–"), (float("nan"), "–"), (0.0001234567, "0.0001235"), (-2.5, "\N{MINUS SIGN}2.5"),
+     (12345.6, "12,350"), (float("inf"), "∞"), (3, "3"), ("V", "V")],
 )  # fmt: skip
-def test_numbers_are_short(value, text):
-    assert page.number(value) == text
+def test_numbers_are_formatted_briefly(value, text):
+    assert page.format_number(value) == text

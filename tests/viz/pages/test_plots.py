@@ -1,4 +1,4 @@
-"""Plots as data: what reaches the page is what was measured, and nothing stops one from being drawn."""
+"""Plots as data: the page gets the given values, and all values can be drawn."""
 
 import base64
 import json
@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 
 from codrl_mj.viz.pages.plots import (
-    POINTS,
+    MAX_POINTS,
     Curve,
     Plot,
     Shade,
-    as_json,
-    description,
-    save,
-    spans,
-    still,
-    thinned,
+    decimate,
+    describe,
+    flagged_intervals,
+    save_png,
+    to_json,
+    to_svg,
 )
 
 
 def read(plot):
-    """The content of a plot as the page's script reads it, arrays decoded."""
-    content = json.loads(as_json(plot))
+    """Return the content of a plot as the page's script reads it, with decoded arrays."""
+    content = json.loads(to_json(plot))
     arrays = [np.frombuffer(base64.b64decode(text), "<f4") for text in content["arrays"]]
     return content, arrays
 
@@ -47,18 +47,18 @@ def test_the_page_gets_every_value_and_each_array_once():
 def test_a_long_line_keeps_its_peaks_and_its_ends():
     y = np.zeros(100_000)
     y[51_234], y[77_777] = 5.0, -3.0
-    x, kept = thinned(np.arange(len(y)), y)
-    assert len(x) <= POINTS + 2
-    assert kept.max() == 5.0
-    assert kept.min() == -3.0
+    x, values = decimate(np.arange(len(y)), y)
+    assert len(x) <= MAX_POINTS + 2
+    assert values.max() == 5.0
+    assert values.min() == -3.0
     assert x[[0, -1]].tolist() == [0, len(y) - 1]
-    assert x[kept == 5.0].tolist() == [51_234]
+    assert x[values == 5.0].tolist() == [51_234]
 
 
-def test_spans_are_the_intervals_in_which_a_flag_is_set():
+def test_flagged_intervals_are_those_with_a_flag():
     times = np.array([0.0, 0.1, 0.2, 0.3, 0.4])
-    assert spans(times, np.array([1, 0, 1, 1])).tolist() == [[0.0, 0.1], [0.2, 0.4]]
-    assert spans(times, np.zeros(4)).shape == (0, 2)
+    assert flagged_intervals(times, np.array([1, 0, 1, 1])).tolist() == [[0.0, 0.1], [0.2, 0.4]]
+    assert flagged_intervals(times, np.zeros(4)).shape == (0, 2)
 
 
 @pytest.mark.parametrize(
@@ -73,10 +73,10 @@ def test_any_numbers_can_be_drawn(y, log):
         for value in y
         if math.isfinite(value) and abs(value) < 3e38 and (value > 1e-37 or not log)
     ]
-    drawn = arrays[json.loads(as_json(plot))["curves"][0]["y"]]
+    drawn = arrays[json.loads(to_json(plot))["curves"][0]["y"]]
     assert np.isfinite(drawn).sum() == len(finite)
-    assert still(plot).lstrip().startswith("<?xml")
-    assert "nan" not in description(plot)
+    assert to_svg(plot).lstrip().startswith("<?xml")
+    assert "nan" not in describe(plot)
 
 
 def test_a_reference_may_leave_a_logarithmic_picture_and_a_result_may_not():
@@ -86,27 +86,27 @@ def test_a_reference_may_leave_a_logarithmic_picture_and_a_result_may_not():
     assert read(Plot("t", "x [1]", "y [1]", (line(1.0, 3.0),), y_log=True))[0]["y"]["most"] is None
 
 
-def test_names_cannot_end_the_script_that_holds_the_data():
+def test_names_cannot_close_the_script_with_the_data():
     curves, shades = (Curve("<!--", np.zeros(1), np.zeros(1)),), (Shade("</", np.ones((1, 2))),)
     plot = Plot("</script><b>", "x", "y", curves, shades=shades)
-    assert "<" not in as_json(plot)
+    assert "<" not in to_json(plot)
     assert read(plot)[0]["title"] == "</script><b>"
 
 
-def test_names_are_no_formulas(tmp_path):
+def test_names_are_not_typeset_as_formulas(tmp_path):
     names = "$KP_$KD", "cost_$10_to_$20"
     plot = Plot(
         names[0], "x", "y", tuple(Curve(name, np.arange(3), np.arange(3)) for name in names)
     )
-    assert all(name in still(plot) for name in names)
-    save(plot, tmp_path / "plot.png")
+    assert all(name in to_svg(plot) for name in names)
+    save_png(plot, tmp_path / "plot.png")
 
 
-def test_words_say_what_the_picture_shows():
-    told = description(Plot("t", "time [s]", "torque [N·m]", (line(1.0, -2.0, 0.5),)))
-    assert told == "torque [N·m] over time [s]. c: -2 to 1, at last 0.5."
+def test_the_description_has_the_range_of_each_curve():
+    text = describe(Plot("t", "time [s]", "torque [N·m]", (line(1.0, -2.0, 0.5),)))
+    assert text == "torque [N·m] over time [s]. c: -2 to 1, at last 0.5."
 
 
-def test_the_still_picture_is_small():
+def test_the_svg_picture_is_small():
     x = np.linspace(0.0, 10.0, 5000)
-    assert len(still(Plot("t", "x [s]", "y [V]", (Curve("a", x, np.sin(50 * x)),)))) < 30_000
+    assert len(to_svg(Plot("t", "x [s]", "y [V]", (Curve("a", x, np.sin(50 * x)),)))) < 30_000

@@ -1,1 +1,1 @@
-"""Replays."""
+"""Tests of the replays."""

@@ -1,4 +1,4 @@
-"""What a replay keeps of a motion is what MuJoCo says."""
+"""A replay stores the poses that MuJoCo computes."""
 
 import mujoco
 import numpy as np
@@ -6,12 +6,13 @@ import pytest
 
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.viz.replay import motion
-from codrl_mj.viz.replay.scene import mesh, shapes, thinned
+from codrl_mj.viz.replay.scene import read_mesh, simplify_mesh, visible_shapes
 
 ARM = """
 <mujoco>
   <asset>
-    <texture name="half" type="2d" builtin="flat" rgb1=".5 .5 .5" rgb2=".5 .5 .5" width="8" height="8"/>
+    <texture name="half" type="2d" builtin="flat" rgb1=".5 .5 .5" rgb2=".5 .5 .5"
+             width="8" height="8"/>
     <material name="red" rgba="1 0 0 1"/>
     <material name="grey" texture="half" rgba="1 1 1 1"/>
     <hfield name="ground" nrow="2" ncol="3" size="3 2 5 1" elevation="0 .5 1  0 .5 1"/>
@@ -43,7 +44,7 @@ def arm():
 
 
 def positions(model, count, seed=0):
-    """Random `qpos`, quaternions of unit length."""
+    """Return random `qpos` with unit quaternions."""
     generator, data = np.random.default_rng(seed), mujoco.MjData(model)
     rows = []
     for _ in range(count):
@@ -54,28 +55,26 @@ def positions(model, count, seed=0):
 
 def test_poses_are_those_of_mujoco(arm):
     states, time = positions(arm, 30), np.arange(30) / 30
-    made, data = motion(arm, states, time), mujoco.MjData(arm)
-    assert [arm.body(int(body)).name for body in made.bodies] == ["upper", "lower", "ball"]
-    np.testing.assert_array_equal(made.time, time)
-    for state, poses in zip(states, made.poses, strict=True):
+    recorded, data = motion(arm, states, time), mujoco.MjData(arm)
+    assert [arm.body(int(body)).name for body in recorded.bodies] == ["upper", "lower", "ball"]
+    np.testing.assert_array_equal(recorded.time, time)
+    for state, poses in zip(states, recorded.poses, strict=True):
         data.qpos[:] = state
         mujoco.mj_kinematics(arm, data)
-        np.testing.assert_allclose(poses[:, :3], data.xpos[made.bodies], atol=1e-6)
-        same = np.abs(
-            (poses[:, 3:] * data.xquat[made.bodies]).sum(axis=1)
-        )  # a quaternion's negative is the same turn
+        np.testing.assert_allclose(poses[:, :3], data.xpos[recorded.bodies], atol=1e-6)
+        # A quaternion and its negative are the same rotation.
+        same = np.abs((poses[:, 3:] * data.xquat[recorded.bodies]).sum(axis=1))
         np.testing.assert_allclose(same, 1.0, atol=1e-6)
-    assert ((made.poses[1:, :, 3:] * made.poses[:-1, :, 3:]).sum(axis=2) >= -1e-6).all()
+    assert ((recorded.poses[1:, :, 3:] * recorded.poses[:-1, :, 3:]).sum(axis=2) >= -1e-6).all()
 
 
-def test_only_as_many_instants_are_kept_as_are_needed_and_the_last(arm):
+def test_instants_are_thinned_out_but_include_the_last(arm):
     time = np.arange(0, 1001) * 0.002
-    made = motion(arm, positions(arm, 1001), time)
-    assert made.time[0] == 0.0
-    assert made.time[-1] == 2.0
-    assert np.diff(made.time)[:-1] == pytest.approx(
-        0.032
-    )  # the largest number of steps not above 1/30 s
+    recorded = motion(arm, positions(arm, 1001), time)
+    assert recorded.time[0] == 0.0
+    assert recorded.time[-1] == 2.0
+    # The stride is the largest number of steps that is at most 1/30 s.
+    assert np.diff(recorded.time)[:-1] == pytest.approx(0.032)
     slow = motion(arm, positions(arm, 5), np.arange(5) * 0.2)
     assert len(slow.time) == 5
     later = motion(arm, positions(arm, 5), 100.0 + np.arange(5) * 0.2)
@@ -85,24 +84,27 @@ def test_only_as_many_instants_are_kept_as_are_needed_and_the_last(arm):
             motion(arm, positions(arm, 3), times)
 
 
-def test_shapes_are_what_mujoco_shows(arm):
-    found = {
-        arm.geom(one.geom).name or str(one.geom): one for one in shapes(arm) if one.geom is not None
+def test_visible_shapes_are_those_that_mujoco_shows(arm):
+    shapes_by_name = {
+        arm.geom(shape.geom).name or str(shape.geom): shape
+        for shape in visible_shapes(arm)
+        if shape.geom is not None
     }
-    assert "hidden" not in found
-    assert found["floor"].colour == pytest.approx(
-        (0.5, 0.5, 0.5, 1), abs=0.01
-    )  # the mean of its picture
-    assert found["floor"].chequered
-    assert found["post"].colour == pytest.approx((0, 1, 0, 0.5))
-    capsule = next(one for one in found.values() if one.kind == "capsule")
+    assert "hidden" not in shapes_by_name
+    # The mean color of its texture.
+    assert shapes_by_name["floor"].colour == pytest.approx((0.5, 0.5, 0.5, 1), abs=0.01)
+    assert shapes_by_name["floor"].chequered
+    assert shapes_by_name["post"].colour == pytest.approx((0, 1, 0, 0.5))
+    capsule = next(shape for shape in shapes_by_name.values() if shape.kind == "capsule")
     assert capsule.colour == (1, 0, 0, 1)
     assert capsule.size[:2] == pytest.approx((0.05, 0.25))  # half of |(.3, 0, .4)|
-    assert [one.kind for one in shapes(arm) if one.geom is None] == ["ellipsoid"]  # the site
+    assert [shape.kind for shape in visible_shapes(arm) if shape.geom is None] == [
+        "ellipsoid"
+    ]  # the site
 
 
-def test_a_height_field_is_as_high_as_it_says(arm):
-    vertices, triangles = mesh(arm, "hfield", 0)
+def test_a_height_field_has_its_heights(arm):
+    vertices, triangles = read_mesh(arm, "hfield", 0)
     np.testing.assert_allclose(vertices.min(axis=0), [-3, -2, 0])
     np.testing.assert_allclose(vertices.max(axis=0), [3, 2, 5])
     assert len(triangles) == 2 * 2 * 1
@@ -112,8 +114,8 @@ def test_a_height_field_is_as_high_as_it_says(arm):
     assert normals[:, 2].sum() / 2 == pytest.approx(6 * 4)  # seen from above they cover all, once
 
 
-def test_the_car_is_on_its_hill():
-    """The geoms of the mountain car are moved by a callback; the body alone would go along a line."""
+def test_the_mountain_car_is_on_its_hill():
+    """Compare with the geoms, which a callback moves along the hill, unlike the body."""
     env = ActuatedEnv("mountain_car", "ideal")
     states = np.array([[x, 0.0] for x in (-1.1, -0.5, 0.4)])
 
@@ -121,54 +123,54 @@ def test_the_car_is_on_its_hill():
         env.physics.show(state)
         return env.data
 
-    made = motion(env.model, states, np.arange(3.0), show=show)
-    ((place, car),) = [(place, body) for place, body in enumerate(made.bodies) if body != 0]
-    for state, poses in zip(states, made.poses, strict=True):
+    recorded = motion(env.model, states, np.arange(3.0), show=show)
+    ((index, car),) = [(index, body) for index, body in enumerate(recorded.bodies) if body != 0]
+    for state, poses in zip(states, recorded.poses, strict=True):
         show(state)
-        for one in made.shapes:
-            if one.body != car or one.geom is None:
+        for shape in recorded.shapes:
+            if shape.body != car or shape.geom is None:
                 continue
-            turned = np.empty(3)
-            mujoco.mju_rotVecQuat(turned, one.position, poses[place, 3:].astype(float))
+            offset = np.empty(3)
+            mujoco.mju_rotVecQuat(offset, shape.position, poses[index, 3:].astype(float))
             np.testing.assert_allclose(
-                poses[place, :3] + turned, env.data.geom_xpos[one.geom], atol=1e-6
+                poses[index, :3] + offset, env.data.geom_xpos[shape.geom], atol=1e-6
             )
-    assert np.ptp(made.poses[:, place, 2]) > 0.1
+    assert np.ptp(recorded.poses[:, index, 2]) > 0.1
 
 
-def test_a_thinned_mesh_is_the_same_shape():
+def test_a_simplified_mesh_keeps_its_shape():
     angles = np.linspace(0, np.pi, 200)
     turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     vertices = np.array(
         [[np.sin(a) * np.cos(t), np.sin(a) * np.sin(t), np.cos(a)] for a in angles for t in turns]
     )
     row, column = np.meshgrid(np.arange(199), np.arange(400), indexing="ij")
-    corner, beside = row * 400 + column, row * 400 + (column + 1) % 400
+    corner, next_column = row * 400 + column, row * 400 + (column + 1) % 400
     triangles = np.concatenate(
         [
-            np.stack([corner, beside, corner + 400], 2),
-            np.stack([beside, beside + 400, corner + 400], 2),
+            np.stack([corner, next_column, corner + 400], 2),
+            np.stack([next_column, next_column + 400, corner + 400], 2),
         ]
     ).reshape(-1, 3)
-    few, corners = thinned(vertices, triangles, 4000)
+    simple_vertices, corners = simplify_mesh(vertices, triangles, 4000)
     assert 1500 < len(corners) <= 4000
-    assert corners.max() < len(few)
-    np.testing.assert_allclose(np.linalg.norm(few, axis=1), 1.0, atol=0.01)
-    a, b, c = np.moveaxis(few[corners], 1, 0)
+    assert corners.max() < len(simple_vertices)
+    np.testing.assert_allclose(np.linalg.norm(simple_vertices, axis=1), 1.0, atol=0.01)
+    a, b, c = np.moveaxis(simple_vertices[corners], 1, 0)
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(
         4 * np.pi, rel=0.05
     )
-    assert thinned(vertices, triangles, len(triangles))[1] is triangles
+    assert simplify_mesh(vertices, triangles, len(triangles))[1] is triangles
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"time": np.arange(4.0)}, "there are 3 for 4 instants"),
         ({"states": np.zeros((3, 2))}, "must begin with the model's 9 of qpos"),
         ({"camera": "sied"}, "the model's cameras are side"),
     ],
 )
-def test_what_does_not_fit_is_refused(arm, change, said):
-    with pytest.raises(ValueError, match=said):
+def test_inconsistent_arguments_are_refused(arm, change, message):
+    with pytest.raises(ValueError, match=message):
         motion(**({"model": arm, "states": positions(arm, 3), "time": np.arange(3.0)} | change))

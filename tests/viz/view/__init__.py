@@ -1,1 +1,1 @@
-"""The live view."""
+"""Tests of the live view."""

@@ -1,4 +1,4 @@
-"""The server of the live view: this machine alone, its own pages alone, and nothing that a client sends ends it."""
+"""Server of the live view: only this machine and its own pages have access, and it stays up."""
 
 import asyncio
 import http.client
@@ -17,10 +17,10 @@ from codrl_mj.viz.view.local import LocalServer
 
 @pytest.fixture(scope="module")
 def server():
-    made = LocalServer(0)
-    made.gui.add_markdown("hello")
-    yield made
-    made.stop()
+    local_server = LocalServer(0)
+    local_server.gui.add_markdown("hello")
+    yield local_server
+    local_server.stop()
 
 
 def status(server, **headers):
@@ -42,7 +42,7 @@ def connect(server, **options):
     )
 
 
-def test_it_listens_on_this_machine_alone_and_asks_nobody_to_share_it(server):
+def test_it_is_reachable_only_from_this_machine(server):
     assert server.request_share_url() is None
     assert server.get_host() == "127.0.0.1"
     address = socket.gethostbyname(socket.gethostname())
@@ -51,16 +51,17 @@ def test_it_listens_on_this_machine_alone_and_asks_nobody_to_share_it(server):
             socket.create_connection((address, server.get_port()), timeout=2)
 
 
-def test_a_port_that_there_is_not_is_refused():
+def test_an_invalid_port_is_refused():
     with pytest.raises(ValueError, match="port = 65536: must be 0 to 65535"):
         LocalServer(65536)
 
 
-def test_only_its_own_pages_are_answered(server):
+def test_only_requests_of_its_own_pages_are_answered(server):
     port = server.get_port()
     assert status(server) == 200
     assert status(server, Host=f"localhost:{port}") == 200
-    assert status(server, Host=f"evil.example:{port}") == 403  # a name that was made to lead here
+    # A host name of an attacker that resolves to this machine.
+    assert status(server, Host=f"evil.example:{port}") == 403
     assert status(server, Origin="http://evil.example") == 403
     assert status(server, Origin=f"http://127.0.0.1:{port}") == 200
 
@@ -68,7 +69,7 @@ def test_only_its_own_pages_are_answered(server):
 @pytest.mark.parametrize(
     "origin", ["http://evil.example", "null", "http://127.0.0.1:1", "https://127.0.0.1:{port}"]
 )
-def test_pages_of_others_cannot_open_a_socket(server, origin):
+def test_foreign_pages_cannot_open_a_socket(server, origin):
     async def attempt():
         async with connect(server, origin=origin.format(port=server.get_port())):
             pass
@@ -77,7 +78,7 @@ def test_pages_of_others_cannot_open_a_socket(server, origin):
         asyncio.run(attempt())
 
 
-def test_malformed_messages_and_clients_that_vanish_do_it_no_harm(server):
+def test_malformed_messages_and_vanished_clients_do_no_harm(server):
     bad = [
         b"",
         b"\x00\xff\x13",
@@ -95,7 +96,8 @@ def test_malformed_messages_and_clients_that_vanish_do_it_no_harm(server):
             except websockets.exceptions.ConnectionClosed:
                 pass
         gone = await connect(server)
-        gone.transport.abort()  # without a farewell
+        # The client vanishes without closing the connection.
+        gone.transport.abort()
         clients = [await connect(server) for _ in range(20)]
         first = [await asyncio.wait_for(client.recv(), 20) for client in clients]
         for client in clients:
@@ -112,7 +114,7 @@ def test_malformed_messages_and_clients_that_vanish_do_it_no_harm(server):
     assert status(server) == 200
 
 
-def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys):
+def test_without_the_extra_the_command_names_it(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "codrl_mj.viz.view.browser", None)
     monkeypatch.setitem(sys.modules, "viser", None)
     monkeypatch.delitem(sys.modules, "codrl_mj.viz.view.browser")
@@ -120,7 +122,7 @@ def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys)
     assert "pip install 'codrl-mj[view]'" in capsys.readouterr().err
 
 
-def test_without_a_display_native_says_so(monkeypatch, capsys):
+def test_native_without_a_display_is_refused(monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert main(["view", "cartpole", "--native"]) == 2
