@@ -130,7 +130,9 @@ def actuators(out: Path) -> None:
     ]
     ideal = Curve("ideal", times, np.full_like(times, asked), reference=True, dashed=True)
     title = "4 N·m asked for, on a joint that is free to turn"
-    save_png(Plot(title, "time [s]", "torque at the joint [N·m]", (*curves, ideal)), out, (7.0, 3.8))
+    save_png(
+        Plot(title, "time [s]", "torque at the joint [N·m]", (*curves, ideal)), out, (7.0, 3.8)
+    )
     smaller(out, out)
 
 

@@ -30,7 +30,7 @@ from codrl_mj.fields import real
 from codrl_mj.physics import trace_names
 from codrl_mj.tasks import TASKS, named_actuator
 from codrl_mj.viz.films import strip
-from codrl_mj.viz.pages.episode import RunEpisode, _motor_series, _motor_plots
+from codrl_mj.viz.pages.episode import RunEpisode, _motor_plots, _motor_series
 
 TRACE = trace_names(DCMotorActuator)
 ROW = ("actual_force", "current", "voltage", "speed", "saturated")

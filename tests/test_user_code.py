@@ -263,7 +263,9 @@ def test_an_actuator_file_names_modules_only_with_trust(tmp_path, monkeypatch, c
     monkeypatch.syspath_prepend(tmp_path)
 
     def make_environment(verb):
-        return int(build_env_config(verb, "cartpole", verb.actuator_name, EnvConfig("cartpole")) is None)
+        return int(
+            build_env_config(verb, "cartpole", verb.actuator_name, EnvConfig("cartpole")) is None
+        )
 
     monkeypatch.setattr(find_verb("evaluate"), "run", make_environment)
     Path("third_party.py").write_text(

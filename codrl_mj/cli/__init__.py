@@ -116,7 +116,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     # While the package was imported, Ctrl-C ended the process with one line. From here on it raises
     # KeyboardInterrupt, so that a training can write its checkpoint.
-    if signal.getsignal(signal.SIGINT) is codrl_mj._stopped_early:
+    if signal.getsignal(signal.SIGINT) is codrl_mj._exit_on_interrupt:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     command_line = sys.argv[1:] if arguments is None else arguments
     if command_line[:1] == ["--version"]:

@@ -240,7 +240,8 @@ class Test:
             title = f"{env.task} by its C on {self.target}: return {panel.episode.total:.0f}"
             film([dataclasses.replace(panel, title=title)], self.film, 640, 480)
             print(f"wrote {self.film}")
-        return int(result.num_equal_returns < 0.95 * self.episodes
+        return int(
+            result.num_equal_returns < 0.95 * self.episodes
             and link == Link()
             and self.actuator is None
         )
@@ -383,8 +384,10 @@ class CompareLog:
                 strict=True,
             )
         )
-        title = f"{self.log.name} through {self.actuator or env.actuator_label}:"
+        title = (
+            f"{self.log.name} through {self.actuator or env.actuator_label}:"
             f" {len(comparison.starts)} windows"
+        )
         rows = [
             (name, unit or "?", f"{error:.3g}", f"{moved:.3g}")
             for name, unit, error, moved in columns

@@ -196,7 +196,8 @@ def scan_flags(arguments: Sequence[str], *flag_names: str) -> argparse.Namespace
         chosen = argparse.Namespace(**dict.fromkeys((*flag_names, "task", "options")), trust=False)
     word_pairs = itertools.pairwise(["", *arguments])
     chosen.task = chosen.task or next(
-        (word for flag, word in word_pairs if is_source_name(word) and not flag.startswith("--")), None
+        (word for flag, word in word_pairs if is_source_name(word) and not flag.startswith("--")),
+        None,
     )
     return chosen
 
@@ -254,7 +255,11 @@ def build_env_config(verb: Any, task: str, name: str, defaults: EnvConfig) -> En
     options = world.options_of(env_flags)
     patterns = _patterns(verb.actuators)
     fields["randomize"] = _ranges(fields["randomize"], name, patterns)
-    actuators = defaults.actuators_by_name if is_default else dict.fromkeys(defaults.actuators_by_name, name)
+    actuators = (
+        defaults.actuators_by_name
+        if is_default
+        else dict.fromkeys(defaults.actuators_by_name, name)
+    )
     config = EnvConfig(task, actuators, options=options)
     if patterns:
         config = EnvConfig(task, world.overlaid(config, patterns), options=options)

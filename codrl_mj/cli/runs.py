@@ -132,11 +132,14 @@ class Data:
 
         if self.name is None:
             rows = [
-                (name, entry["title"], entry["licence"]) for name, entry in published_datasets().items()
+                (name, entry["title"], entry["licence"])
+                for name, entry in published_datasets().items()
             ]
             print_table("", ("name", "motor and rig", "licence"), rows)
             print(
-                "\n".join(f"{name}: {entry['source']}" for name, entry in published_datasets().items())
+                "\n".join(
+                    f"{name}: {entry['source']}" for name, entry in published_datasets().items()
+                )
             )
             return 0
         files = fetch(self.name, self.out)

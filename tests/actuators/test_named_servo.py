@@ -26,7 +26,7 @@ from codrl_mj.cli import main
 from codrl_mj.sizing import find_drive, find_loop
 from codrl_mj.training import load_config
 from codrl_mj.training.folder import prepare_run
-from tests.cli.lines import TINY, run_ok, assert_refused
+from tests.cli.lines import TINY, assert_refused, run_ok
 
 MOTOR, LENGTH, MASS = "maxon-ec45-flat-50w", 0.2, 0.5
 ARM = f"""<mujoco><option timestep="0.001"/><worldbody><body><joint name="knee" axis="0 -1 0"/>
@@ -191,7 +191,9 @@ def test_the_command_line_makes_a_servo_of_a_name_and_a_run_keeps_it(files, monk
 def test_the_way_to_a_servo_is_told_where_it_is_missed(capsys, files):
     train = "train pendulum --actuator sheet.toml"
     assert "(--actuator.family servo)" in assert_refused(capsys, f"{train} --env.action position")
-    assert "--actuator.loop.controls velocity)" in assert_refused(capsys, f"{train} --env.action velocity")
+    assert "--actuator.loop.controls velocity)" in assert_refused(
+        capsys, f"{train} --env.action velocity"
+    )
     assert "add --actuator.family servo" in assert_refused(
         capsys, f"{train} --actuator.loop.position-gain 3"
     )

@@ -128,7 +128,8 @@ REFUSED_FOR_RUNS = [
 
 
 @pytest.mark.parametrize(
-    ("line", "message"), [*REFUSED, *REFUSED_BY_TRAIN, *matrix_params(REFUSED_FOR_RUNS[:6], REFUSED_FOR_RUNS)]
+    ("line", "message"),
+    [*REFUSED, *REFUSED_BY_TRAIN, *matrix_params(REFUSED_FOR_RUNS[:6], REFUSED_FOR_RUNS)],
 )
 def test_a_refused_line_prints_one_line_and_changes_nothing(capsys, trained, line, message):
     before = folder_contents(trained)

@@ -377,8 +377,9 @@ def test_run_is_exported_with_the_environment_of_its_training(tmp_path, capsys):
     assert main(line.split()) == 0
     for flags, names in {"--actuator ideal": "actuator", "--env.action voltage": "action"}.items():
         assert main(["export", "run", *flags.split()]) == 2
-        assert f"{names}: the environment that run was trained in" in capsys.readouterr().err.replace(
-            "actuator.controller", ""
+        assert (
+            f"{names}: the environment that run was trained in"
+            in capsys.readouterr().err.replace("actuator.controller", "")
         )
     assert main(["export", "run", "--episodes", "1"]) == 0
     assert Contract.read(tmp_path / "exported").assumed == load_config(Path("run")).env.as_mapping()

@@ -258,9 +258,7 @@ class Browser:
         for (
             pattern,
             actuator,
-        ) in (
-            session.config.actuators_by_name.items()
-        ):
+        ) in session.config.actuators_by_name.items():
             suffix = f" {pattern}" if len(session.config.actuators_by_name) > 1 else ""
             family = actuator.family or type(actuator).__name__
             change, fields_found = (

@@ -153,9 +153,9 @@ def test_the_episode_is_the_median_one_or_has_its_rank(run):
     assert "seed 7, return" in text
     assert f"of 5 evaluated episodes {worse} returned less, the median -900 (seed 1000000)" in text
     write_evaluation(run, [])
-    text = of(run).text
-    assert "seed 0, return" in report_page(run).text
-    assert "evaluated episodes" not in report_page(run).text
+    text = report_page(run).text
+    assert "seed 0, return" in text
+    assert "evaluated episodes" not in text
 
 
 def test_the_best_policy_uses_the_median_of_its_own_evaluation(run, capsys):
