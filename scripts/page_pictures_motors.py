@@ -91,7 +91,7 @@ def own_robot(out: Path) -> None:
 
 
 def foreign(out: Path) -> None:
-    """A frame of the film of docs/foreign.md: HalfCheetah, its motors, random actions."""
+    """A frame of the film of docs/external_envs.md: HalfCheetah, its motors, random actions."""
     with tempfile.TemporaryDirectory() as made:
         film = (
             "--motor",
