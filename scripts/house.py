@@ -19,6 +19,8 @@ import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from plain_words import count_words
+
 ROOT = Path(__file__).parents[1]
 RECURRING = {"State", "Signals", "Options", "ReferenceEnv"}
 """Names of classes that each family of actuators, or each task, has for itself."""
@@ -194,11 +196,9 @@ def counts(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
     return numbers | {name: len(found) for name, found in told.items()}, told
 
 
-def main(arguments: list[str]) -> int:
-    """Print each count with its limit, and by name what is above one."""
-    root = Path(arguments[0]) if arguments else ROOT / "codrl_mj"
-    limits: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["house"]
-    found, told = counts(root.resolve())
+def check_counts(root: Path, limits: dict[str, Any]) -> bool:
+    """Print each count of the package with its limit, and what is above one; return True if any is."""
+    found, told = counts(root)
     if limits.keys() != found.keys():
         raise ValueError(
             "[tool.house] and the counts differ in"
@@ -214,6 +214,33 @@ def main(arguments: list[str]) -> int:
             else f"{name} is above its limit"
         )
     return bool(over)
+
+
+def check_words(folder: Path, limits: dict[str, float]) -> bool:
+    """Print a folder's counts of words with their limits; return True if one is beyond its limit.
+
+    A limit whose name ends with `_per_k` is a lower one: a folder may have too few comments.
+    """
+    words, is_beyond = count_words(folder), False
+    for name, limit in limits.items():
+        value, is_lower = words.counts[name], name.endswith("_per_k")
+        is_wrong = value < limit if is_lower else value > limit
+        bound = f"at least {limit:,}" if is_lower else f"at most {limit:,}"
+        print(f"{folder.name} {name}".ljust(28) + f"{value:8,}  {bound}" + "  WRONG" * is_wrong)
+        if is_wrong:
+            print("\n".join(f"  {place}" for place in words.places.get(name, [])))
+        is_beyond |= is_wrong
+    return is_beyond
+
+
+def main(arguments: list[str]) -> int:
+    """Compare all counts with their limits; return 1 if one is beyond its limit."""
+    root = Path(arguments[0]) if arguments else ROOT / "codrl_mj"
+    limits: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["house"]
+    limits_of_words = limits.pop("words")
+    results = [check_counts(root.resolve(), limits)]
+    results += [check_words(ROOT / folder, bounds) for folder, bounds in limits_of_words.items()]
+    return int(any(results))
 
 
 if __name__ == "__main__":
