@@ -69,7 +69,7 @@ def _ends_at_ctrl_c():
         (_ends(0), []),
         (_ends(2, "codrl-mj: error: there is no such thing\n"), []),
         (_ends_at_ctrl_c, []),
-        (_ends(2), ["no word on it"]),
+        (_ends(2), ["no message"]),
         (_crashes, ["exit status 99", "traceback"]),
         (_ends_by_a_signal, ["exit status -9"]),
         (_does(lambda: Path("mine").write_text("theirs")), ["lost: mine"]),
