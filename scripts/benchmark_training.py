@@ -265,12 +265,7 @@ def with_rltools(task: str, seed: int, watch: Watch) -> None:
 
     state = SAC(make).State(seed)
     # Actions are rescaled to Pendulum's range, from -2 to 2 N*m.
-    act = lambda observations: (
-        2.0
-        * np.array(  # noqa: E731
-            [state.action(observation) for observation in observations], dtype=np.float32
-        )
-    )
+    act = lambda rows: 2.0 * np.array([state.action(row) for row in rows], dtype=np.float32)  # noqa: E731
     for steps in range(1, BUDGET + 1):
         if state.step():
             break

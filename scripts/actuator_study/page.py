@@ -422,8 +422,9 @@ def _method(collected: Collected, scores: Scores) -> str:
     ]
     runs = max(len(grid.seeds_of(grid.arms[0])), 2)
     about = f"""By [the plan](plan.md): {num_trained} of {num_planned} trainings
-({totals.seconds / 3600:.1f} hours of one core) and {tested} of {tests} tests; code with its runs: {codes}. `scripts/study_actuators.py` ([how](../studies.md)) writes this
-page, [hypotheses]({FOLDER}/{HYPOTHESES}), [trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}) and
+({totals.seconds / 3600:.1f} hours of one core) and {tested} of {tests} tests; code with its runs: {codes}.
+`scripts/study_actuators.py` ([how](../studies.md)) writes this page,
+[hypotheses]({FOLDER}/{HYPOTHESES}), [trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}) and
 [advised]({FOLDER}/{ADVISED}). `examples/recompute.py` recomputes the conclusions without this package."""
     text = f"""A score is the mean return over {grid.episodes} test episodes in shares of the span: 0 is what random
 actions get on ideal forces, 1 what ideal-trained policies get there on the mean ({"; ".join(known) or "none yet"}).

@@ -310,7 +310,8 @@ def _method(collected: Collected, rising: Sequence[str], count: int) -> str:
         len(collected.grid.deployments),
     )
     text = f"""By [the plan](insurance_plan.md), scores and tests as in [what an actuator costs](actuators.md).
-{num_tested} of {num_tests} tests of {num_planned} policies are there ({totals.seconds / 3600:.1f} hours of one core at hand).
+{num_tested} of {num_tests} tests of {num_planned} policies are there
+({totals.seconds / 3600:.1f} hours of one core at hand).
 `scripts/study_insurance.py` ([how](../studies.md)) writes this page, [every
 policy]({FOLDER}/{RUNS}), [trials]({FOLDER}/{TRIALS}) with medians and
 failures, [every comparison]({FOLDER}/{HYPOTHESES}), and [what was returned in tenths of the
