@@ -87,8 +87,8 @@ def main() -> None:
         for seed in range(options.seeds):
             clock, result = run(dataclasses.replace(config, seed=seed), ENOUGH[task])
             print(
-                f"{task} {options.agent} {options.actuator} seed {seed}: learnt after"
-                f" {clock.learnt}; in all {result['steps']} steps {clock.seconds:5.1f} s,"
+                f"{task} {options.agent} {options.actuator} seed {seed}: learned after"
+                f" {clock.learned}; in all {result['steps']} steps {clock.seconds:5.1f} s,"
                 f" {result['steps'] / clock.seconds:5.0f} steps/s; evaluations"
                 f" {' '.join(clock.curve)}",
                 flush=True,
