@@ -143,7 +143,8 @@ def actuators_in_numbers(out: Path) -> None:
     """Draw the share of the largest force that the paper's actuators deliver on blocked joints."""
     plots = []
     for task in (
-        task for task in PAPER_TASKS
+        task
+        for task in PAPER_TASKS
         if task.name in ("pendulum", "cartpole", "acrobot", "mountain_car")
     ):
         timestep = task.step_duration / task.motor_inner_steps

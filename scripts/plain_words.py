@@ -10,7 +10,7 @@ import io
 import itertools
 import re
 import tokenize
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -75,7 +75,8 @@ def count_words(folder: Path) -> Words:
         for line_number, name in new_names(tree):
             if EMPTY_NAME.fullmatch(name):
                 places["names"].append(f"{path}:{line_number}: {name}")
-    counts: dict[str, float] = Counter({kind: len(hits) for kind, hits in places.items()})
+    counts: dict[str, float] = defaultdict(float)
+    counts |= {kind: len(hits) for kind, hits in places.items()}
     counts["comments_per_k"] = round(1000 * num_comments / max(num_lines, 1), 1)
     return Words(counts, places)
 
