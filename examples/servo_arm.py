@@ -1,7 +1,7 @@
-"""An arm with position servos, as somebody's Gymnasium environment: two links in a vertical plane reach for a point.
+"""Third-party environment with position servos: a two-link arm reaches for a point in a plane.
 
-The action is where the joints are asked to be; `ServoArm-v0` registers with Gymnasium when this
-module is imported.
+The plane is vertical. The action is the desired angles of the joints. `ServoArm-v0` is registered
+with Gymnasium when this module is imported.
 """
 
 import tempfile
@@ -47,7 +47,10 @@ SHOULDER = np.array([0.0, 0.3])  # [m], x and z
 
 
 class ServoArm(MujocoEnv):
-    """Observed are the angles' cosines and sines, their speeds, the target and the way to it; the reward is -distance.
+    """Two-link arm that observes its joints and the target; the reward is minus the distance.
+
+    The observation is the cosines and sines of the angles, their speeds, the target, and the
+    vector from the hand to the target.
 
     A step is 25 ms, an episode 100. Success: the hand is within 3 cm of the target at the end.
     """
@@ -66,36 +69,39 @@ class ServoArm(MujocoEnv):
             super().__init__(str(path), 5, space, camera_name="side", **options)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Ask the servos for an angle each."""
+        """Set the desired angles of the servos and simulate a step."""
         self.do_simulation(action, self.frame_skip)
-        distance = float(np.linalg.norm(self._way()))
-        return self._seen(), -distance, False, False, {"is_success": distance < NEAR}
+        distance = float(np.linalg.norm(self._error()))
+        return self._observe(), -distance, False, False, {"is_success": distance < NEAR}
 
     @property
     def _target(self) -> np.ndarray:
-        """Of the hand [m], from the shoulder; where all of an environment's state should be: in MuJoCo's."""
+        """Desired position of the hand [m], from the shoulder.
+
+        It is stored in MuJoCo's state, like everything in an environment that a reset restores.
+        """
         return self.data.mocap_pos[0, ::2] - SHOULDER
 
-    def _way(self) -> np.ndarray:
-        """From the hand to the target [m]."""
-        shoulder, both = self.data.qpos[0], self.data.qpos.sum()
+    def _error(self) -> np.ndarray:
+        """Return the vector from the hand to the target [m]."""
+        shoulder, forearm = self.data.qpos[0], self.data.qpos.sum()
         hand = 0.2 * np.array([np.cos(shoulder), np.sin(shoulder)]) + 0.18 * np.array(
-            [np.cos(both), np.sin(both)]
+            [np.cos(forearm), np.sin(forearm)]
         )
         return self._target - hand
 
-    def _seen(self) -> np.ndarray:
+    def _observe(self) -> np.ndarray:
         angles = self.data.qpos
         return np.concatenate(
-            [np.cos(angles), np.sin(angles), 0.1 * self.data.qvel, self._target, self._way()]
+            [np.cos(angles), np.sin(angles), 0.1 * self.data.qvel, self._target, self._error()]
         )
 
     def reset_model(self) -> np.ndarray:
-        """Start at rest somewhere, with a target within reach."""
+        """Start at rest in a random pose, with a target within reach."""
         angle, radius = self.np_random.uniform(-np.pi, np.pi), self.np_random.uniform(0.12, REACH)
         self.data.mocap_pos[0, ::2] = SHOULDER + radius * np.array([np.cos(angle), np.sin(angle)])
         self.set_state(self.np_random.uniform(-1.0, 1.0, 2), np.zeros(2))
-        return self._seen()
+        return self._observe()
 
 
 gymnasium.register("ServoArm-v0", ServoArm, max_episode_steps=100)

@@ -1,4 +1,4 @@
-"""Writes docs/actuators_in_numbers.md and its two CSV files: what every actuator that has a name does on a bench.
+"""Write docs/actuators_in_numbers.md and its two CSV files: bench results of all named actuators.
 
 Torques and speeds are measured in the engine, on one hinge: blocked, turned slowly by a heavy load,
 or free. The loops of the catalogue's motors and their continuous torques are `codrl_mj.sizing`'s.
@@ -31,13 +31,13 @@ FOLDER = Path(__file__).parent.parent / "docs"
 PAGE = "actuators_in_numbers.md"
 TABLES = {"tasks": "actuators_in_numbers_tasks.csv", "motors": "actuators_in_numbers_motors.csv"}
 TASKS = {task.name: task for task in PAPER_TASKS}
-"""Those that have the paper's actuators."""
+"""Built-in tasks, which have the paper's actuators."""
 LONG = 200.0
-"""Time [s] after which the slowest of the tasks' loops has settled."""
+"""Time [s] after which the slowest current loop of the tasks has settled."""
 
 
 def settled(torques: np.ndarray, band: float) -> int:
-    """The first step from which on the torque, shape (steps,), stays within a share of its last."""
+    """Return the step from which the torque, shape (steps,), stays within `band` of its end."""
     wrong = np.flatnonzero(np.abs(torques / torques[-1] - 1.0) > band)
     return int(wrong[-1]) + 1 if len(wrong) else 0
 
@@ -45,28 +45,29 @@ def settled(torques: np.ndarray, band: float) -> int:
 def free_run(
     actuator: Any, timestep: float, inertia: float, time_constant: float
 ) -> tuple[float, float]:
-    """No-load speed [rad/s] of the joint and the time constant [s] in which it is reached.
+    """Return the joint's no-load speed [rad/s] and the time constant [s] of reaching it.
 
-    That is the area between speed and no-load speed over the latter: the sum of all time constants
-    less none of the winding's, whatever its inductance; torque and back-EMF are of the speed at a
-    step's start, and so is the sum.
+    The time constant is the area between no-load speed and speed, divided by the no-load speed.
+    It is the sum of all time constants minus the winding's, whatever the inductance: torque and
+    back-EMF are evaluated with the speed at a step's start, and so is the area.
 
     Args:
-        actuator: whose.
-        timestep: [s].
-        inertia: of the load [kg*m^2].
-        time_constant: about the one to be found [s], for how long to look.
+        actuator: actuator on the bench.
+        timestep: integration step [s].
+        inertia: inertia of the load [kg*m^2].
+        time_constant: rough estimate [s] of the time constant; the run lasts 20 times as long.
     """
+    # 1e6 is far beyond every limit: the actuator drives the load as hard as it can.
     speeds = on_bench(actuator, timestep, inertia)(1e6, 20.0 * time_constant)[:, 2]
     return float(speeds[-1]), float(timestep * (1.0 + np.sum(1.0 - speeds / speeds[-1])))
 
 
 def task_row(task: str, name: str) -> dict[str, Any]:
-    """What a named actuator does on a task's bench: a torque step to the task's largest force, stall, free run."""
+    """Measure a named actuator on a task's bench: step to the largest force, stall, free run."""
     spec, actuator = TASKS[task], named_actuator(name, task)
     timestep, motor = spec.step_duration / spec.motor_inner_steps, actuator.motor
-    asked, blocked = float(spec.max_forces[0]), on_bench(actuator, timestep, BLOCKED)
-    torques = blocked(asked, LONG)[:, 0]
+    max_force, blocked = float(spec.max_forces[0]), on_bench(actuator, timestep, BLOCKED)
+    torques = blocked(max_force, LONG)[:, 0]
     row: dict[str, Any] = {"task": task, "actuator": name}
     for band in (5, 2):
         seconds = settled(torques, band / 100) * timestep
@@ -76,8 +77,9 @@ def task_row(task: str, name: str) -> dict[str, Any]:
     )
 
     return row | {
-        "first_step_percent": 100.0 * torques[spec.motor_inner_steps - 1] / asked,
-        "steady_error_percent": round(100.0 * (torques[-1] / asked - 1.0), 6) + 0.0,
+        "first_step_percent": 100.0 * torques[spec.motor_inner_steps - 1] / max_force,
+        # Adding 0.0 turns a negative zero into zero.
+        "steady_error_percent": round(100.0 * (torques[-1] / max_force - 1.0), 6) + 0.0,
         "stall_torque": blocked(1e6, 50.0 * motor.electrical_time_constant)[-1, 0],
         "no_load_speed": free_run(actuator, timestep, 50.0 * timestep * product, 50.0 * timestep)[
             0
@@ -96,9 +98,10 @@ def _on_a_slide(task: str) -> bool:
 
 
 def motor_row(name: str) -> dict[str, Any]:
-    """What a motor of the catalogue does at its own gear, at the output, by its nominal voltage or 24 V, still cold."""
+    """Measure a motor of the catalogue, cold, at its nominal voltage (or 24 V) and its own gear."""
     drive, numbers = find_drive(name), motor_entry(name).numbers
     loop = design(drive)
+    # Stall and no load are properties of the motor, so the controller does not limit the current.
     cold = dataclasses.replace(drive.motor, **NO_HEATING)
     free = dataclasses.replace(
         drive, motor=cold, controller=dataclasses.replace(drive.controller, max_current=math.inf)
@@ -129,7 +132,7 @@ def motor_row(name: str) -> dict[str, Any]:
 
 
 def _free(drive: Drive) -> tuple[float, float]:
-    """`free_run` of the rotor alone; where its inertia is not known, of a load that takes 20 ms."""
+    """Return `free_run` of the bare rotor, or with a 20 ms load if its inertia is unknown."""
     motor, rate = drive.motor, drive.controller.sample_rate
     product = (
         motor.torque_constant * motor.back_emf_constant * motor.gear_efficiency / motor.resistance
@@ -137,28 +140,30 @@ def _free(drive: Drive) -> tuple[float, float]:
     known = motor.rotor_inertia > 0.0
     time_constant = motor.rotor_inertia / product if known else 0.02
     timestep = max(math.floor(time_constant / 100.0 * rate), 1) / rate
+    # MuJoCo needs a load with an inertia; 1e-13 kg*m^2 is nothing beside a rotor.
     inertia = 1e-13 if known else 0.02 * product / drive.arm_radius**2
     return free_run(drive, timestep, inertia, time_constant)
 
 
 def _stall(drive: Drive, no_load_speed: float) -> float:
-    """Torque [N*m] of the output that just turns, by its line through 1 and 2 % of the no-load speed."""
+    """Return the stall torque [N*m] at the output, extrapolated from 1 and 2 % of no-load speed."""
     duration = max(50.0 * drive.motor.electrical_time_constant, 2e-3)
-    most = (
+    max_torque = (
         drive.motor.torque_constant
         * drive.voltage_limit
         / drive.motor.resistance
         / drive.arm_radius
     )
+    # A motor that stands still may be held by friction, so it is turned slowly by a heavy load.
     bench = on_bench(
-        drive, 1.0 / drive.controller.sample_rate, 1e4 * most * duration / no_load_speed
+        drive, 1.0 / drive.controller.sample_rate, 1e4 * max_torque * duration / no_load_speed
     )
     slow, less_slow = (bench(1e6, duration, share * no_load_speed)[-1, 1] for share in (0.01, 0.02))
     return float(2.0 * slow - less_slow)
 
 
 def rows() -> dict[str, list[dict[str, Any]]]:
-    """Both tables."""
+    """Measure the rows of both tables."""
     named = [name for name in NAMED if name != "ideal"]
     return {
         "tasks": [task_row(task, name) for task in TASKS for name in named],
@@ -167,7 +172,7 @@ def rows() -> dict[str, list[dict[str, Any]]]:
 
 
 def _number(value: Any, digits: int = 3) -> str:
-    """A number for people: without the last digits, and – where there is none."""
+    """Format a number with few digits; "–" if it is not finite."""
     value = float(value)
     if not math.isfinite(value):
         return "–"
@@ -180,18 +185,18 @@ def _table(heads: Iterable[str], body: Iterable[Iterable[str]]) -> str:
 
 
 def _ranges(rows: list[dict[str, str]], column: str) -> list[str]:
-    """The least and the largest of a number, from task to task, of each actuator."""
-    found: dict[str, list[float]] = {}
+    """Return the minimum and maximum over the tasks of each actuator's value."""
+    values: dict[str, list[float]] = {}
     for row in rows:
-        found.setdefault(row["actuator"], []).append(float(row[column]))
+        values.setdefault(row["actuator"], []).append(float(row[column]))
     return [
-        " to ".join(dict.fromkeys([_number(min(some)), _number(max(some))]))
-        for some in found.values()
+        " to ".join(dict.fromkeys([_number(min(actuator_values)), _number(max(actuator_values))]))
+        for actuator_values in values.values()
     ]
 
 
 def _motor_line(row: dict[str, str]) -> list[str]:
-    """A motor: what is printed, and what is measured."""
+    """Return a motor's row of the page: printed values, then measured ones."""
     entry = motor_entry(row["motor"])
     measured = ("stall_torque", "no_load_speed", "continuous_torque")
     return [
@@ -201,10 +206,10 @@ def _motor_line(row: dict[str, str]) -> list[str]:
 
 
 def page(tables: Mapping[str, list[dict[str, str]]]) -> str:
-    """The Markdown page, from the rows of the CSV files and the catalogue."""
+    """Return the Markdown page, from the rows of the CSV files and the catalogue."""
     tasks, motors = tables["tasks"], tables["motors"]
     heads = ("motor", "V", "gear", "stall [N·m]", "no load [rad/s]", "continuous [N·m]")
-    names = [f"`{name}`" for name in dict.fromkeys(row["actuator"] for row in tasks)]
+    actuator_names = [f"`{name}`" for name in dict.fromkeys(row["actuator"] for row in tasks)]
     paper = {
         "settles within 2 % [s]": "settled_2_s",
         "is there after a policy's step [%]": "first_step_percent",
@@ -221,7 +226,7 @@ What every named [actuator](actuators.md) does on one hinge, blocked or free. Mo
 
 A step to the task's largest force, over the tasks (0: within the first integration step; all is there by {LONG:g} s):
 
-{_table(["", *names], [[words, *_ranges(tasks, column)] for words, column in paper.items()])}
+{_table(["", *actuator_names], [[words, *_ranges(tasks, column)] for words, column in paper.items()])}
 
 ## The catalogue
 
@@ -238,7 +243,7 @@ values. –: not printed. Stall and no load are measured; they are as printed, t
 
 
 def _write(measured: list[dict[str, Any]], path: Path) -> list[dict[str, str]]:
-    """Write a table, and return its rows as they stand there."""
+    """Write a table, and return its rows as the file has them."""
     texts = [
         {
             key: f"{value:.6g}" if isinstance(value, float) else f"{value}"

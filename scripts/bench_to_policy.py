@@ -1,9 +1,9 @@
-"""From a bench log to a policy: log, identify, train with what is left open, test on the motor that the log is of.
+"""Go from bench logs to a policy: identify the motor, randomize within its intervals, test.
 
-The motor on the bench is one that only its logs show: that of a datasheet with more friction, a
-higher resistance and a lower torque constant. Agents learn Pendulum through the datasheet's motor
-and through the identified one, drawn within its intervals, and are tested on the real one.
-Trainings that were interrupted go on.
+The real motor differs from its datasheet: more friction, a higher resistance and a lower torque
+constant. Only its logs show that. Agents learn Pendulum through the datasheet's motor and through
+the identified one, randomized within its intervals, and are tested on the real one. Interrupted
+trainings are resumed.
 """
 
 import argparse
@@ -37,20 +37,21 @@ REAL = dataclasses.replace(
         viscous_friction=1e-4,  # N*m*s/rad at the rotor
     ),
 )
+# Noise in A, resolution in rad.
 SENSORS = {
     "current": Sensor(noise=0.05),
     "position": Sensor(resolution=2.0 * np.pi / 4096),
-}  # A, rad
+}
 COLUMNS = "time=time:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
 
 
 def main() -> None:
-    """Log, identify, train, test."""
+    """Log, identify, train and test."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("runs/bench_to_policy"), help="folder for all of it"
+        "--out", type=Path, default=Path("runs/bench_to_policy"), help="folder for all outputs"
     )
     parser.add_argument("--seeds", type=int, default=3, help="trainings of each kind")
     parser.add_argument(
@@ -58,14 +59,15 @@ def main() -> None:
     )
     options = parser.parse_args()
     logs = list(_bench())
-    found = identify(logs[:2], "free", {"gear_ratio": 20.0, "load_inertia": 0.0}, held_out=logs[2:])
-    for one in found.estimates:
-        real = getattr(REAL.motor, one.name, None)
+    # The third log is held out: it only tests the fit.
+    fit = identify(logs[:2], "free", {"gear_ratio": 20.0, "load_inertia": 0.0}, held_out=logs[2:])
+    for estimate in fit.estimates:
+        real = getattr(REAL.motor, estimate.name, None)
         print(
-            f"{one.name}: {one.value:.4g} [{one.low:.4g}, {one.high:.4g}] {one.unit}, {one.status};"
-            f" real {real}"
+            f"{estimate.name}: {estimate.value:.4g} [{estimate.low:.4g}, {estimate.high:.4g}]"
+            f" {estimate.unit}, {estimate.status}; real {real}"
         )
-    found.write(options.out)
+    fit.write(options.out)
     fitted = options.out / "actuator.yaml"
     through = {
         "datasheet": EnvConfig(TASK, mapping_of(DATASHEET)),
@@ -83,7 +85,7 @@ def main() -> None:
 
 
 def _bench() -> Iterator[Log]:
-    """Three logs of the real motor without a load, written to files and read again, as a bench would have it."""
+    """Simulate three logs of the real motor without a load; yield them as read from files."""
     excitation = Excitation("prbs", amplitude=20.0, duration=4.0, clock=2e-3)
     sampler = Sampler(rate=5000.0, mean_voltage=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -104,12 +106,14 @@ def _trained(env: EnvConfig, out: Path, seed: int, steps: int) -> Path:
 
 
 def _tested(runs: list[Path], motor: Any) -> str:
-    """Mean return over seeds, lowest and highest, and how many episodes end upright."""
+    """Return mean, minimum and maximum return over the runs, and the share of upright episodes."""
     tests = [
         evaluate(load_policy(run), EnvConfig(TASK, motor), EPISODES, TEST_SEED) for run in runs
     ]
-    returns = [one.returns.mean for one in tests]
-    upright = np.mean([one.success.mean for one in tests if one.success is not None])
+    returns = [evaluation.returns.mean for evaluation in tests]
+    upright = np.mean(
+        [evaluation.success.mean for evaluation in tests if evaluation.success is not None]
+    )
     return f"{np.mean(returns):.0f} [{min(returns):.0f}, {max(returns):.0f}], {upright:.0%} upright"
 
 

@@ -1,13 +1,13 @@
-"""Speed of our environments beside others'; everything is measured side by side in this one run.
+"""Compare the speed of codrl_mj's environments with other libraries', side by side in one run.
 
-The members of a group take turns: A, B, C, A, B, C, ... with many steps a turn; the table has the
-median of the ratios to the group's first member, turn by turn, with their range. Libraries that are
-not installed are skipped.
+The members of a group take turns: A, B, C, A, B, C, ... with many steps a turn. The table shows the
+median ratio to the group's first member, over the turns, with the range. Libraries that are not
+installed are skipped.
 
-`--publish` puts them into docs/results/speed.csv, in place of the same groups' before, and writes
-docs/speed.md. `--quick` compares with scripts/ratios.json instead, in two minutes, and fails where
-something became slower; a change that is meant to be slower says why, and writes them anew by
-`--keep`. Trainings are in scripts/benchmark_training.py.
+`--publish` replaces the measured groups in docs/results/speed.csv and rewrites docs/speed.md.
+`--quick` compares with scripts/ratios.json instead, in two minutes, and fails if anything became
+slower. A commit that slows something down on purpose says why and updates the ratios with `--keep`.
+Trainings are measured by scripts/benchmark_training.py.
 """
 
 # isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
@@ -39,7 +39,7 @@ from codrl_mj.tasks import PAPER_TASKS
 Makers = list[Callable[[], Subject]]
 NUM_ENVS = 1024
 BOUGHT = "maxon-ec45-flat-50w"
-# of its dm_control swing-ups Pendulum's alone: a thousand of the others take minutes to make
+# Of EnvPool's dm_control swing-ups only Pendulum's: creating a thousand others takes minutes.
 ENVPOOL = {
     "pendulum": ("Pendulum-v1", "PendulumSwingup-v1"),
     "cartpole": ("CartPole-v1",),
@@ -48,12 +48,10 @@ ENVPOOL = {
     "mountain_car_continuous": ("MountainCarContinuous-v0",),
 }
 TASKS = {task.name: task for task in PAPER_TASKS}
-APART = (
-    "mountain_car",
-    "mountain_car_continuous",
-)  # whose walls need a call of the engine for each step of it
+# The walls of these tasks are checked after each integration step, with a call of the engine each.
+APART = ("mountain_car", "mountain_car_continuous")
 RATIOS = Path(__file__).with_name("ratios.json")
-"""Group -> member -> its ratio to the group's first member, as it was."""
+"""Group -> member -> its stored ratio to the group's first member."""
 ROWS = Path(__file__).parents[1] / "docs" / "results" / "speed.csv"
 PAGE, WRITTEN = ROWS.parents[1] / "speed.md", "<!-- written by scripts/benchmark.py -->\n"
 SHOWN = {
@@ -67,23 +65,26 @@ SHOWN = {
     "foreign: Humanoid-v5": "Humanoid, seventeen motors",
     "engine: pendulum": "The engine's step, Pendulum",
 }
-"""Group -> what it is called on the page."""
+"""Group -> its title on the page."""
 SLOWER = 0.85
-"""Of a ratio that is kept, below which something became slower."""
+"""Fraction of a stored ratio below which a member counts as slower."""
 TRIES = 4
-"""Measurements of a group, by whose best it is judged: other processes make something slower, none makes it faster."""
+"""Maximum number of measurements of a group; the best one counts.
+
+Other processes make a measurement slower, and nothing makes it faster.
+"""
 DM_CONTROL = {"pendulum": "swingup", "cartpole": "swingup", "acrobot": "swingup"}
 
 
-def kept_groups() -> dict[str, Makers]:
-    """What `--quick` compares: the single step, the batch, the engine and an environment of others."""
-    found: dict[str, Makers] = {
+def quick_groups() -> dict[str, Makers]:
+    """Return the groups of `--quick`: single steps, batches, engine, a third-party environment."""
+    groups_by_title: dict[str, Makers] = {
         "single: pendulum": [
-            partial(subjects.theirs, "Pendulum-v1"),
+            partial(subjects.gymnasium_env, "Pendulum-v1"),
             partial(subjects.ours, "pendulum", "paper"),
         ],
         "single: cartpole": [
-            partial(subjects.theirs, "InvertedPendulum-v5"),
+            partial(subjects.gymnasium_env, "InvertedPendulum-v5"),
             partial(subjects.ours, "cartpole", "paper"),
         ],
         "foreign: HalfCheetah-v5": [
@@ -91,14 +92,14 @@ def kept_groups() -> dict[str, Makers]:
             partial(subjects.foreign, "HalfCheetah-v5", BOUGHT),
         ],
         "engine: pendulum": [
-            partial(subjects.engine, "pendulum", one) for one in (None, "paper", "drive")
+            partial(subjects.engine, "pendulum", actuator) for actuator in (None, "paper", "drive")
         ],
     }
     for task in ("pendulum", "cartpole", "acrobot"):
-        found[f"two threads: {task}"] = [
+        groups_by_title[f"two threads: {task}"] = [
             subject(task, NUM_ENVS, 2) for subject in (_batch, _vector)
         ]
-    return found
+    return groups_by_title
 
 
 def _batch(task: str, num_envs: int, threads: int) -> Callable[[], Subject]:
@@ -110,112 +111,118 @@ def _vector(task: str, num_envs: int, threads: int) -> Callable[[], Subject]:
 
 
 def compare(keep: bool) -> int:
-    """Measure what is kept; 1 where something became slower, by the best of some tries.
+    """Measure the quick groups and compare them with the stored ratios; return 1 if any is slower.
 
     Args:
-        keep: write the ratios, each the least of the tries, instead of comparing.
+        keep: store the minimum ratios of all tries instead of comparing.
     """
-    kept: dict[str, Any] = {} if keep else read_json(RATIOS, "ratios")
+    stored: dict[str, Any] = {} if keep else read_json(RATIOS, "ratios")
     slower = False
-    for title, makers in kept_groups().items():
+    for title, makers in quick_groups().items():
         first, *others = members = build(makers)
-        was = np.array([0.0 if keep else kept[title][one.name] for one in others])
-        clock = (
-            time.perf_counter if "threads" in title else time.process_time
-        )  # which other processes do not move
+        stored_ratios = np.array([0.0 if keep else stored[title][member.name] for member in others])
+        # Other processes do not affect processor time, but it adds up over threads.
+        clock = time.perf_counter if "threads" in title else time.process_time
         tries: list[list[float]] = []
         while len(tries) < TRIES and (
-            keep or not tries or (np.max(tries, axis=0) < SLOWER * was).any()
+            keep or not tries or (np.max(tries, axis=0) < SLOWER * stored_ratios).any()
         ):
-            found = measure(members, 15, 0.02, clock)
-            tries.append([found[one.name]["ratio"][0] for one in others])
+            results = measure(members, 15, 0.02, clock)
+            tries.append([results[member.name]["ratio"][0] for member in others])
         if keep:
-            kept[title] = {
-                one.name: round(ratio, 3)
-                for one, ratio in zip(others, np.min(tries, axis=0), strict=True)
+            stored[title] = {
+                member.name: round(ratio, 3)
+                for member, ratio in zip(others, np.min(tries, axis=0), strict=True)
             }
-        for one, ratio, before in zip(others, np.max(tries, axis=0), was, strict=True):
-            verdict = "  SLOWER" if ratio < SLOWER * before else ""
+        for member, ratio, stored_ratio in zip(
+            others, np.max(tries, axis=0), stored_ratios, strict=True
+        ):
+            verdict = "  SLOWER" if ratio < SLOWER * stored_ratio else ""
             print(
-                f"{title}: {one.name}: {ratio:.3f} of {first.name}, was {before:.3f}{verdict}",
+                f"{title}: {member.name}: {ratio:.3f} of {first.name}, was {stored_ratio:.3f}"
+                f"{verdict}",
                 flush=True,
             )
             slower |= bool(verdict)
     if keep:
-        write_json(RATIOS, kept)
+        write_json(RATIOS, stored)
     return int(slower)
 
 
 def groups() -> dict[str, Makers]:
-    """What is compared with what; the first of a group is what the others are divided by."""
-    found: dict[str, Makers] = {}
+    """Return all groups; the speeds of a group are divided by its first member's."""
+    groups_by_title: dict[str, Makers] = {}
     for task in TASKS:
-        found[f"engine: {task}"] = [
-            partial(subjects.engine, task, one) for one in (None, "paper", "drive", "stepped")
+        groups_by_title[f"engine: {task}"] = [
+            partial(subjects.engine, task, actuator)
+            for actuator in (None, "paper", "drive", "stepped")
         ]
     for count in (1, 6, 17):
         drivers = (None, "ideal", "torque_speed", "lag", "current_loop")
-        found[f"motorised: {count} motors"] = [
+        groups_by_title[f"motorised: {count} motors"] = [
             partial(subjects.chain, count, driver) for driver in drivers
         ]
     for env_id in ("HalfCheetah-v5", "Humanoid-v5"):
-        given = (None, "ideal", "lag", "torque_speed", BOUGHT)
-        found[f"foreign: {env_id}"] = [
-            partial(subjects.foreign, env_id, driver) for driver in given
+        actuators = (None, "ideal", "lag", "torque_speed", BOUGHT)
+        groups_by_title[f"foreign: {env_id}"] = [
+            partial(subjects.foreign, env_id, driver) for driver in actuators
         ]
-        found[f"foreign: {env_id}"].append(partial(subjects.without_motors, env_id, BOUGHT))
+        groups_by_title[f"foreign: {env_id}"].append(
+            partial(subjects.without_motors, env_id, BOUGHT)
+        )
     for task, definition in TASKS.items():
         assert definition.gymnasium_id is not None
-        members: Makers = [partial(subjects.theirs, definition.gymnasium_id)]
+        members: Makers = [partial(subjects.gymnasium_env, definition.gymnasium_id)]
         members += [partial(subjects.ours, task, actuator) for actuator in ("paper", "ideal")]
         if task == "cartpole":
-            members.append(partial(subjects.theirs, "InvertedPendulum-v5"))
+            members.append(partial(subjects.gymnasium_env, "InvertedPendulum-v5"))
         if task in DM_CONTROL:
             members.append(partial(subjects.dm_control, task, DM_CONTROL[task]))
         if task == "pendulum":
             members.append(subjects.electric_motor)
-        found[f"single: {task}"] = members
+        groups_by_title[f"single: {task}"] = members
     for task in TASKS:
         members = [partial(subjects.raw_batch, task, NUM_ENVS, 1, apart) for apart in (False, True)]
         members += [
             partial(subjects.vector, task, NUM_ENVS, 1, actuator) for actuator in ("paper", "ideal")
         ]
         members += [partial(subjects.envpool, name, NUM_ENVS, 1) for name in ENVPOOL[task]]
-        found[f"vector: {task}"] = members
+        groups_by_title[f"vector: {task}"] = members
         apart = task in APART
         members = [
             partial(subjects.raw_batch, task, NUM_ENVS, 2, apart),
             partial(subjects.vector, task, NUM_ENVS, 2),
         ]
-        found[f"two threads: {task}"] = members
+        groups_by_title[f"two threads: {task}"] = members
     for count in (NUM_ENVS, 16_384):
-        both = (
+        pair = (
             partial(subjects.envpool, "Pendulum-v1", count, 2),
             partial(subjects.vector, "pendulum", count, 2),
         )
-        found[f"EnvPool: {count}"] = list(both)
+        groups_by_title[f"EnvPool: {count}"] = list(pair)
     cores = sorted({1, 2, cpus()})
     sizes = [
         (num_envs, threads) for num_envs in (NUM_ENVS, 1, 64, 16_384, 100_000) for threads in cores
     ]
     for task in TASKS:
-        found[f"sizes: {task}"] = [partial(subjects.vector, task, *size) for size in sizes]
+        groups_by_title[f"sizes: {task}"] = [
+            partial(subjects.vector, task, *size) for size in sizes
+        ]
     for task in ("cartpole", "mountain_car"):
-        found[f"drawing: {task}"] = [
+        groups_by_title[f"drawing: {task}"] = [
             partial(subjects.drawing, task, fast) for fast in (False, True)
         ]
-    return found
+    return groups_by_title
 
 
 def build(makers: Makers) -> list[Subject]:
-    """The members of a group that can be had here; the others are named, with the reason."""
+    """Create the members of a group; print those that fail, such as missing libraries, and why."""
     members = []
     for make in makers:
         try:
             members.append(make())
-        except (
-            Exception
-        ) as error:  # a missing library, or one that does not work with the others installed
+        # A library may be missing, or may not work with the versions that are installed here.
+        except Exception as error:
             arguments = ", ".join(map(str, getattr(make, "args", ())))
             name = getattr(make, "func", make).__name__
             console().print(
@@ -225,7 +232,7 @@ def build(makers: Makers) -> list[Subject]:
 
 
 def seconds(member: Subject, calls: int, clock: Callable[[], float]) -> float:
-    """The time that some calls take."""
+    """Return the time that a number of calls takes [s]."""
     member.prepare()
     start = clock()
     member.run(calls)
@@ -241,16 +248,16 @@ def measure(
     """Time the members in turn.
 
     Returns:
-        By name: steps per second, and their ratio to the first member's: (median, least, most)
-        each.
+        Steps per second and their ratio to the first member's, by name: (median, min, max) each.
     """
     calls = []
     for member in members:
-        seconds(member, 1, clock)  # compiles what it needs
+        # The first call compiles.
+        seconds(member, 1, clock)
         count = 1
-        while (taken := seconds(member, count, clock)) < turn_duration / 4 and count < 1_000_000:
+        while (elapsed := seconds(member, count, clock)) < turn_duration / 4 and count < 1_000_000:
             count *= 4
-        calls.append(max(1, round(count * turn_duration / taken)))
+        calls.append(max(1, round(count * turn_duration / elapsed)))
     speeds = np.empty((turns, len(members)))
     for turn in range(turns):
         for column, member in enumerate(members):
@@ -272,7 +279,7 @@ def _spread(values: np.ndarray) -> list[float]:
 
 
 def memory() -> dict[str, float]:
-    """Resident memory of a Pendulum environment with its motor in a batch [bytes], from the growth at N = 16384."""
+    """Return the memory of a Pendulum environment in a batch [bytes], measured at N = 16384."""
     page, num_envs = os.sysconf("SC_PAGE_SIZE"), 16384
 
     def resident() -> int:
@@ -286,23 +293,24 @@ def memory() -> dict[str, float]:
 
 
 def learning() -> dict[str, dict[str, float]]:
-    """PPO's environment steps per second, and the share of the time that stepping takes."""
-    found = {}
+    """Return PPO's environment steps per second, and the share of the time spent in stepping."""
+    results = {}
     for num_envs, ours in ((8, False), (64, True), (256, True)):
         name, train = subjects.ppo(num_envs, ours)
-        train(2048)  # warm-up
+        # Warm-up: the first rollout compiles.
+        train(2048)
         steps = 20480
         start = time.perf_counter()
         share = train(steps)
-        found[name] = {
+        results[name] = {
             "steps_per_second": steps / (time.perf_counter() - start),
             "share_in_environment": share,
         }
-    return found
+    return results
 
 
 def families() -> dict[str, float]:
-    """Seconds until a family runs in the engine, the first one's and the others'; they are compiled once a process."""
+    """Return the seconds until each family runs in the engine, in order; one process for all."""
     code = (
         "import time, codrl_mj\nfrom codrl_mj.actuators import FAMILIES\nfor name, family in"
         " FAMILIES.items():\n"
@@ -319,39 +327,40 @@ def families() -> dict[str, float]:
 
 
 def report(title: str, results: dict[str, dict[str, list[float]]]) -> None:
-    """Print a group's table."""
+    """Print the table of a group."""
     table = Table(title=title, title_justify="left")
     for column in ("", "steps/s", "ratio to the first"):
         table.add_column(column, justify="right" if column else "left")
-    for name, numbers in results.items():
-        ratio = "{:.2f} ({:.2f} to {:.2f})".format(*numbers["ratio"])
-        table.add_row(name, f"{numbers['steps_per_second'][0]:,.0f}", ratio)
+    for name, spreads in results.items():
+        ratio = "{:.2f} ({:.2f} to {:.2f})".format(*spreads["ratio"])
+        table.add_row(name, f"{spreads['steps_per_second'][0]:,.0f}", ratio)
     console().print(table)
 
 
 def publish(
     results: dict[str, dict[str, dict[str, list[float]]]], file: Path = ROWS, page: Path = PAGE
 ) -> None:
-    """Put groups among the rows of a file, and what is shown of all of them on a page."""
+    """Put groups among the rows of a CSV file, and rewrite the tables of a page."""
     rows = [row for row in read_csv(file) if row["group"] not in results]
     for group, members in results.items():
-        for name, numbers in members.items():
+        for name, spreads in members.items():
             speed, ratio = (
-                numbers["steps_per_second"][0],
-                [f"{one:.3f}" for one in numbers["ratio"]],
+                spreads["steps_per_second"][0],
+                [f"{value:.3f}" for value in spreads["ratio"]],
             )
             row = {"group": group, "member": name, "steps_a_second": f"{speed:.0f}"}
             rows.append(row | dict(zip(("ratio", "least", "most"), ratio, strict=True)))
     write_csv(file, rows)
+    # The page shows all published groups, also those that this run did not measure.
     tables = []
     for group, title in SHOWN.items():
-        own = [row for row in rows if row["group"] == group]
-        told = [
+        group_rows = [row for row in rows if row["group"] == group]
+        cells = [
             (row["member"], f"{int(row['steps_a_second']):,}", f"{float(row['ratio']):.2f}")
-            for row in own
+            for row in group_rows
         ]
         tables.append(
-            markdown_table((title, "steps a second", "times the first"), told, 2) if told else ""
+            markdown_table((title, "steps a second", "times the first"), cells, 2) if cells else ""
         )
     write_page(page, [page.read_text().partition(WRITTEN)[0] + WRITTEN, *tables])
 
@@ -362,17 +371,17 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--quick", action="store_true", help="compare with the ratios that are kept: two minutes"
+        "--quick", action="store_true", help="compare with the stored ratios: two minutes"
     )
-    parser.add_argument("--keep", action="store_true", help="measure and write those")
+    parser.add_argument("--keep", action="store_true", help="measure and store the ratios")
     parser.add_argument(
         "--only", default="", help="only groups whose name contains this, such as 'vector'"
     )
     parser.add_argument("--turns", type=int, default=11, help="turns of each member of a group")
-    parser.add_argument("--duration", type=float, default=0.1, help="of a turn [s]")
+    parser.add_argument("--duration", type=float, default=0.1, help="duration of a turn [s]")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     parser.add_argument(
-        "--publish", action="store_true", help="put the groups' rows and their page into docs/"
+        "--publish", action="store_true", help="write the groups' rows and their page in docs/"
     )
     options = parser.parse_args()
     turns = options.turns
@@ -384,7 +393,8 @@ def main() -> int:
     results: dict[str, Any] = {}
     measured: dict[str, Any] = {}
     if options.only in "memory":
-        results["memory"] = memory()  # first: later, freed memory would hide the growth
+        # Memory comes first: later, freed memory would hide the growth.
+        results["memory"] = memory()
         console().print(
             "memory: {bytes_per_environment:,.0f} bytes an environment".format(**results["memory"])
         )

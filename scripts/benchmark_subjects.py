@@ -1,4 +1,4 @@
-"""What the benchmark times: our simulations, and those of other libraries."""
+"""Subjects of the benchmark: simulations of codrl_mj and of other libraries."""
 
 # isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
 import dataclasses
@@ -21,42 +21,49 @@ from codrl_mj.tasks import TASKS, named_actuator
 from codrl_mj.validation.motor_catalogue import DriveOracle, task_drive
 
 ACTIONS = 1000
-"""Actions drawn beforehand."""
+"""Number of actions that are drawn in advance."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Subject:
-    """Something that takes steps."""
+    """One thing that is timed: a simulation that takes steps."""
 
     name: str
-    """Its name in the table."""
+    """Name in the table."""
     run: Callable[[int], None]
-    """Makes the given number of calls; what is timed."""
+    """Timed function; it makes the given number of calls."""
     prepare: Callable[[], Any] = lambda: None
-    """Called before each turn, not timed."""
+    """Function that is called before each turn and not timed."""
     per_call: int = 1
-    """Environment steps (or frames) in one call."""
+    """Number of environment steps (or frames) in one call."""
 
 
 def engine(task: str, actuator: str | None = "paper") -> Subject:
-    """`mj_step` of the task's model with an actuator; None: without our callbacks, a motor dead weight, a hill flat.
+    """Return `mj_step` of the task's model with an actuator; None: without our callbacks.
+
+    Without callbacks the motor is dead weight and a hill is flat.
 
     Args:
         task: the task's name.
-        actuator: `paper`; `drive`, the one that the certificate runs the task with; or `stepped`,
-            the same with its gains given, which is what keeps it from its closed form.
+        actuator: `paper`; `drive`, the actuator of the task's certificate; or `stepped`, the
+            same with explicit gains, which is solved substep by substep, not in closed form.
     """
     definition = TASKS[task]
     timestep = definition.step_duration / definition.motor_inner_steps
-    one: Any = named_actuator("paper", task)
+    fitted_actuator: Any = named_actuator("paper", task)
     if actuator in ("drive", "stepped"):
-        one = task_drive(task)
+        fitted_actuator = task_drive(task)
     if actuator == "stepped":
-        bench = DriveOracle(one, timestep)
-        one = one.replaced(
-            {"controller.kp": bench.kp, "controller.ki": bench.ki * one.controller.sample_rate}
+        bench = DriveOracle(fitted_actuator, timestep)
+        fitted_actuator = fitted_actuator.replaced(
+            {
+                "controller.kp": bench.kp,
+                "controller.ki": bench.ki * fitted_actuator.controller.sample_rate,
+            }
         )
-    model = task_model(SimulationConfig(definition, (one,), definition.motor_inner_steps))
+    model = task_model(
+        SimulationConfig(definition, (fitted_actuator,), definition.motor_inner_steps)
+    )
     data = mujoco.MjData(model)
 
     def prepare() -> None:
@@ -64,7 +71,8 @@ def engine(task: str, actuator: str | None = "paper") -> Subject:
         if actuator is not None:
             install_callbacks(model)
         mujoco.mj_resetData(model, data)
-        data.qpos[:] = 0.3  # in motion in both cases: at rest, a step is cheaper
+        # The pendulum is in motion with and without motors: at rest, a step is cheaper.
+        data.qpos[:] = 0.3
         data.qvel[:] = 0.1
         data.ctrl[:] = model.actuator_ctrlrange[0, 1] / 2
 
@@ -73,7 +81,7 @@ def engine(task: str, actuator: str | None = "paper") -> Subject:
 
 
 def chain(motors: int, actuator: str | None, substeps: int = 10) -> Subject:
-    """`mj_step` of a chain of links with a motor in every joint; None leaves MuJoCo's own."""
+    """Return `mj_step` of a chain of links with a motor in every joint; None: MuJoCo's."""
     spec = mujoco.MjSpec()
     body = spec.worldbody
     for index in range(motors):
@@ -84,13 +92,13 @@ def chain(motors: int, actuator: str | None, substeps: int = 10) -> Subject:
             name=f"motor{index}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
         motor.set_to_motor()
-    given: Any = {
+    custom_actuators: Any = {
         "current_loop": codrl_mj.actuators.DCMotorActuator(
             controller=codrl_mj.actuators.CurrentLoop(ki=1.0, substeps=substeps)
         )
     }
     if actuator is not None:
-        spec = codrl_mj.add_motors(spec, {".*": given.get(actuator, actuator)})
+        spec = codrl_mj.add_motors(spec, {".*": custom_actuators.get(actuator, actuator)})
     model = spec.compile()
     data = mujoco.MjData(model)
 
@@ -103,7 +111,7 @@ def chain(motors: int, actuator: str | None, substeps: int = 10) -> Subject:
 
 
 def single(name: str, env: Any) -> Subject:
-    """Steps of a Gymnasium environment under random actions, with resets."""
+    """Return the steps of a Gymnasium environment under random actions, with resets."""
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(ACTIONS)]
 
@@ -113,26 +121,25 @@ def single(name: str, env: Any) -> Subject:
             if terminated or truncated:
                 env.reset()
 
-    return Subject(
-        name, run, lambda: env.reset(seed=0)
-    )  # a reset installs our callbacks where the environment is ours
+    # If the environment is ours, the reset installs our callbacks.
+    return Subject(name, run, lambda: env.reset(seed=0))
 
 
 def ours(task: str, actuator: str) -> Subject:
-    """Our environment through `gym.make`."""
+    """Return our environment, made by `gym.make`."""
     env = gymnasium.make(TASKS[task].env_id, actuator=actuator, disable_env_checker=True)
     return single(f"ours, actuator {actuator!r}", env)
 
 
-def theirs(env_id: str) -> Subject:
-    """A Gymnasium environment."""
+def gymnasium_env(env_id: str) -> Subject:
+    """Return a Gymnasium environment."""
     return single(f"Gymnasium {env_id}", gymnasium.make(env_id, disable_env_checker=True))
 
 
 def foreign(env_id: str, actuator: str | None) -> Subject:
-    """An environment of Gymnasium's with motors behind its actuators; None: as it is."""
+    """Return a Gymnasium environment with added motors; None: with its own actuators."""
     if actuator is None:
-        return theirs(env_id)
+        return gymnasium_env(env_id)
     return single(
         actuator,
         codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True, disable_env_checker=True),
@@ -140,10 +147,11 @@ def foreign(env_id: str, actuator: str | None) -> Subject:
 
 
 def without_motors(env_id: str, actuator: str) -> Subject:
-    """It with all that an actuator adds to its joints, inertia and friction: what the engine alone takes with those."""
+    """Return an environment with the inertia and friction that an actuator adds, but no motors."""
     env = gymnasium.make(env_id, disable_env_checker=True)
     plain: Any = env.unwrapped
     model = codrl_mj.make(env_id, {".*": actuator}, allow_unstable=True).unwrapped.model  # type: ignore[attr-defined]
+    # The engine's cost depends on these fields too, so they are the same with and without motors.
     for field in (
         "actuator_armature",
         "actuator_damping",
@@ -156,7 +164,7 @@ def without_motors(env_id: str, actuator: str) -> Subject:
 
 
 def dm_control(domain: str, task: str) -> Subject:
-    """A task of dm_control's suite."""
+    """Return a task of dm_control's suite."""
     from dm_control import suite
 
     env = suite.load(domain, task, task_kwargs={"random": 0})
@@ -176,7 +184,10 @@ def dm_control(domain: str, task: str) -> Subject:
 
 
 def electric_motor() -> Subject:
-    """gym-electric-motor's permanently excited DC motor under current control: a motor, and no mechanics of a task."""
+    """Return gym-electric-motor's DC motor with permanent magnets under current control.
+
+    It simulates a motor, but no mechanics of a task.
+    """
     import gym_electric_motor
 
     return single(
@@ -185,15 +196,18 @@ def electric_motor() -> Subject:
 
 
 def batched(name: str, env: Any) -> Subject:
-    """Steps of a vector environment of any library under random actions."""
+    """Return the steps of any library's vector environment under random actions."""
     generator, space = np.random.default_rng(0), env.unwrapped
+    # EnvPool has no `num_envs`, and its length is the number of environments.
     count = getattr(space, "num_envs", None) or len(env)
-    one = getattr(env, "single_action_space", env.action_space)
-    if isinstance(one, gymnasium.spaces.Discrete):
-        actions = list(generator.integers(one.n, size=(20, count)))
+    action_space = getattr(env, "single_action_space", env.action_space)
+    if isinstance(action_space, gymnasium.spaces.Discrete):
+        actions = list(generator.integers(action_space.n, size=(20, count)))
     else:
         actions = list(
-            generator.uniform(one.low, one.high, (20, count, *one.shape)).astype(one.dtype)
+            generator.uniform(
+                action_space.low, action_space.high, (20, count, *action_space.shape)
+            ).astype(action_space.dtype)
         )
 
     def run(calls: int) -> None:
@@ -204,7 +218,7 @@ def batched(name: str, env: Any) -> Subject:
 
 
 def vector(task: str, num_envs: int, threads: int, actuator: str = "paper") -> Subject:
-    """Our vector environment."""
+    """Return our vector environment."""
     env = gymnasium.make_vec(
         TASKS[task].env_id, num_envs, "vector_entry_point", num_threads=threads, actuator=actuator
     )
@@ -212,7 +226,7 @@ def vector(task: str, num_envs: int, threads: int, actuator: str = "paper") -> S
 
 
 def raw_batch(task: str, num_envs: int, threads: int, calls_apart: bool) -> Subject:
-    """`Batch.step` of the same model with its motor: all inner steps of an environment step in one call, or apart."""
+    """Return `Batch.step` of the same model with its motor: all inner steps in one call, or not."""
     env: Any = gymnasium.make_vec(
         TASKS[task].env_id, num_envs, "vector_entry_point", num_threads=threads
     )
@@ -242,7 +256,7 @@ def raw_batch(task: str, num_envs: int, threads: int, calls_apart: bool) -> Subj
 
 
 def envpool(env_id: str, num_envs: int, threads: int) -> Subject:
-    """An environment of EnvPool."""
+    """Return an environment of EnvPool."""
     import envpool as library
 
     env = library.make(env_id, env_type="gymnasium", num_envs=num_envs, num_threads=threads, seed=0)
@@ -250,7 +264,7 @@ def envpool(env_id: str, num_envs: int, threads: int) -> Subject:
 
 
 def drawing(task: str, fast: bool) -> Subject:
-    """Frames of 480 x 480 of the task's scene, with our fast visual settings or with MuJoCo's defaults."""
+    """Return the rendering of 480 x 480 frames, with our fast settings or MuJoCo's defaults."""
     model = task_model(SimulationConfig(TASKS[task], (IDEAL,)))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -262,7 +276,8 @@ def drawing(task: str, fast: bool) -> Subject:
                 renderer.render(data)
 
         return Subject("frames with our settings", run)
-    model.vis.quality.shadowsize, model.vis.quality.offsamples = 4096, 4  # MuJoCo's defaults
+    # These are MuJoCo's defaults, which our tasks' models lower.
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = 4096, 4
     default = mujoco.Renderer(model, 480, 480)
 
     def run_default(frames: int) -> None:
@@ -274,10 +289,10 @@ def drawing(task: str, fast: bool) -> Subject:
 
 
 class Stopwatch:
-    """Sums the time spent in a `VecEnv`'s steps."""
+    """Sum of the time that is spent in a `VecEnv`'s steps."""
 
     def __init__(self, env: Any) -> None:
-        """Time the steps of `env` from now on."""
+        """Start to time the steps of `env`."""
         self.seconds = 0.0
         self._step_wait = env.step_wait
         env.step_wait = self._timed
@@ -290,7 +305,10 @@ class Stopwatch:
 
 
 def ppo(num_envs: int, batched_ours: bool) -> tuple[str, Callable[[int], float]]:
-    """Stable-Baselines3's PPO on Pendulum; the function trains for some steps and returns the environment's share."""
+    """Return Stable-Baselines3's PPO on Pendulum: a name, and a function that trains.
+
+    The function trains for some steps and returns the share of time spent in the environment.
+    """
     import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import DummyVecEnv

@@ -1,14 +1,14 @@
-"""Trainings side by side: how soon CartPole and Pendulum are learned, by ours and by other libraries.
+"""Compare how fast codrl_mj and other libraries learn CartPole and Pendulum, side by side.
 
     python scripts/benchmark_training.py --seeds 10
     python scripts/benchmark_training.py --only 'ours, fast' --task pendulum
 
-Each contender has a process of its own and one core, and trains until the mean of the last 100
-training episodes and that of 20 greedy episodes have both been good enough (475 of 500; -200).
-Counted are processor seconds without those greedy episodes, and environment steps. The first
-training of a process also pays for imports and compilers: its time from the process's start stands
-apart. Rows are added to docs/results/training_speed.csv as they finish; what is there is not done
-again. Libraries that are not installed are named, and left out: pip install '.[bench]'.
+Each contender has its own process and one core. It trains until both the mean of the last 100
+training episodes and the mean of 20 greedy episodes are good enough (475 of 500; -200). The cost is
+counted in processor seconds, without those greedy episodes, and in environment steps. The first
+training of a process also pays for imports and compilers, so its time since the process's start has
+its own column. Rows are appended to docs/results/training_speed.csv; trainings that already have a
+row are skipped. Libraries that are not installed are reported and skipped: pip install '.[bench]'.
 """
 
 import argparse
@@ -45,48 +45,56 @@ COLUMNS = (
 ENOUGH = {"cartpole": 475.0, "pendulum": -200.0}
 TITLES = {"cartpole": "CartPole", "pendulum": "Pendulum"}
 WORTH = {"cartpole": 200.0, "pendulum": -500.0}
-"""Mean of the last 20 training episodes from which on greedy ones are looked at."""
-THEIRS = {"cartpole": "CartPole-v1", "pendulum": "Pendulum-v1"}
+"""Mean return of the last 20 training episodes above which greedy episodes are run."""
+GYMNASIUM_IDS = {"cartpole": "CartPole-v1", "pendulum": "Pendulum-v1"}
 BUDGET = 150_000
-"""Environment steps after which a training has failed."""
+"""Number of environment steps after which a training has failed."""
 INTERVAL = 2048
-"""Environment steps between two looks at greedy episodes."""
+"""Number of environment steps between two tests with greedy episodes."""
 
 
-class LearntError(Exception):
-    """Both means were good enough, or the budget is spent."""
+class LearnedError(Exception):
+    """Exception that ends a training: both means are good enough, or the budget is spent."""
 
 
 class Watch:
-    """When a training was good enough, by processor time without what looking takes."""
+    """Monitor of a training: steps and processor time until it is good enough, without tests."""
 
     def __init__(self, task: str, env: Callable[[], gymnasium.vector.VectorEnv]) -> None:
-        """Begin; `env` makes 20 environments for greedy episodes."""
+        """Start the clock; `env` makes 20 environments for greedy episodes."""
         self._task, self._make = task, env
         self._began, self.paused, self._looked = time.process_time(), 0.0, 0
-        self.found: dict[str, Any] = {}
+        self.results: dict[str, Any] = {}
 
-    def see(self, steps: int, returns: Any, act: Callable[[np.ndarray], np.ndarray]) -> None:
-        """Look, at the end of a rollout: returns of the last training episodes, and actions (n, ...) for (n, k).
+    def update(self, steps: int, returns: Any, act: Callable[[np.ndarray], np.ndarray]) -> None:
+        """Update the results at the end of a rollout.
 
-        Where a library does not say what training episodes came to, greedy ones alone count.
+        Args:
+            steps: environment steps so far.
+            returns: returns of the last training episodes, or None if the library does not report
+                them; then only greedy episodes count.
+            act: greedy policy, from observations (n, k) to actions (n, ...).
+
+        Raises:
+            LearnedError: both means are good enough, or the budget is spent.
         """
         now = time.process_time() - self._began - self.paused
         last = [WORTH[self._task]] * 20 if returns is None else list(returns)
         if (
-            "steps" not in self.found
+            "steps" not in self.results
             and len(last) >= 100
+            # Before there are 100 training episodes their mean says little.
             and np.mean(last[-100:]) >= ENOUGH[self._task]
         ):
-            self.found |= {"steps": steps, "seconds": now}
+            self.results |= {"steps": steps, "seconds": now}
         promising = len(last) >= 20 and np.mean(last[-20:]) >= WORTH[self._task]
-        if "greedy_steps" not in self.found and promising and steps - self._looked >= INTERVAL:
+        if "greedy_steps" not in self.results and promising and steps - self._looked >= INTERVAL:
             self._looked, start = steps, time.process_time()
             if self._greedy(act) >= ENOUGH[self._task]:
-                self.found |= {"greedy_steps": steps, "greedy_seconds": now}
+                self.results |= {"greedy_steps": steps, "greedy_seconds": now}
             self.paused += time.process_time() - start
-        if len(self.found) == (2 if returns is None else 4) or steps >= BUDGET:
-            raise LearntError
+        if len(self.results) == (2 if returns is None else 4) or steps >= BUDGET:
+            raise LearnedError
 
     def _greedy(self, act: Callable[[np.ndarray], np.ndarray]) -> float:
         envs = self._make()
@@ -100,8 +108,8 @@ class Watch:
         return float(total.mean())
 
 
-def _looking(watch: Watch) -> Any:
-    """A callback of Stable-Baselines3's, and of what is built on it."""
+def _watch_callback(watch: Watch) -> Any:
+    """Return a callback for Stable-Baselines3 and for libraries built on it."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Look(BaseCallback):
@@ -110,23 +118,25 @@ def _looking(watch: Watch) -> Any:
 
         def _on_rollout_end(self) -> None:
             assert self.model.ep_info_buffer is not None
-            act = lambda seen: self.model.predict(seen, deterministic=True)[0]  # noqa: E731
-            watch.see(self.num_timesteps, [one["r"] for one in self.model.ep_info_buffer], act)
+            act = lambda observations: self.model.predict(observations, deterministic=True)[0]  # noqa: E731
+            watch.update(
+                self.num_timesteps, [episode["r"] for episode in self.model.ep_info_buffer], act
+            )
 
     return Look()
 
 
-def _twenty(task: str, actuator: str | None) -> Callable[[], gymnasium.vector.VectorEnv]:
-    """Makes 20 environments, Gymnasium's own or ours."""
+def _test_envs(task: str, actuator: str | None) -> Callable[[], gymnasium.vector.VectorEnv]:
+    """Return a function that makes 20 environments, Gymnasium's or ours."""
     if actuator is None:
-        return lambda: gymnasium.make_vec(THEIRS[task], 20, "sync")
+        return lambda: gymnasium.make_vec(GYMNASIUM_IDS[task], 20, "sync")
     import codrl_mj
 
     return lambda: codrl_mj.make_vec(task, 20, actuator=actuator)
 
 
 def ours(settings: str, actuator: str | None) -> Callable[[str, int, Watch], None]:
-    """Our PPO with its own settings, on our task through an actuator; None: on Gymnasium's task."""
+    """Return our PPO with its own settings on our task; actuator None: on Gymnasium's task."""
 
     def run(task: str, seed: int, watch: Watch) -> None:
         from stable_baselines3.common.env_util import make_vec_env
@@ -136,11 +146,11 @@ def ours(settings: str, actuator: str | None) -> Callable[[str, int, Watch], Non
         config = TrainConfig.preset(task, "ppo", settings, actuator or "default")
         count = config.num_envs
         env = (
-            make_vec_env(THEIRS[task], count)
+            make_vec_env(GYMNASIUM_IDS[task], count)
             if actuator is None
             else make_sb3_vec_env(config.env, count)
         )
-        config.agent.make_model(env, seed).learn(BUDGET, _looking(watch))
+        config.agent.make_model(env, seed).learn(BUDGET, _watch_callback(watch))
 
     return run
 
@@ -163,13 +173,15 @@ ZOO: dict[str, dict[str, Any]] = {
         "use_sde": True,
     },
 }
-"""What RL Baselines3 Zoo recommends for PPO, whose learning rate on CartPole falls linearly from
-1e-3, as clipping does from 0.2; eight environments there, four on Pendulum.
+"""Settings for PPO of RL Baselines3 Zoo, except schedules and numbers of environments.
+
+On CartPole the learning rate falls linearly from 1e-3, and the clip range from 0.2. The zoo uses
+eight environments for CartPole and four for Pendulum.
 """
 
 
 def on_stable_baselines3(library: str, actuator: str | None) -> Callable[[str, int, Watch], None]:
-    """PPO of `stable_baselines3` or `sbx`, with the zoo's settings."""
+    """Return PPO of `stable_baselines3` or `sbx`, with the zoo's settings."""
 
     def run(task: str, seed: int, watch: Watch) -> None:
         import importlib
@@ -179,43 +191,49 @@ def on_stable_baselines3(library: str, actuator: str | None) -> Callable[[str, i
         from codrl_mj import make_sb3_vec_env
         from codrl_mj.envs.config import EnvConfig
 
-        falling = task == "cartpole"
-        given = ZOO[task] | {
-            "learning_rate": (lambda left: 1e-3 * left) if falling else 1e-3,
-            "clip_range": (lambda left: 0.2 * left) if falling and library != "sbx" else 0.2,
+        is_cartpole = task == "cartpole"
+        # sbx takes a function for the learning rate, but only a number for the clip range.
+        settings = ZOO[task] | {
+            "learning_rate": (lambda progress_remaining: 1e-3 * progress_remaining)
+            if is_cartpole
+            else 1e-3,
+            "clip_range": (lambda progress_remaining: 0.2 * progress_remaining)
+            if is_cartpole and library != "sbx"
+            else 0.2,
         }
-        if given.get("use_sde"):
-            given["sde_sample_freq"] = 4
-        count = 8 if falling else 4
-        env: Any = make_vec_env(THEIRS[task], count, seed=seed)
+        if settings.get("use_sde"):
+            # The zoo samples the exploration noise of Pendulum's gSDE every four steps.
+            settings["sde_sample_freq"] = 4
+        count = 8 if is_cartpole else 4
+        env: Any = make_vec_env(GYMNASIUM_IDS[task], count, seed=seed)
         if actuator is not None:
             env = make_sb3_vec_env(EnvConfig(task, actuator), count)
-        model = importlib.import_module(library).PPO("MlpPolicy", env, seed=seed, **given)
-        model.learn(100_000, _looking(watch))
+        model = importlib.import_module(library).PPO("MlpPolicy", env, seed=seed, **settings)
+        model.learn(100_000, _watch_callback(watch))
 
     return run
 
 
 def with_rlox(task: str, seed: int, watch: Watch) -> None:
-    """PPO of `rlox`, with its own settings."""
+    """Train PPO of `rlox`, with its own settings."""
     import torch
     from rlox.algorithms.ppo import PPO
     from rlox.callbacks import Callback
 
     class Look(Callback):
-        def on_rollout_end(self, **given: Any) -> None:
-            act = lambda seen: np.asarray(  # noqa: E731
-                algorithm.predict(torch.as_tensor(seen, dtype=torch.float32))
+        def on_rollout_end(self, **arguments: Any) -> None:
+            act = lambda observations: np.asarray(  # noqa: E731
+                algorithm.predict(torch.as_tensor(observations, dtype=torch.float32))
             )
             config = algorithm.config
-            watch.see((given["update"] + 1) * config.n_envs * config.n_steps, None, act)
+            watch.update((arguments["update"] + 1) * config.n_envs * config.n_steps, None, act)
 
-    algorithm = PPO(THEIRS[task], seed=seed, callbacks=[Look()])
+    algorithm = PPO(GYMNASIUM_IDS[task], seed=seed, callbacks=[Look()])
     algorithm.train(BUDGET)
 
 
 def with_rltools(task: str, seed: int, watch: Watch) -> None:
-    """SAC of `rltools`, compiled for the environment at run time; it takes actions from -1 to 1 alone."""
+    """Train SAC of `rltools`, compiled for the environment at run time."""
     from gymnasium.wrappers import RescaleAction
     from rltools import SAC
 
@@ -226,9 +244,9 @@ def with_rltools(task: str, seed: int, watch: Watch) -> None:
     class Counted(gymnasium.Wrapper):
         total = 0.0
 
-        def reset(self, **given: Any) -> Any:
+        def reset(self, **arguments: Any) -> Any:
             self.total = 0.0
-            return self.env.reset(**given)
+            return self.env.reset(**arguments)
 
         def step(self, action: Any) -> Any:
             observation, reward, terminated, truncated, info = self.env.step(action)
@@ -237,24 +255,26 @@ def with_rltools(task: str, seed: int, watch: Watch) -> None:
                 returns.append(self.total)
             return observation, reward, terminated, truncated, info
 
+    # rltools only takes actions from -1 to 1.
     def make() -> gymnasium.Env:
         env = RescaleAction(
-            Counted(gymnasium.make(THEIRS[task])), np.float32(-1.0), np.float32(1.0)
+            Counted(gymnasium.make(GYMNASIUM_IDS[task])), np.float32(-1.0), np.float32(1.0)
         )
         env.reset(seed=seed)
         return env
 
     state = SAC(make).State(seed)
-    act = lambda seen: 2.0 * np.array([state.action(one) for one in seen], dtype=np.float32)  # noqa: E731
+    # Actions are rescaled to Pendulum's range, from -2 to 2 N*m.
+    act = lambda rows: 2.0 * np.array([state.action(row) for row in rows], dtype=np.float32)  # noqa: E731
     for steps in range(1, BUDGET + 1):
         if state.step():
             break
         if steps % 1000 == 0:
-            watch.see(steps, returns, act)
+            watch.update(steps, returns, act)
 
 
 def with_envpool(task: str, seed: int, watch: Watch) -> None:
-    """PPO in one file, of the usual kind, on EnvPool's environments."""
+    """Train a PPO that is written in one file, as in many tutorials, on EnvPool's environments."""
     import envpool
     import torch
     from torch import nn
@@ -264,7 +284,7 @@ def with_envpool(task: str, seed: int, watch: Watch) -> None:
     gamma, decay, rate, epochs, batch = (
         (0.99, 0.95, 1e-3, 10, 256) if discrete else (0.9, 0.95, 1e-3, 10, 256)
     )
-    envs = envpool.make_gymnasium(THEIRS[task], num_envs=count, seed=seed, num_threads=1)
+    envs = envpool.make_gymnasium(GYMNASIUM_IDS[task], num_envs=count, seed=seed, num_threads=1)
     inputs, outputs = envs.observation_space.shape[0], 2 if discrete else 1
 
     def network(last: int) -> nn.Sequential:
@@ -274,82 +294,84 @@ def with_envpool(task: str, seed: int, watch: Watch) -> None:
 
     actor, critic, log_std = network(outputs), network(1), nn.Parameter(torch.zeros(outputs))
     parameters = [*actor.parameters(), *critic.parameters(), log_std]
-    optimiser = torch.optim.Adam(parameters, lr=rate, eps=1e-5, fused=True)
+    optimizer = torch.optim.Adam(parameters, lr=rate, eps=1e-5, fused=True)
     scale = torch.ones(inputs) if discrete else torch.tensor([1.0, 1.0, 0.2])
 
-    def policy(seen: torch.Tensor) -> Any:
-        out = actor(seen * scale)
+    def policy(observations: torch.Tensor) -> Any:
+        out = actor(observations * scale)
         if discrete:
             return torch.distributions.Categorical(logits=out)
         return torch.distributions.Independent(torch.distributions.Normal(out, log_std.exp()), 1)
 
-    def act(seen: np.ndarray) -> np.ndarray:
+    def act(observations: np.ndarray) -> np.ndarray:
         with torch.no_grad():
-            out = actor(torch.as_tensor(seen, dtype=torch.float32) * scale)
+            out = actor(torch.as_tensor(observations, dtype=torch.float32) * scale)
         return out.argmax(1).numpy() if discrete else np.clip(out.numpy(), -2.0, 2.0)
 
     returns: collections.deque = collections.deque(maxlen=100)
     total, steps = np.zeros(count), 0
-    seen = torch.as_tensor(envs.reset()[0], dtype=torch.float32)
-    began = torch.zeros(count, dtype=torch.bool)  # EnvPool's first step after an end is a reset
+    observation = torch.as_tensor(envs.reset()[0], dtype=torch.float32)
+    # EnvPool's first step after an episode's end is a reset; its reward and action do not count.
+    is_reset = torch.zeros(count, dtype=torch.bool)
     while True:
-        kept: list[Any] = []
+        rollout: list[Any] = []
         with torch.no_grad():
             for _ in range(length):
-                chosen = policy(seen)
+                chosen = policy(observation)
                 action = chosen.sample()
-                sent = action.numpy() if discrete else np.clip(action.numpy(), -2.0, 2.0)
-                following, reward, terminated, truncated, _ = envs.step(sent)
-                total += np.where(began.numpy(), 0.0, reward)
+                clipped = action.numpy() if discrete else np.clip(action.numpy(), -2.0, 2.0)
+                next_observation, reward, terminated, truncated, _ = envs.step(clipped)
+                total += np.where(is_reset.numpy(), 0.0, reward)
                 ended = terminated | truncated
                 returns.extend(total[ended])
                 total[ended] = 0.0
-                kept.append(
+                rollout.append(
                     (
-                        seen,
+                        observation,
                         action,
                         chosen.log_prob(action),
                         torch.as_tensor(reward, dtype=torch.float32),
-                        began,
+                        is_reset,
                         torch.as_tensor(terminated),
                         torch.as_tensor(ended),
                     )
                 )
-                seen, began = (
-                    torch.as_tensor(following, dtype=torch.float32),
+                observation, is_reset = (
+                    torch.as_tensor(next_observation, dtype=torch.float32),
                     torch.as_tensor(ended),
                 )
             steps += count * length
-            states, actions, before, rewards, skipped, dead, over = map(
-                torch.stack, zip(*kept, strict=True)
+            states, actions, log_probs, rewards, is_reset_step, is_terminal, is_last = map(
+                torch.stack, zip(*rollout, strict=True)
             )
-            values = critic(torch.cat([states, seen[None]]) * scale)[..., 0]
+            values = critic(torch.cat([states, observation[None]]) * scale)[..., 0]
             advantage, advantages = torch.zeros(count), torch.zeros(length, count)
-            for at in reversed(range(length)):
-                error = rewards[at] + gamma * values[at + 1] * ~dead[at] - values[at]
-                advantage = error + gamma * decay * advantage * ~over[at]
-                advantages[at] = advantage
-        watch.see(steps, returns, act)
-        use = ~skipped.flatten()
+            # Generalized advantage estimation, backwards in time.
+            for step in reversed(range(length)):
+                error = rewards[step] + gamma * values[step + 1] * ~is_terminal[step] - values[step]
+                advantage = error + gamma * decay * advantage * ~is_last[step]
+                advantages[step] = advantage
+        watch.update(steps, returns, act)
+        use = ~is_reset_step.flatten()
         columns = [
-            one.flatten(0, 1)[use]
-            for one in (states, actions, before, advantages, advantages + values[:-1])
+            column.flatten(0, 1)[use]
+            for column in (states, actions, log_probs, advantages, advantages + values[:-1])
         ]
         for _ in range(epochs):
             for rows in torch.randperm(len(columns[0])).split(batch):
-                state, action, old, gain, target = (one[rows] for one in columns)
+                state, action, old, gain, target = (column[rows] for column in columns)
                 ratio = (policy(state).log_prob(action) - old).exp()
                 gain = (gain - gain.mean()) / (gain.std() + 1e-8)
                 loss = -torch.min(ratio * gain, ratio.clamp(0.8, 1.2) * gain).mean()
                 loss = loss + 0.5 * (critic(state * scale)[:, 0] - target).square().mean()
-                optimiser.zero_grad()
+                optimizer.zero_grad()
                 loss.backward()
                 nn.utils.clip_grad_norm_(parameters, 0.5)
-                optimiser.step()
+                optimizer.step()
 
 
 CONTENDERS: dict[str, tuple[Callable[[str, int, Watch], None], str | None]] = {
-    # name: its training, and the actuator of the environment; None: Gymnasium's own
+    # Name -> training, and actuator of the environment; None: Gymnasium's own task.
     "ours, default, Gymnasium's task": (ours("default", None), None),
     "ours, fast, Gymnasium's task": (ours("fast", None), None),
     "ours, default, ideal force": (ours("default", "ideal"), "ideal"),
@@ -370,63 +392,82 @@ CONTENDERS: dict[str, tuple[Callable[[str, int, Watch], None], str | None]] = {
 
 
 def contend(task: str, contender: str, seeds: list[int]) -> None:
-    """Train with some seeds in this process, and add a row for each."""
+    """Train a contender with some seeds in this process, and append a row for each."""
+    # One core for all contenders, whatever number of threads their libraries start.
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     train, actuator = CONTENDERS[contender]
     for seed in seeds:
-        watch = Watch(task, _twenty(task, actuator))
-        with contextlib.suppress(LearntError):
+        watch = Watch(task, _test_envs(task, actuator))
+        with contextlib.suppress(LearnedError):
             train(task, seed, watch)
+        # Only the first training of a process pays for imports and compilation.
         first = time.process_time() - watch.paused if seed == seeds[0] else ""
         with ROWS.open("a", newline="") as file:
             csv.DictWriter(file, COLUMNS).writerow(
-                {"task": task, "contender": contender, "seed": seed, "first": first, **watch.found}
+                {
+                    "task": task,
+                    "contender": contender,
+                    "seed": seed,
+                    "first": first,
+                    **watch.results,
+                }
             )
 
 
 def rows() -> list[dict[str, str]]:
-    """What was measured."""
+    """Return the published rows."""
     return list(csv.DictReader(ROWS.open(newline=""))) if ROWS.is_file() else []
 
 
 def medians(task: str, name: str) -> dict[str, float]:
-    """Medians over a contender's seeds, of what there is; `seeds` and `learned` count them."""
-    own = [row for row in rows() if (row["task"], row["contender"]) == (task, name)]
-    found = {"seeds": len(own), "learned": sum(bool(row["greedy_steps"]) for row in own)}
-    known = {column: [float(row[column]) for row in own if row[column]] for column in COLUMNS[3:]}
-    return found | {column: statistics.median(values) for column, values in known.items() if values}
+    """Return the medians over a contender's seeds; `seeds` and `learned` count its trainings."""
+    contender_rows = [row for row in rows() if (row["task"], row["contender"]) == (task, name)]
+    numbers = {
+        "seeds": len(contender_rows),
+        "learned": sum(bool(row["greedy_steps"]) for row in contender_rows),
+    }
+    known = {
+        column: [float(row[column]) for row in contender_rows if row[column]]
+        for column in COLUMNS[3:]
+    }
+    return numbers | {
+        column: statistics.median(values) for column, values in known.items() if values
+    }
 
 
 FORMS = {"greedy_seconds": ".1f", "greedy_steps": ",.0f"}
-"""Columns of the table, and how they are written."""
+"""Columns of the table -> number formats."""
 
 
 def table() -> str:
-    """Seconds and steps in Markdown, but for our ideal forces, which take what our motors take."""
+    """Return the Markdown table of seconds and steps.
+
+    Contenders with our ideal forces are left out: they take as long as those with our motors.
+    """
     titles = [TITLES[task] for task in ENOUGH]
     lines = [
         f"| | {' | '.join(f'{title}: seconds | steps' for title in titles)} |",
         f"| --- |{' ---: |' * len(FORMS) * len(titles)}",
     ]
-    for name in (one for one in CONTENDERS if not one.endswith("ideal force")):
+    for name in (name for name in CONTENDERS if not name.endswith("ideal force")):
         cells = [name]
         for task in ENOUGH:
-            of = medians(task, name)
+            numbers = medians(task, name)
             seconds, *others = (
-                format(of[key], form) if key in of else "–" for key, form in FORMS.items()
+                format(numbers[key], form) if key in numbers else "–" for key, form in FORMS.items()
             )
-            few = (
-                f" ({of['learned']:.0f} of {of['seeds']:.0f})"
-                if of["learned"] < of["seeds"]
+            note = (
+                f" ({numbers['learned']:.0f} of {numbers['seeds']:.0f})"
+                if numbers["learned"] < numbers["seeds"]
                 else ""
             )
-            cells += [seconds + few, *others]
+            cells += [seconds + note, *others]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
 def draw() -> None:
-    """Seconds until each has learned each task, as bars."""
+    """Draw the seconds until each contender has learned each task, as bars."""
     from matplotlib.figure import Figure
 
     from codrl_mj.study.pages import save
@@ -438,8 +479,8 @@ def draw() -> None:
         seconds = {
             name: medians(task, name).get("greedy_seconds", 0.0) for name in reversed(CONTENDERS)
         }
-        colours = ["#0072B2" if name.startswith("ours") else "#999999" for name in seconds]
-        bars = axes.barh([*seconds], [*seconds.values()], color=colours)
+        colors = ["#0072B2" if name.startswith("ours") else "#999999" for name in seconds]
+        bars = axes.barh([*seconds], [*seconds.values()], color=colors)
         axes.bar_label(
             bars, [f"{value:.1f}" if value else "–" for value in seconds.values()], padding=3
         )
@@ -450,7 +491,7 @@ def draw() -> None:
 
 
 def main() -> None:
-    """Measure what is not there yet, print the table and put it on its page."""
+    """Run the missing trainings, print the table, and write it on its page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -464,26 +505,32 @@ def main() -> None:
             csv.DictWriter(file, COLUMNS).writeheader()
     for task in [options.task] if options.task else list(ENOUGH):
         for name in CONTENDERS:
-            there = {
+            finished_seeds = {
                 int(row["seed"])
                 for row in rows()
                 if (row["task"], row["contender"]) == (task, name)
             }
-            seeds = [seed for seed in range(options.seeds) if seed not in there]
+            seeds = [seed for seed in range(options.seeds) if seed not in finished_seeds]
             if options.here == name:
                 contend(task, name, seeds)
             elif not options.here and seeds and options.only in name:
-                given = ["--task", task, "--seeds", str(options.seeds), "--here", name]
+                arguments = ["--task", task, "--seeds", str(options.seeds), "--here", name]
+                # The libraries read their number of threads when they are imported, so a child
+                # process is used.
                 single = dict.fromkeys(
                     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
                 )
-                line = [sys.executable, __file__, *given]
-                done = subprocess.run(
-                    line, env=os.environ | single, check=False, capture_output=True, text=True
+                child_command = [sys.executable, __file__, *arguments]
+                completed = subprocess.run(
+                    child_command,
+                    env=os.environ | single,
+                    check=False,
+                    capture_output=True,
+                    text=True,
                 )
-                if done.returncode:
+                if completed.returncode:
                     print(
-                        f"left out: {name}, {task}: {done.stderr.strip().splitlines()[-1]}",
+                        f"left out: {name}, {task}: {completed.stderr.strip().splitlines()[-1]}",
                         flush=True,
                     )
                 else:

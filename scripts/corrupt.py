@@ -1,13 +1,13 @@
-"""Corrupts at random what a user hands to codrl-mj, and looks how that ends.
+"""Corrupt the inputs of codrl-mj at random, and check how each command ends.
 
-Three kinds of cases, drawn from a seed: run folders (bytes changed, files cut, lost, emptied or
-exchanged, entries of JSON edited), files that a user writes (motors, actuators, tasks, families,
-configurations, models, bench logs), and command lines (words dropped, doubled, exchanged, misspelt,
-out of bounds). Each runs in a process of its own, forked from one that has compiled what they
-share. A case passes if the exit status is 0, 1 or 2, a refusal is a sentence, there is no
-traceback, no signal, nothing half-written is left, and no file that was there is changed or gone
-that the command does not name as its output. What is still at work after `--patience` is sent
-Ctrl-C, and must end with status 130 and a word on it.
+There are three kinds of cases, drawn from a seed: run folders (bytes changed, files cut, deleted,
+emptied or exchanged, JSON entries edited), files that a user writes (motors, actuators, tasks,
+families, configurations, models, bench logs), and command lines (words dropped, doubled,
+exchanged, misspelled, out of bounds). Each case runs in its own process, forked from one that has
+compiled the shared code. A case passes if the exit status is 0, 1 or 2, a refusal is a sentence,
+there is no traceback and no signal, no half-written file remains, and no file that the command does
+not name as its output is changed or deleted. A command that still runs after `--patience` receives
+Ctrl-C, and must end with status 130 and a message.
 """
 
 import argparse
@@ -40,11 +40,11 @@ from codrl_mj.cli.terminal import console
 from codrl_mj.runs.files import leftovers, sealed
 
 SOME = (1, 1, 1, 2, 3)
-"""How many changes a case has, one as likely as the other."""
+"""Number of changes in a case, drawn from these with equal probability."""
 MEMORY = 8_000_000_000
-"""Bytes that a case may allocate."""
+"""Limit of a case's memory [bytes]."""
 GRACE = 30.0
-"""Time [s] that a case has after Ctrl-C."""
+"""Time [s] that a case has to end after Ctrl-C."""
 WILD = (
     "-1",
     "0",
@@ -63,7 +63,7 @@ WILD = (
     "{}",
     "ü",
 )
-"""What stands where something else is expected."""
+"""Values that are written in place of others."""
 
 MOTOR = """\
 manufacturer = "mine"
@@ -187,7 +187,7 @@ RUNS = {
     "ddpg": f"train pendulum --agent ddpg {_SHORT}",
     "foreign": f"train InvertedPendulum-v5 --actuators slide=lag {_PPO}",
 }
-"""Command lines of the run folders, by name; `unfinished` is the first without what is written last."""
+"""Name -> command line of a run folder; `unfinished` is `weaker` without its last files."""
 COLUMNS = "--columns time=time:s,voltage=mean(voltage):V,current=current:A,position=position:rad"
 SIMULATE = (
     "identify simulate maxon-ec45-flat-50w --kind prbs --amplitude 4 --duration 1 --mean-voltage"
@@ -205,7 +205,7 @@ ON_RUNS = (
     "motor feasible maxon-ec45-flat-50w RUN",
     "motor choose RUN --top 2",
 )
-"""What is done with a corrupted run folder."""
+"""Commands for a corrupted run folder, RUN."""
 ON_FILES = {
     "motor.toml": (
         "motor show motor.toml",
@@ -228,7 +228,7 @@ ON_FILES = {
     "gearbox.py": (f"train cartpole --actuator gearbox.py:Gearbox {_PPO}",),
     "log.csv": (f"identify check log.csv {COLUMNS}", "identify columns log.csv"),
 }
-"""File -> what is done with it, corrupted."""
+"""File -> commands for it when it is corrupted."""
 COMMANDS = (
     *(
         command.replace("RUN", "runs/unfinished" if "resume" in command else "runs/ideal")
@@ -268,44 +268,47 @@ COMMANDS = (
     "validate pendulum --quick --out certificate",
     "--version",
 )
-"""What a user types, short."""
+"""Short command lines, as a user types them."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """What is run in a folder of its own, which `corrupt` has changed."""
+    """Command with its own folder, in which `corrupt` has changed something."""
 
     kind: str
     command: list[str]
     corrupted: str
-    """What was done, in words."""
+    """Description of the change."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How it ended."""
+    """Result of a case."""
 
     status: int
     """Exit status; negative for a signal."""
     interrupted: bool
     output: str
     lost: list[str]
-    """Files that were there and are changed or gone, and what was left half-written."""
+    """Files that were changed or deleted, and half-written files that remained."""
 
     @property
     def failures(self) -> list[str]:
-        """What is wrong with it."""
-        allowed, said = ((130,) if self.interrupted else (0, 1, 2)), "codrl-mj: " in self.output
-        found = [] if self.status in allowed else [f"exit status {self.status}"]
+        """Descriptions of everything that is wrong with the result."""
+        allowed, has_message = (
+            ((130,) if self.interrupted else (0, 1, 2)),
+            "codrl-mj: " in self.output,
+        )
+        problems = [] if self.status in allowed else [f"exit status {self.status}"]
         if "Traceback (most recent call last)" in self.output:
-            found.append("traceback")
-        if self.status in (2, 130) and not said:
-            found.append("no word on it")
-        return found + [f"lost: {name}" for name in self.lost]
+            problems.append("traceback")
+        if self.status in (2, 130) and not has_message:
+            problems.append("no message")
+        return problems + [f"lost: {name}" for name in self.lost]
 
 
 def change_bytes(content: bytes, rng: random.Random) -> bytes:
-    """One to four bytes changed, or a bit of them flipped; a cut; or nothing left."""
+    """Return bytes with one to four changed, cut at a random length, or empty."""
     if rng.random() < 0.25 or not content:
         return content[: rng.randrange(len(content) + 1) if rng.random() < 0.8 else 0]
     changed = bytearray(content)
@@ -317,7 +320,7 @@ def change_bytes(content: bytes, rng: random.Random) -> bytes:
 
 
 def change_entry(content: Any, rng: random.Random) -> Any:
-    """A nested JSON value with one entry lost, added, or with something else in its place."""
+    """Return a nested JSON value with one entry deleted, added or replaced."""
     if isinstance(content, dict | list) and content and rng.random() < 0.85:
         keys = list(content) if isinstance(content, dict) else list(range(len(content)))
         key = rng.choice(keys)
@@ -353,22 +356,22 @@ def change_entry(content: Any, rng: random.Random) -> Any:
 
 
 def change_text(text: str, rng: random.Random) -> str:
-    """A word or line of a text, or some, lost, doubled, exchanged, misspelt, scaled, or something else in its place."""
+    """Return a text in which some words or lines are deleted, doubled, exchanged or misspelled."""
     for _ in range(rng.choice(SOME)):
         words = list(re.finditer(r"[\w.]+|[^\w\s]", text)) or list(re.finditer("", text))
-        one, other = rng.choice(words), rng.choice(words)
+        word, other_word = rng.choice(words), rng.choice(words)
         new = rng.choice(
             (
                 lambda: "",
-                lambda: one[0] * 2,  # noqa: B023 - called at once
-                lambda: other[0],  # noqa: B023
-                lambda: misspell(one[0], rng),  # noqa: B023
-                lambda: scale(one[0], rng),  # noqa: B023
-                lambda: scale(one[0], rng),  # noqa: B023
+                lambda: word[0] * 2,  # noqa: B023 - called immediately
+                lambda: other_word[0],  # noqa: B023
+                lambda: misspell(word[0], rng),  # noqa: B023
+                lambda: scale(word[0], rng),  # noqa: B023
+                lambda: scale(word[0], rng),  # noqa: B023
                 lambda: rng.choice(WILD),
             )
         )()
-        text = text[: one.start()] + new + text[one.end() :]
+        text = text[: word.start()] + new + text[word.end() :]
         if rng.random() < 0.2:
             lines = text.splitlines(keepends=True) or [""]
             row = rng.randrange(len(lines))
@@ -380,9 +383,9 @@ def change_text(text: str, rng: random.Random) -> str:
 
 
 def misspell(word: str, rng: random.Random) -> str:
-    """A letter lost, doubled, exchanged with its neighbour, or another one."""
-    at = rng.randrange(max(len(word), 1))
-    head, letter, tail = word[:at], word[at : at + 1], word[at + 1 :]
+    """Return a word with a letter deleted, doubled, replaced, or swapped with its neighbor."""
+    index = rng.randrange(max(len(word), 1))
+    head, letter, tail = word[:index], word[index : index + 1], word[index + 1 :]
     return rng.choice(
         (
             head + tail,
@@ -394,7 +397,7 @@ def misspell(word: str, rng: random.Random) -> str:
 
 
 def scale(word: str, rng: random.Random) -> str:
-    """A number times something; any other word as it is, but for its last letter."""
+    """Multiply a number by a random factor; cut the last letter of any other word."""
     try:
         return f"{float(word) * rng.choice((-1.0, 0.0, 1e-6, 0.1, 10.0, 1e3, 1e6)):g}"
     except ValueError:
@@ -402,35 +405,37 @@ def scale(word: str, rng: random.Random) -> str:
 
 
 def corrupt_run(folder: Path, rng: random.Random) -> Case:
-    """Corrupt one file of one run folder."""
+    """Corrupt one file of a run folder."""
     run = folder / "runs" / rng.choice([*RUNS, "unfinished"])
     path = rng.choice(sorted(path for path in run.rglob("*") if path.is_file()))
-    how = rng.choice(
+    change = rng.choice(
         ("bytes", "bytes", "lost", "exchanged", "folder", "entry", "entry", "entry with a seal")
     )
-    if how.startswith("entry") and path.suffix != ".json":
-        how = "bytes"
-    other = folder / "runs" / rng.choice(list(RUNS)) / path.relative_to(run)
-    if how == "bytes":
+    # Only JSON files have entries.
+    if change.startswith("entry") and path.suffix != ".json":
+        change = "bytes"
+    exchanged = folder / "runs" / rng.choice(list(RUNS)) / path.relative_to(run)
+    if change == "bytes":
         path.write_bytes(change_bytes(path.read_bytes(), rng))
-    elif how.startswith("entry"):
+    elif change.startswith("entry"):
         content = json.loads(path.read_text())
         content.pop("sha256", None)
         content = change_entry(content, rng)
-        sealing = how != "entry" and isinstance(content, dict)
-        path.write_text(json.dumps(sealed(content) if sealing else content))
-    elif how == "exchanged" and other.is_file():
-        path.write_bytes(other.read_bytes())
+        # With a valid seal the file is accepted, so that the checks of its entries are reached.
+        is_sealed = change != "entry" and isinstance(content, dict)
+        path.write_text(json.dumps(sealed(content) if is_sealed else content))
+    elif change == "exchanged" and exchanged.is_file():
+        path.write_bytes(exchanged.read_bytes())
     else:
         path.unlink()
-        if how == "folder":
+        if change == "folder":
             path.mkdir()
     command = rng.choice(ON_RUNS).replace("RUN", str(run.relative_to(folder)))
-    return Case("run folders", command.split(), f"{path.relative_to(folder)}: {how}")
+    return Case("run folders", command.split(), f"{path.relative_to(folder)}: {change}")
 
 
 def corrupt_file(folder: Path, rng: random.Random) -> Case:
-    """Corrupt one of the files that a user writes."""
+    """Corrupt a file that a user writes."""
     name = rng.choice(list(ON_FILES))
     path = folder / name
     if rng.random() < 0.15:
@@ -440,27 +445,28 @@ def corrupt_file(folder: Path, rng: random.Random) -> Case:
     return Case("files", rng.choice(ON_FILES[name]).split(), name)
 
 
-def corrupt_command(folder: Path, rng: random.Random) -> Case:  # noqa: ARG001 - as the others
+def corrupt_command(folder: Path, rng: random.Random) -> Case:  # noqa: ARG001 - same signature
     """Corrupt a command line."""
     words = rng.choice(COMMANDS).split()
     for _ in range(rng.choice(SOME)):
-        at, other = rng.randrange(len(words)), rng.randrange(len(words))
+        index, other_index = rng.randrange(len(words)), rng.randrange(len(words))
         change = rng.choice(("drop", "double", "swap", "misspell", "scale", "scale", "wild"))
         if change == "drop" and len(words) > 1:
-            del words[at]
+            del words[index]
         elif change == "double":
-            words.insert(at, words[at])
+            words.insert(index, words[index])
         elif change == "swap":
-            words[at], words[other] = words[other], words[at]
+            words[index], words[other_index] = words[other_index], words[index]
         elif change == "misspell":
-            words[at] = misspell(words[at], rng)
+            words[index] = misspell(words[index], rng)
         elif change == "scale":
-            at = rng.choice(
-                [place for place, word in enumerate(words) if word[:1].isdigit()] or [at]
+            # Numbers are scaled if there are any.
+            index = rng.choice(
+                [position for position, word in enumerate(words) if word[:1].isdigit()] or [index]
             )
-            words[at] = scale(words[at], rng)
+            words[index] = scale(words[index], rng)
         else:
-            words[at] = rng.choice((*WILD, "/dev/null/x", "runs", "wheel.py", "log.csv"))
+            words[index] = rng.choice((*WILD, "/dev/null/x", "runs", "wheel.py", "log.csv"))
     return Case("command lines", words, "")
 
 
@@ -469,11 +475,11 @@ KINDS: dict[str, Callable[[Path, random.Random], Case]] = {
     "files": corrupt_file,
     "commands": corrupt_command,
 }
-"""By the name that `--only` takes."""
+"""Kind, as `--only` takes it -> function that corrupts a folder."""
 
 
 def prepare(folder: Path) -> None:
-    """Make the run folders and files, which compiles what the cases share."""
+    """Create the run folders and files; this compiles the code that the cases share."""
     texts = {
         "motor.toml": MOTOR,
         "actuator.yaml": ACTUATOR,
@@ -494,6 +500,7 @@ def prepare(folder: Path) -> None:
     with contextlib.chdir(folder):
         for command in commands:
             assert codrl_mj(command.split()) == 0, command
+    # An unfinished training lacks the files that are written at its end.
     shutil.copytree(folder / "runs" / "weaker", folder / "runs" / "unfinished")
     for name in (
         "result.json",
@@ -503,11 +510,13 @@ def prepare(folder: Path) -> None:
         "learning_curve.png",
     ):
         (folder / "runs" / "unfinished" / name).unlink()
+    # Garbage is collected before the forks, so that children do not copy its memory pages.
     gc.collect()
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Digest of every file by its path."""
+    """Return the digest of every file in a folder, by its path."""
+    # Locks may be created or left by any command.
     paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
     return {
         str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -516,25 +525,26 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def attempt(case: Case, folder: Path, patience: float) -> Outcome:
-    """Run a case in a process of its own."""
+    """Run a case in its own process and return its result."""
     before, output = digests(folder), folder.with_suffix(".output")
     child = os.fork()
     if child == 0:
-        _be(case.command, folder, output)
+        _run_child(case.command, folder, output)
     end, interrupted, ended = time.monotonic() + patience, False, (0, 0)
     while ended[0] == 0:
         if time.monotonic() > end:
-            os.killpg(child, signal.SIGKILL if interrupted else signal.SIGINT)  # as a terminal does
+            # Like a terminal, send the signal to the whole process group.
+            os.killpg(child, signal.SIGKILL if interrupted else signal.SIGINT)
             end, interrupted = time.monotonic() + GRACE, True
         time.sleep(0.01)
         ended = os.waitpid(child, os.WNOHANG)
-    with contextlib.suppress(ProcessLookupError):  # whatever it started
+    # Kill the processes that the command may have started and left.
+    with contextlib.suppress(ProcessLookupError):
         os.killpg(child, signal.SIGKILL)
     status = os.waitstatus_to_exitcode(ended[1])
     after = digests(folder)
-    resumed = (
-        "--resume" in case.command
-    )  # a training that goes on writes into its folder, its tables at once
+    # A resumed training writes into its folder, and into its tables immediately.
+    resumed = "--resume" in case.command
     lost = [
         name
         for name in before
@@ -544,18 +554,19 @@ def attempt(case: Case, folder: Path, patience: float) -> Outcome:
     ]
     halves = [
         str(path.relative_to(folder))
-        for place in [folder, *folder.rglob("*")]
-        for path, _ in leftovers(place)
+        for parent in [folder, *folder.rglob("*")]
+        for path, _ in leftovers(parent)
     ]
     return Outcome(status, interrupted, output.read_text(errors="replace"), lost + halves)
 
 
-def _be(command: list[str], folder: Path, output: Path) -> None:
-    """The child's whole life."""
+def _run_child(command: list[str], folder: Path, output: Path) -> None:
+    """Run a command in the forked child and exit with its status."""
     status = 99
     try:
         os.setsid()
         os.chdir(folder)
+        # The limit turns a huge allocation into a MemoryError, which the command has to report.
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
         for target, flags in ((0, os.O_RDONLY), (1, os.O_WRONLY), (2, os.O_WRONLY)):
             path = "/dev/null" if target == 0 else output
@@ -575,7 +586,7 @@ def _be(command: list[str], folder: Path, output: Path) -> None:
 
 
 def control(base: Path, patience: float) -> None:
-    """Run every command line as it stands, which must not be refused: else nothing is learned from a corrupted one."""
+    """Run every command line unchanged; if one failed, its corruption would prove nothing."""
     for command in track(COMMANDS, "as they are", console=console(), transient=True):
         shutil.copytree(base, base.with_name("control"))
         outcome = attempt(Case("", command.split(), ""), base.with_name("control"), patience)
@@ -587,7 +598,7 @@ def control(base: Path, patience: float) -> None:
 def cases(
     count: int, seed: int, only: list[str], base: Path, patience: float
 ) -> Iterator[tuple[str, Case, Outcome]]:
-    """Run so many cases of each kind; yields their names, by which one can be run again."""
+    """Run `count` cases of each kind; yield their names, which reproduce them, and results."""
     names = [f"{kind}/{seed}/{index}" for kind in only for index in range(count)]
     for name in track(names, "corrupting", console=console(), transient=True):
         folder = base.parent / "case"
@@ -599,30 +610,30 @@ def cases(
 
 
 def main() -> int:
-    """Run the cases, print a table of how they ended, and what is wrong."""
+    """Run the cases, and print a table of results and all failures."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--count", type=int, default=300, help="cases of each kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", choices=list(KINDS), nargs="+", default=list(KINDS))
-    parser.add_argument("--patience", type=float, default=60.0, help="seconds before Ctrl-C")
-    parser.add_argument("--log", type=Path, help="file for every case with its output")
+    parser.add_argument("--patience", type=float, default=60.0, help="time before Ctrl-C [s]")
+    parser.add_argument("--log", type=Path, help="file for all cases with their outputs")
     options = parser.parse_args()
     counts: collections.Counter[tuple[str, str]] = collections.Counter()
     failed = 0
-    with tempfile.TemporaryDirectory() as place, contextlib.ExitStack() as stack:
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         log = stack.enter_context(options.log.open("w")) if options.log else None
-        base = Path(place) / "base"
+        base = Path(folder) / "base"
         base.mkdir()
         prepare(base)
         control(base, options.patience / 4)
         for name, case, outcome in cases(
             options.count, options.seed, options.only, base, options.patience
         ):
-            how = "Ctrl-C" if outcome.interrupted else f"status {outcome.status}"
-            counts[case.kind, how] += 1
-            text = f"{name}: codrl-mj {' '.join(case.command)} [{case.corrupted}] -> {how}"
+            ending = "Ctrl-C" if outcome.interrupted else f"status {outcome.status}"
+            counts[case.kind, ending] += 1
+            text = f"{name}: codrl-mj {' '.join(case.command)} [{case.corrupted}] -> {ending}"
             if log is not None:
                 print(text, outcome.failures, outcome.output, sep="\n", flush=True, file=log)
             if outcome.failures:
@@ -634,8 +645,8 @@ def main() -> int:
     table = Table(title="How they ended", title_justify="left")
     for column in ("corrupted", "how", "cases"):
         table.add_column(column)
-    for (kind, how), number in sorted(counts.items()):
-        table.add_row(kind, how, str(number))
+    for (kind, ending), number in sorted(counts.items()):
+        table.add_row(kind, ending, str(number))
     console().print(table)
     console().print(f"{failed} of {sum(counts.values())} failed")
     return int(failed > 0)

@@ -1,4 +1,4 @@
-"""Cross-validate the port: MuJoCo against Gymnasium's equations and the motor against others' motors, check by check.
+"""Cross-validate codrl_mj: the mechanics with Gymnasium's, the motor with other libraries' motors.
 
 Example: python scripts/cross_validate.py cartpole --quick
 """
@@ -10,7 +10,7 @@ from codrl_mj.validation import validate
 
 
 def main() -> int:
-    """Print every check with its worst case; 1 if one failed."""
+    """Print every check with its worst case; return 1 if one failed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

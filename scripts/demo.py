@@ -1,4 +1,4 @@
-"""The main job in one command: learn to balance through a weak actuator.
+"""Demonstrate codrl_mj in one command: learn to balance through a weak actuator.
 
 Cross-validates CartPole against Gymnasium, trains the same agent twice (on the ideal actuator and
 through the actuator `weaker`), deploys both policies on `weaker`, prints one table and films them
@@ -26,9 +26,8 @@ from codrl_mj.validation import validate
 from codrl_mj.viz.films.film import Panel, film
 
 TASK, REAL = "cartpole", "weaker"
-PAPER_REWARD = {
-    "center_radius": 0.1
-}  # the paper trains with no reward beyond 0.1 m from the centre
+# The paper gives no reward farther than 0.1 m from the center.
+PAPER_REWARD = {"center_radius": 0.1}
 
 
 def main() -> int:
@@ -73,6 +72,7 @@ def main() -> int:
     }
     waiting = {}
     for actuator, (config, out) in runs.items():
+        # A folder with other settings is neither overwritten nor taken for this demonstration's.
         if (out / CONFIG).is_file() and load_config(out) != config:
             print(
                 f"demo: {out} holds a run with other settings: choose another --out, or delete it",
@@ -80,7 +80,7 @@ def main() -> int:
             )
             return 2
         if finished(out):
-            print(f"     {out} is trained already (delete it to train anew)")
+            print(f"     {out} is trained already (delete it to train again)")
         else:
             waiting[f"trained on {actuator}"] = (config, out)
     if waiting:
@@ -106,6 +106,7 @@ def main() -> int:
     print_evaluations(evaluations, details=False)
 
     print(f"\n4/4  Film both on {REAL!r}, in the same typical episode")
+    # The typical episode has returns close to the medians of both policies.
     returns = np.array([[episode.total for episode in episodes] for episodes in on_real.values()])
     typical = int(np.abs(returns - np.median(returns, axis=1, keepdims=True)).sum(axis=0).argmin())
     panels = [

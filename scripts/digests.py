@@ -1,10 +1,10 @@
-"""Digests of what a change of the code's structure must leave as it is, to the last bit.
+"""Digests of results that a change of the code's structure must leave as they are, bit for bit.
 
-Written on two commits and compared by `--compare`: trajectories of every task through every
-actuator, command and disturbance, and through off-the-shelf motors; of environments of others; the
-weights that short trainings of every agent end with; what is identified from logs that are made
-here; every preset's configuration; and what every check of the quick certificate found at worst, as
-the number itself. They may depend on the machine and on the versions of the packages.
+They are written on two commits and compared with `--compare`. They cover trajectories of every task
+through every actuator, command and disturbance, and through off-the-shelf motors; trajectories of
+third-party environments; the final weights of short trainings of every agent; parameters that are
+identified from simulated and real logs; every preset's configuration; and the worst value of every
+check of the quick certificate. They may depend on the machine and on the packages' versions.
 """
 
 import argparse
@@ -51,12 +51,17 @@ DISTURBANCES: dict[str, dict[str, float]] = {
     "most": _COMMAND | _PULSE | _MOTOR,
     "low_voltage": {},
 }
-"""Name -> fields. `supply_resistance` and `most` are at `low_voltage`, where the voltage saturates."""
+"""Name -> fields; `supply_resistance` and `most` are tested at `low_voltage`.
+
+At a low voltage limit the voltage saturates.
+"""
 LOW_VOLTAGE = ("supply_resistance", "most", "low_voltage")
 
 
 def disturbed(name: str, task: str, actuator: str = "paper") -> dict[str, Any]:
-    """Arguments of `gymnasium.make` for a disturbance. Nothing else here knows how disturbances are spelled.
+    """Return the arguments of `gymnasium.make` for a disturbance.
+
+    Only this function knows how disturbances are spelled, so that old commits need one change.
 
     Args:
         name: one of `DISTURBANCES`.
@@ -95,9 +100,9 @@ _GAINS = CurrentLoop(kp=1.0, ki=2.0, kd=0.01, kff=0.5, bemf_compensation=False, 
 CUSTOM = DCMotorActuator(
     _WINDING, dataclasses.replace(_GAINS, integral_leak=0.1, derivative_time_constant=0.02)
 )
-"""An actuator none of whose fields is neutral."""
+"""Actuator with no neutral value in any field."""
 STEPS, LIMIT, HOLD = 200, 50, 10
-"""Steps of a trajectory, of its episodes at most, and for which an action is held."""
+"""Steps of a trajectory, maximum steps of an episode, and steps for which an action is held."""
 _CAR = {"low": -1.2, "high": 0.6}
 STARTS = {
     "pendulum": {"y_init": 8.0},
@@ -114,7 +119,7 @@ Entries = Iterator[tuple[str, str]]
 
 
 def digest(arrays: list[np.ndarray]) -> str:
-    """The first digits of the SHA-256 of arrays' bytes."""
+    """Return the first digits of the SHA-256 of arrays' bytes."""
     return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:16]
 
 
@@ -122,17 +127,17 @@ def trajectory(
     task: str,
     num_envs: int | None,
     arguments: dict[str, Any],
-    told: tuple[str, ...] = SIGNALS,
+    signal_names: tuple[str, ...] = SIGNALS,
     steps: int = STEPS,
 ) -> str:
-    """The digest of what an environment returns under random actions.
+    """Return the digest of everything that an environment returns under random actions.
 
     Args:
         task: the task's name.
-        num_envs: environments of the vector environment; None for a single one.
-        arguments: of the environment.
-        told: signals of the info.
-        steps: how many.
+        num_envs: number of environments of the vector environment; None for a single one.
+        arguments: arguments of the environment.
+        signal_names: names of the info's signals.
+        steps: number of steps.
     """
     size: tuple[int, ...] = () if num_envs is None else (num_envs,)
     env: Any
@@ -145,7 +150,7 @@ def trajectory(
     space = env.action_space if num_envs is None else env.single_action_space
     generator, options = np.random.default_rng(1), STARTS.get(task)
     observation, _ = env.reset(seed=2, options=options)
-    seen = [observation, env.unwrapped.state]
+    arrays = [observation, env.unwrapped.state]
     for step in range(steps):
         if step % HOLD == 0 and isinstance(space, Discrete):
             action = generator.integers(space.n, size=size)
@@ -154,24 +159,29 @@ def trajectory(
                 np.float32
             )
         observation, reward, terminated, truncated, info = env.step(action)
-        signals = [
-            info.get(name, np.zeros(size)) for name in told
-        ]  # none where every environment was reset
-        seen += [observation, reward, terminated, env.unwrapped.state, *signals]
+        # A step in which every environment was reset has no signals.
+        signals = [info.get(name, np.zeros(size)) for name in signal_names]
+        arrays += [observation, reward, terminated, env.unwrapped.state, *signals]
         if num_envs is None and (terminated or truncated):
             observation, _ = env.reset(options=options)
-            seen += [observation, env.unwrapped.state]
+            arrays += [observation, env.unwrapped.state]
     env.close()
-    return digest([np.asarray(array, dtype=np.float64) for array in seen])
+    return digest([np.asarray(array, dtype=np.float64) for array in arrays])
 
 
 def variants(task: str, physics: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Names and arguments of a task's environments: every actuator, and one thing varied at `paper` or `ideal`."""
+    """Yield names and arguments of a task's environments: all actuators, and single variations."""
     for actuator in ACTUATORS:
         yield actuator, {"actuator": actuator}
         for name in DISTURBANCES if actuator in ("ideal", "paper") else ():
-            of_motor, of_joint = name in LOW_VOLTAGE or name in _MOTOR, name in _JOINT
-            if (actuator == "paper" or not of_motor) and (physics == "mujoco" or not of_joint):
+            is_motor_disturbance, is_joint_disturbance = (
+                name in LOW_VOLTAGE or name in _MOTOR,
+                name in _JOINT,
+            )
+            # Analytic physics has no joint damping and friction.
+            if (actuator == "paper" or not is_motor_disturbance) and (
+                physics == "mujoco" or not is_joint_disturbance
+            ):
                 yield f"{actuator}/{name}", disturbed(name, task, actuator)
     for command, levels in LEVELS.items():
         discrete = isinstance(TASKS[task].action_space, Discrete)
@@ -188,7 +198,7 @@ def variants(task: str, physics: str) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def trajectories() -> Entries:
-    """Names and digests of trajectories."""
+    """Yield names and digests of trajectories."""
     for task, definition in TASKS.items():
         for physics in ("mujoco", "analytic"):
             for name, arguments in variants(task, physics):
@@ -205,8 +215,8 @@ def trajectories() -> Entries:
                     yield f"trajectory/{task}/vector/{name}", trajectory(task, 8, common)
         mixed = [named_actuator(name, task) for name in ACTUATORS[1:] * 2]
         yield f"trajectory/{task}/vector/mixed", trajectory(task, 8, {"actuator": mixed})
-        both = {"randomize": RANDOMIZE, "autoreset_mode": "SameStep"}
-        yield f"trajectory/{task}/vector/paper/randomize, same step", trajectory(task, 8, both)
+        arguments = {"randomize": RANDOMIZE, "autoreset_mode": "SameStep"}
+        yield f"trajectory/{task}/vector/paper/randomize, same step", trajectory(task, 8, arguments)
 
 
 TRAININGS: dict[str, dict[str, Any]] = {
@@ -223,16 +233,16 @@ TRAININGS: dict[str, dict[str, Any]] = {
     "sarsa/mountain_car/default": {},
     "sarsa/cartpole/default": {},
 }
-"""Agent, task and settings -> what is set otherwise, so that a short training learns."""
+"""Agent, task and settings -> changed settings with which a short training learns."""
 
 
 def weights(subject: str, num_envs: int, arguments: dict[str, Any]) -> str:
-    """The digest of the policy that a short training ends with.
+    """Return the digest of the policy after a short training.
 
     Args:
         subject: one of `TRAININGS`.
-        num_envs: environments side by side.
-        arguments: of the environment.
+        num_envs: number of parallel environments.
+        arguments: arguments of the environment.
     """
     agent, task, settings = subject.split("/")
     budget: dict[str, Any] = {
@@ -242,9 +252,8 @@ def weights(subject: str, num_envs: int, arguments: dict[str, Any]) -> str:
     others: dict[str, Any] = {"seed": 3, "num_envs": num_envs, "evaluation_episodes": 1}
     config = TrainConfig.preset(task, agent, settings, **budget, **others)
     changes = dict(TRAININGS[subject])
-    if (
-        num_envs > 1 and getattr(config.agent, "train_every", 1) is None
-    ):  # at the end of a single environment's episode
+    # None trains at the end of an episode, which only a single environment has.
+    if num_envs > 1 and getattr(config.agent, "train_every", 1) is None:
         changes["train_every"] = 4
     env = EnvConfig(task, **arguments)
     config = dataclasses.replace(
@@ -258,7 +267,7 @@ def weights(subject: str, num_envs: int, arguments: dict[str, Any]) -> str:
 
 
 def trainings() -> Entries:
-    """Names and digests of trained weights."""
+    """Yield names and digests of trained weights."""
     for subject in TRAININGS:
         for physics in ("mujoco", "analytic"):
             for num_envs in (1,) if subject.startswith("sarsa") else (1, 4):
@@ -274,7 +283,7 @@ def trainings() -> Entries:
 
 
 def certificate() -> Entries:
-    """Names of the quick certificate's checks, and the worst that they found."""
+    """Yield names of the quick certificate's checks, and their worst values."""
     for check in __import__("codrl_mj.validation").validation.validate(quick=True).checks:
         yield (
             f"certificate/{check.group}/{check.task or 'no task'}/{check.name}",
@@ -293,20 +302,19 @@ MOTORS = {
     "torque_speed": "torque_speed",
     "servo": "servo",
 }
-"""Name -> actuator of a family that is not the paper's."""
+"""Name -> actuator of a family other than the paper's."""
 FAMILIES = ("HalfCheetah-v5", "Hopper-v5", "InvertedPendulum-v5")
-"""Environments of others."""
+"""Ids of third-party environments."""
 
 
 def behind_motors() -> Entries:
-    """Names and digests of our tasks' trajectories behind other families; of those that are refused, the word."""
+    """Yield names and digests of our tasks' trajectories through other families, or "refused"."""
     for task in TASKS:
         for name, actuator in MOTORS.items():
             for num_envs in (None, 4):
                 arguments = {"actuator": actuator, "allow_unstable": True}
-                arguments |= (
-                    {"action": "position"} if name == "servo" else {}
-                )  # refused where an angle wraps
+                # A servo is refused if the angle wraps.
+                arguments |= {"action": "position"} if name == "servo" else {}
                 try:
                     digested = trajectory(task, num_envs, arguments, SIGNALS[:5], 60)
                 except ValueError:
@@ -314,24 +322,24 @@ def behind_motors() -> Entries:
                 yield f"motors/{task}/{'single' if num_envs is None else 'vector'}/{name}", digested
 
 
-def rolled_out(env: Any, steps: int = 60) -> str:
-    """The digest of what somebody else's environment and the motors in it do under random actions."""
+def rollout_digest(env: Any, steps: int = 60) -> str:
+    """Return the digest of a third-party environment and its motors under random actions."""
     generator, space = np.random.default_rng(1), env.action_space
-    seen = [env.reset(seed=2)[0]]
+    arrays = [env.reset(seed=2)[0]]
     for _ in range(steps):
         action = generator.uniform(space.low, space.high).astype(space.dtype)
         observation, reward, terminated, truncated, info = env.step(action)
-        seen += [observation, reward, terminated, *(info.get(name, 0.0) for name in SIGNALS[:5])]
+        arrays += [observation, reward, terminated, *(info.get(name, 0.0) for name in SIGNALS[:5])]
         if terminated or truncated:
-            seen.append(env.reset()[0])
+            arrays.append(env.reset()[0])
     env.close()
-    return digest([np.asarray(array, dtype=np.float64) for array in seen])
+    return digest([np.asarray(array, dtype=np.float64) for array in arrays])
 
 
-def environments_of_others() -> Entries:
-    """Names and digests of trajectories of environments of others, Gymnasium's and dm_control's."""
+def third_party_environments() -> Entries:
+    """Yield names and digests of trajectories of Gymnasium's and dm_control's environments."""
     drive = {"name": "maxon-ec45-flat-50w", "motor": {"gear_ratio": 5}}
-    ways: dict[str, dict[str, Any]] = {
+    variants: dict[str, dict[str, Any]] = {
         "ideal": {"actuator": {".*": "ideal"}},
         "lag": {"actuator": {".*": "lag"}},
         "drive": {"actuator": {".*": drive}, "observe_actuator": True},
@@ -350,50 +358,53 @@ def environments_of_others() -> Entries:
         },
     }
     for env_id in FAMILIES:
-        for name, arguments in ways.items():
-            made = codrl_mj.make(env_id, allow_unstable=True, **arguments)
-            yield f"others/{env_id}/{name}", rolled_out(made)
+        for name, arguments in variants.items():
+            gym_env = codrl_mj.make(env_id, allow_unstable=True, **arguments)
+            yield f"others/{env_id}/{name}", rollout_digest(gym_env)
     for name in ("ideal", "drive", "drawn"):
         arguments = {"randomize": None} | {
-            key: ways[name][key] for key in ways[name] if key != "observe_actuator"
+            key: variants[name][key] for key in variants[name] if key != "observe_actuator"
         }
-        made_by = {"task_kwargs": {"random": 1}, "noise_seed": 3, "allow_unstable": True}
+        options = {"task_kwargs": {"random": 1}, "noise_seed": 3, "allow_unstable": True}
         env = codrl_mj.make_dm_control(
-            "cheetah/run", arguments.pop("actuator"), **made_by, **arguments
+            "cheetah/run", arguments.pop("actuator"), **options, **arguments
         )
-        generator, seen = np.random.default_rng(1), []
+        generator, arrays = np.random.default_rng(1), []
         env.reset()
         for _ in range(60):
             step = env.step(generator.uniform(-1.0, 1.0, 6))
-            seen += [*step.observation.values(), step.reward]
+            arrays += [*step.observation.values(), step.reward]
         yield (
             f"others/cheetah-run/{name}",
-            digest([np.asarray(array, dtype=np.float64) for array in seen]),
+            digest([np.asarray(array, dtype=np.float64) for array in arrays]),
         )
-    for name, fields in ("vector", {}), ("vector, observed and delayed", SEEN):
+    for name, fields in ("vector", {}), ("vector, observed and delayed", OBSERVED_AND_DELAYED):
         config = EnvConfig(
             "Hopper-v5", {".*": drive if fields else "lag"}, allow_unstable=True, **fields
         )
         vector = codrl_mj.make_sb3_vec_env(config, 2)
         vector.seed(3)
-        seen = [vector.reset()]
+        arrays = [vector.reset()]
         for _ in range(60):
-            seen += vector.step(np.full((2, 3), 0.1, dtype=np.float32))[:2]
+            arrays += vector.step(np.full((2, 3), 0.1, dtype=np.float32))[:2]
         yield (
             f"others/Hopper-v5/{name}",
-            digest([np.asarray(array, dtype=np.float64) for array in seen]),
+            digest([np.asarray(array, dtype=np.float64) for array in arrays]),
         )
 
 
-SEEN: dict[str, Any] = {"observe_actuator": True, "disturbances": {"command_delay": 0.02}}
+OBSERVED_AND_DELAYED: dict[str, Any] = {
+    "observe_actuator": True,
+    "disturbances": {"command_delay": 0.02},
+}
 
 
 def furuta() -> Entries:
-    """Names and digests of Furuta's trajectories, which Gymnasium does not have."""
+    """Yield names and digests of trajectories of Furuta, which Gymnasium does not have."""
     kinds: dict[str, dict[str, Any]] = {
         **{
-            name: {"actuator": one, "allow_unstable": True}
-            for name, one in MOTORS.items()
+            name: {"actuator": actuator, "allow_unstable": True}
+            for name, actuator in MOTORS.items()
             if name not in ("warm", "servo")
         },
         "default": {"observe_actuator": True},
@@ -412,7 +423,7 @@ def furuta() -> Entries:
 
 
 def helps() -> Entries:
-    """What every verb says with `--help`, and of every task and an environment of others `train`'s."""
+    """Yield digests of the help texts of every command, and of `train` for every task."""
     verbs = [
         [verb]
         for verb in (
@@ -442,7 +453,7 @@ def helps() -> Entries:
 
 
 def identified() -> Entries:
-    """What is identified from logs that are simulated, and from real ones, as the numbers themselves."""
+    """Yield parameters that are identified from simulated and real logs, with all digits."""
     drive = find_drive("maxon-ec45-flat-50w")
     prbs = Excitation("prbs", amplitude=4.0, duration=2.0)
     sensors = {"current": Sensor(noise=0.02), "position": Sensor(resolution=0.0015)}
@@ -451,42 +462,43 @@ def identified() -> Entries:
         "pendulum": (Load(inertia=1e-3, gravity=0.05), {"mgl": 0.05}),
     }
     for rig, (load, known) in rigs.items():
-        made = [
+        simulated = [
             simulate(drive, prbs, load, sensors, Sampler(mean_voltage=True), seed)
             for seed in (1, 2)
         ]
         logs = [
-            dataclasses.replace(log, signals={name: log.signals[name] for name in USED})
-            for log in made
+            dataclasses.replace(log, signals={name: log.signals[name] for name in LOGGED_SIGNALS})
+            for log in simulated
         ]
-        for one in identify(logs, rig, {"gear_ratio": 1.0, **known}).estimates:
+        for estimate in identify(logs, rig, {"gear_ratio": 1.0, **known}).estimates:
             yield (
-                f"identified/{rig}/{one.name}",
-                f"{one.value!r} {one.low!r} {one.high!r} {one.status}",
+                f"identified/{rig}/{estimate.name}",
+                f"{estimate.value!r} {estimate.low!r} {estimate.high!r} {estimate.status}",
             )
 
-    columns, here = (
+    columns, data_folder = (
         "time=time:s,position=position:rad,torque=torque:N*m",
         Path(os.environ.get("CODRL_MJ_DATA", "data")),
     )
-    if not (here / "bench_logs" / "dfki_pendulum").is_dir():
-        return  # codrl-mj data dfki_pendulum
+    if not (data_folder / "bench_logs" / "dfki_pendulum").is_dir():
+        # The real logs are optional: codrl-mj data dfki_pendulum downloads them.
+        return
     real = [
-        read_log(here / "bench_logs" / "dfki_pendulum" / f"{name}.csv", columns)
+        read_log(data_folder / "bench_logs" / "dfki_pendulum" / f"{name}.csv", columns)
         for name in ("ddp", "ilqr")
     ]
-    for one in identify(real, "pendulum").estimates:
+    for estimate in identify(real, "pendulum").estimates:
         yield (
-            f"identified/real pendulum/{one.name}",
-            f"{one.value!r} {one.low!r} {one.high!r} {one.status}",
+            f"identified/real pendulum/{estimate.name}",
+            f"{estimate.value!r} {estimate.low!r} {estimate.high!r} {estimate.status}",
         )
 
 
-USED = ("voltage", "current", "position")
+LOGGED_SIGNALS = ("voltage", "current", "position")
 
 
 def configurations() -> Entries:
-    """Every preset as its mapping, whose hash names a run."""
+    """Yield the digest of every preset's mapping, whose hash names a run."""
     for task in TASKS:
         for agent in AGENTS:
             for settings in SETTINGS:
@@ -507,7 +519,7 @@ PARTS = {
     "certificate": certificate,
     "motors": behind_motors,
     "furuta": furuta,
-    "others": environments_of_others,
+    "others": third_party_environments,
     "identified": identified,
     "configuration": configurations,
     "help": helps,
@@ -515,7 +527,7 @@ PARTS = {
 
 
 def compare(first: dict[str, str], second: dict[str, str]) -> int:
-    """Print what differs between two files; the number of entries that do."""
+    """Print the entries that differ between two files; return their number."""
     names = sorted(first.keys() | second.keys())
     differing = [name for name in names if first.get(name) != second.get(name)]
     for name in differing:
@@ -525,14 +537,14 @@ def compare(first: dict[str, str], second: dict[str, str]) -> int:
 
 
 def main() -> int:
-    """Make digests, or compare them."""
+    """Compute digests, or compare two files of them."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--only", choices=list(PARTS), help="only this part")
     parser.add_argument("--out", type=Path, help="JSON file for the digests")
     parser.add_argument(
-        "--compare", type=Path, nargs=2, metavar="FILE", help="print what differs between two such"
+        "--compare", type=Path, nargs=2, metavar="FILE", help="print the differences of two files"
     )
     options = parser.parse_args()
     parts = [options.only] if options.only else list(PARTS)
@@ -544,16 +556,16 @@ def main() -> int:
             )
             > 0
         )
-    found: dict[str, str] = {}
+    digests_by_name: dict[str, str] = {}
     for part in parts:
         start = time.perf_counter()
         for name, value in PARTS[part]():
-            assert name not in found, name
-            found[name] = value
+            assert name not in digests_by_name, name
+            digests_by_name[name] = value
             print(f"{name} {value}", flush=True)
         print(f"{part}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
     if options.out is not None:
-        write_json(options.out, dict(sorted(found.items())))
+        write_json(options.out, dict(sorted(digests_by_name.items())))
     return 0
 
 

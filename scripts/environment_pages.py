@@ -1,6 +1,6 @@
-"""Writes docs/environments/: a page for each environment, from its task's docstring and its code, so they cannot drift.
+"""Write docs/environments/: a page for each environment, from its docstring and code.
 
-`make docs` runs it; a test compares the pages with what it would write.
+`make docs` runs it; a test compares the pages with its output, so they cannot drift apart.
 """
 
 import argparse
@@ -24,24 +24,24 @@ FOLDER = Path(__file__).parent.parent / "docs" / "environments"
 
 
 def _title(task_name: str) -> str:
-    """What a page is called: the environment's id without our namespace."""
+    """Return a page's title: the environment's id without our namespace."""
     return TASKS[task_name].env_id.removeprefix("codrl_mj/")
 
 
 def _documentation(task_name: str) -> tuple[str, str]:
-    """The first line of a task's documentation, and the rest."""
+    """Return the first line of a task's documentation, and the rest."""
     documented = (importlib.import_module(f"codrl_mj.tasks.{task_name}").__doc__ or "").strip()
     summary, _, body = documented.partition("\n\n")
     return summary, body
 
 
 def _space(space: object) -> str:
-    """A space on one line, without numpy's padding."""
+    """Format a space on one line, without numpy's padding."""
     return re.sub(r"\s+", " ", str(space)).replace("[ ", "[").replace(" ]", "]")
 
 
 def common_arguments() -> str:
-    """The arguments of every environment but `task`, as a table: name, default, meaning.
+    """Return a table of all environments' arguments except `task`: name, default, meaning.
 
     Raises:
         ValueError: the signature of `ActuatedEnv` and the arguments that it documents differ.
@@ -63,16 +63,19 @@ def common_arguments() -> str:
             f"ActuatedEnv documents {', '.join(meanings)} but takes {', '.join(parameters)}"
         )
     defaults = {field.name: field.default for field in dataclasses.fields(EnvConfig)[1:]}
-    common = {*find_source("pendulum").fields} - {"options"}  # which each task's own page has
+    # The options of a task are on its own page.
+    common = {*find_source("pendulum").fields} - {"options"}
     defaults = {name: default for name, default in defaults.items() if name in common}
     meanings |= field_docs(EnvConfig)
     defaults |= {
         name: parameter.default
         for name, parameter in parameters.items()
         if name not in defaults
-        and parameter.kind is not parameter.VAR_KEYWORD  # the tasks' own, which each page has
+        # Keyword arguments are the tasks' options.
+        and parameter.kind is not parameter.VAR_KEYWORD
     }
-    for name, text in meanings.items():  # the reference has them whole
+    # The reference has the full texts; the table shows their first sentences.
+    for name, text in meanings.items():
         first, stop, _ = text.partition(". ")
         meanings[name] = first + stop.strip()
     shown = {name: re.sub(r"\(.*\)$", "()", repr(default)) for name, default in defaults.items()}
@@ -81,11 +84,11 @@ def common_arguments() -> str:
 
 
 def page(task_name: str) -> str:
-    """The Markdown page of one environment."""
+    """Return the Markdown page of an environment."""
     task = TASKS[task_name]
     summary, body = _documentation(task_name)
-    says = summary.partition(": ")[2]
-    title, own = _title(task_name), task.options()._asdict().items()
+    description = summary.partition(": ")[2]
+    title, options = _title(task_name), task.options()._asdict().items()
     facts = {
         "action space": f"`{_space(task.action_space)}`",
         "state": ", ".join(task.state_names),
@@ -95,7 +98,7 @@ def page(task_name: str) -> str:
         ),
         "integrators": ", ".join(f"`{name}`" for name in task.integrators),
         "options of its own": (
-            ", ".join(f"`{name}` (default {value})" for name, value in own) or "none"
+            ", ".join(f"`{name}` (default {value})" for name, value in options) or "none"
         ),
         "time limit": f"{task.max_episode_steps} steps",
         f"`{task.default_actuator}` actuator": _actuator(task_name),
@@ -104,7 +107,7 @@ def page(task_name: str) -> str:
         facts["solved at"] = f"a return of {task.reward_threshold:g}"
     rows = "\n".join(f"| {name} | {value} |" for name, value in facts.items())
     return (
-        f"# {title}\n\n{says[0].upper()}{says[1:]}\n\n"
+        f"# {title}\n\n{description[0].upper()}{description[1:]}\n\n"
         f"![A policy on {title}; below it torque and voltage of the motor]({task_name}.webp)\n\n"
         f"```console\n$ codrl-mj train {task_name} {SCENES[task_name].flags}\n```\n\n"
         f"| | |\n| --- | --- |\n{rows}\n\n{body}\n"
@@ -112,7 +115,7 @@ def page(task_name: str) -> str:
 
 
 def _actuator(task_name: str) -> str:
-    """The numbers of a task's own actuator."""
+    """Describe a task's default actuator by its numbers."""
     actuator = named_actuator("default", task_name)
     motor, loop = actuator.motor, actuator.controller
     constants = (
@@ -131,7 +134,7 @@ def _actuator(task_name: str) -> str:
 
 
 def index() -> str:
-    """The Markdown page that lists the environments."""
+    """Return the Markdown page that lists the environments."""
     rows = "\n".join(
         f"| [{_title(name)}]({name}.md) | {_documentation(name)[0].partition(': ')[2]} |"
         for name in TASKS
@@ -144,7 +147,7 @@ def index() -> str:
 
 
 def arguments() -> str:
-    """The Markdown page of what every environment takes."""
+    """Return the Markdown page on the arguments of all environments."""
     return (
         "# Arguments of every environment\n\nSay what the force goes through, and how it is"
         ' simulated.\n\n```python\nimport codrl_mj\n\nenv = codrl_mj.make("cartpole",'
@@ -155,14 +158,14 @@ def arguments() -> str:
 
 
 def pages() -> dict[str, str]:
-    """Every page by its file name."""
+    """Return all pages by file name."""
     return {"README.md": index(), "arguments.md": arguments()} | {
         f"{name}.md": page(name) for name in TASKS
     }
 
 
 def main() -> int:
-    """Write every page; scripts/page_pictures_tasks.py makes the films on them."""
+    """Write all pages; scripts/page_pictures_tasks.py makes the films on them."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,7 +1,7 @@
-"""What Furuta policies are worth on weaker supplies and behind delays, trained on the ideal arm and through motors.
+"""Compare Furuta policies on weaker supplies and with delays, trained on ideal forces and motors.
 
-Prints a table: the mean return over the seeds, and the worst and the best seed's. Runs that are
-finished are not trained again: half an hour of one core for three seeds.
+Prints a table of the mean return over the seeds, with the worst and the best seed's. Finished runs
+are not trained again; three seeds take half an hour on one core.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from codrl_mj.training import EVALUATION_SEED, TrainConfig, train
 
 
 def motor(volts: float, delay: float = 0.0) -> dict[str, Any]:
-    """Arguments of an environment whose motor has a supply [V], and commands that come late [s]."""
+    """Return arguments of an environment whose motor has a supply [V] and delayed commands [s]."""
     return {
         "actuator": {"name": "default", "supply": {"voltage": volts}},
         "disturbances": {"command_delay": delay},
@@ -34,12 +34,12 @@ TESTED = {f"{volts:g} V": motor(volts) for volts in (18.0, 12.0, 10.0, 8.0, 7.0,
 
 
 def main() -> None:
-    """Train what is not trained, and evaluate all of it everywhere."""
+    """Train the missing policies, and evaluate each policy on each motor."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--episodes", type=int, default=30, help="of each policy on each motor")
+    parser.add_argument("--episodes", type=int, default=30, help="episodes per policy and motor")
     parser.add_argument("--total-steps", type=int, default=200_000)
     parser.add_argument(
         "--out", type=Path, default=Path("runs/furuta_table"), help="folder of the runs"
@@ -47,11 +47,12 @@ def main() -> None:
     options = parser.parse_args()
     policies: dict[str, list[Any]] = {name: [] for name in TRAINED}
     for seed in range(options.seeds):
-        for name, given in TRAINED.items():
-            others = {key: value for key, value in given.items() if key != "actuator"}
+        # All policies are trained before the first row, which needs every one.
+        for name, arguments in TRAINED.items():
+            others = {key: value for key, value in arguments.items() if key != "actuator"}
             changes: dict[str, Any] = {"seed": seed, "total_steps": options.total_steps}
             config = TrainConfig.preset(
-                "furuta", "ppo", "default", given["actuator"], others, **changes
+                "furuta", "ppo", "default", arguments["actuator"], others, **changes
             )
             run = options.out / f"{name.replace(', ', '_').replace(' ', '')}-{seed}"
             policies[name].append(
@@ -63,16 +64,18 @@ def main() -> None:
         + " |"
     )
     print("| --- |" + " ---: |" * len(TRAINED))
-    for condition, given in TESTED.items():
+    for condition, arguments in TESTED.items():
         cells = []
-        for ones in policies.values():
-            found = [
+        for seed_policies in policies.values():
+            returns = [
                 evaluate(
-                    one, EnvConfig("furuta", **given), options.episodes, EVALUATION_SEED
+                    policy, EnvConfig("furuta", **arguments), options.episodes, EVALUATION_SEED
                 ).returns.mean
-                for one in ones
+                for policy in seed_policies
             ]
-            cells.append(f"{sum(found) / len(found):.0f} ({min(found):.0f} to {max(found):.0f})")
+            cells.append(
+                f"{sum(returns) / len(returns):.0f} ({min(returns):.0f} to {max(returns):.0f})"
+            )
         print(f"| {condition} | " + " | ".join(cells) + " |", flush=True)
 
 

@@ -1,10 +1,9 @@
-"""Counts what a reader of the package has to hold in mind, against the limits in `[tool.house]` of pyproject.toml.
+"""Compare counts of the package's complexity with the limits in `[tool.house]` of pyproject.toml.
 
     python scripts/house.py [FOLDER]
 
-Exits with 1 where a count is above its limit. A change that needs more raises the limit in the same
-commit and says why; a count that falls because names were shortened or files glued together says
-nothing.
+Exits with 1 if a count is above its limit. A commit that needs more raises the limit and says why.
+A count that falls because names were shortened or files joined means nothing.
 """
 
 import ast
@@ -19,18 +18,20 @@ import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from plain_words import count_words
+
 ROOT = Path(__file__).parents[1]
 RECURRING = {"State", "Signals", "Options", "ReferenceEnv"}
-"""Names of classes that each family of actuators, or each task, has for itself."""
+"""Class names that each family of actuators, or each task, uses for itself."""
 SCREEN, FILE = 75, 570
-"""Lines of 100 characters that a function, and a file, may have."""
+"""Maximum number of lines of a function and of a file, with lines of up to 100 characters."""
 KINDS = r"\w*Config|\w*EnvSource|Task|MotorsAddedEnv|ActuatedEnv"
-"""Kinds of environments and configurations: what asks which of them something is, is a fork."""
+"""Pattern of the classes of environments and configurations whose type checks count as forks."""
 BLOCK = re.compile(r"(Args|Returns|Raises):")
 
 
 class Module(NamedTuple):
-    """One file of the package."""
+    """File of the package."""
 
     name: str
     path: Path
@@ -39,49 +40,49 @@ class Module(NamedTuple):
 
 
 def modules(root: Path) -> list[Module]:
-    """All of a package, but for the models that a wheel has beside them."""
-    found = []
+    """Parse all files of a package, except the assets that a wheel contains beside them."""
+    parsed = []
     for path in sorted(root.rglob("*.py")):
         name = ".".join((root.name, *path.relative_to(root).with_suffix("").parts)).removesuffix(
             ".__init__"
         )
         if "_assets" not in path.parts:
-            found.append(Module(name, path, path.read_text(), ast.parse(path.read_text())))
-    return found
+            parsed.append(Module(name, path, path.read_text(), ast.parse(path.read_text())))
+    return parsed
 
 
 def imports(module: Module, known: set[str]) -> set[str]:
-    """Modules of the package that one imports, wherever in it, by what names they are imported."""
-    named: set[str] = set()
+    """Return the package's modules that a module imports anywhere, absolutely or relatively."""
+    imported: set[str] = set()
     for node in ast.walk(module.tree):
         if isinstance(node, ast.Import):
-            named |= {alias.name for alias in node.names}
+            imported |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             package = (
                 module.name if module.path.stem == "__init__" else module.name.rpartition(".")[0]
             )
             above = package.split(".")[: package.count(".") + 2 - node.level] if node.level else []
             base = ".".join([*above, *filter(None, [node.module])])
-            named |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
-    return (named & known) - {module.name}
+            imported |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+    return (imported & known) - {module.name}
 
 
-def circles(graph: dict[str, set[str]]) -> list[list[str]]:
-    """Circles of what needs what, one after the other: each is cut where it was found."""
-    found, left = [], {name: set(needs) for name, needs in graph.items()}
+def import_cycles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Return the cycles of a graph, one after the other; each is cut where it was found."""
+    cycles, remaining = [], {name: set(needs) for name, needs in graph.items()}
     while True:
         try:
-            graphlib.TopologicalSorter(left).prepare()
+            graphlib.TopologicalSorter(remaining).prepare()
         except graphlib.CycleError as error:
-            circle = error.args[1]
-            found.append(circle)
-            left[circle[1]].discard(circle[0])
+            cycle = error.args[1]
+            cycles.append(cycle)
+            remaining[cycle[1]].discard(cycle[0])
         else:
-            return found
+            return cycles
 
 
 def lines_of_code(module: Module) -> int:
-    """Lines that are neither empty nor comment nor docstring."""
+    """Count the lines that are neither empty nor comment nor docstring."""
     silent = {
         tokenize.COMMENT,
         tokenize.NL,
@@ -105,7 +106,7 @@ def lines_of_code(module: Module) -> int:
 
 
 def public_names(package: list[Module]) -> set[str]:
-    """What the package and its rooms offer: in `__all__` of their `__init__`, or in the package's lazy names."""
+    """Return the public names of the package and its subpackages: `__all__`, or the lazy names."""
     assigned = [
         node.value
         for module in package
@@ -121,14 +122,14 @@ def public_names(package: list[Module]) -> set[str]:
 
 
 def counts(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
-    """All counts of a package; and of some of them what was counted."""
+    """Compute all counts of a package, and for some of them the names that were counted."""
     package = modules(root)
-    names, offered = {module.name for module in package}, public_names(package)
+    names, public = {module.name for module in package}, public_names(package)
     everything = "\n".join(module.text for module in package)
     mentions = collections.Counter(re.findall(r"\b\w+\b", everything))
-    told: dict[str, list[str]] = collections.defaultdict(list)
+    counted: dict[str, list[str]] = collections.defaultdict(list)
     classes: dict[str, int] = collections.Counter()
-    functions = documented = 0
+    functions = num_doc_lines = 0
     for module in package:
         owner: dict[int, str] = {}
         top = set(map(id, module.tree.body))
@@ -139,40 +140,44 @@ def counts(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
             if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 continue
             functions += 1
-            where, inner = (
+            qualified_name, is_internal = (
                 f"{module.name}.{node.name}",
-                not {node.name, owner.get(id(node))} & offered,
+                not {node.name, owner.get(id(node))} & public,
             )
-            if inner:
+            # Only what users call needs Args and Returns; elsewhere such blocks are counted as
+            # overhead.
+            if is_internal:
                 text = (ast.get_docstring(node) or "").splitlines()
-                documented += len(
+                num_doc_lines += len(
                     list(itertools.dropwhile(lambda line: not BLOCK.match(line), text))
                 )
             if (node.end_lineno or 0) - node.lineno > SCREEN:
-                told["long_functions"].append(where)
+                counted["long_functions"].append(qualified_name)
             if len(node.args.posonlyargs) + len(node.args.args) + len(node.args.kwonlyargs) > 8:
-                told["wide_functions"].append(where)
-            if inner and not node.decorator_list and not node.name.startswith("__"):
+                counted["wide_functions"].append(qualified_name)
+            if is_internal and not node.decorator_list and not node.name.startswith("__"):
                 if mentions[node.name] == 1:
-                    told["named_once"].append(where)
+                    counted["named_once"].append(qualified_name)
                 elif mentions[node.name] == 2 and id(node) in top:
-                    told["used_in_one_place"].append(where)
+                    counted["used_in_one_place"].append(qualified_name)
     graph = {module.name: imports(module, names) for module in package}
     users = collections.Counter(itertools.chain.from_iterable(graph.values()))
     above = {name: name.rpartition(".")[0] for name in names}
     sizes = {module.name: module.text.count("\n") for module in package}
     plain = [module.name for module in package if module.path.stem != "__init__"]
-    told["imported_by_one"] = [n for n in plain if users[n] - (n in graph.get(above[n], ())) <= 1]
-    told["homonyms"] = [n for n, count in classes.items() if count > 1 and n not in RECURRING]
-    told["forks"] = re.findall(
+    counted["imported_by_one"] = [
+        n for n in plain if users[n] - (n in graph.get(above[n], ())) <= 1
+    ]
+    counted["homonyms"] = [n for n, count in classes.items() if count > 1 and n not in RECURRING]
+    counted["forks"] = re.findall(
         rf"(?:isinstance|issubclass)\([^()]*,\s*(?:{KINDS})\b|is_gymnasium_id\(|is_foreign\w*\(",
         everything,
     )
-    # a package's __init__ that offers its modules' names is no circle by itself
-    needs = {n: {m for m in found if above[n] != m and above[m] != n} for n, found in graph.items()}
-    told["circles"] = [" -> ".join(circle) for circle in circles(needs)]
-    told["long_files"] = [n for n in sizes if sizes[n] > FILE]
-    told["short_modules"] = [n for n in plain if sizes[n] < 60]
+    # A package that exports names of its modules does not form a cycle with them.
+    needs = {n: {m for m in names if above[n] != m and above[m] != n} for n, names in graph.items()}
+    counted["circles"] = [" -> ".join(circle) for circle in import_cycles(needs)]
+    counted["long_files"] = [n for n in sizes if sizes[n] > FILE]
+    counted["short_modules"] = [n for n in plain if sizes[n] < 60]
     data = [
         path
         for path in root.rglob("*")
@@ -185,35 +190,60 @@ def counts(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
         "modules": len(package),
         "classes": sum(classes.values()),
         "functions": functions,
-        "inner_doc_lines": documented,
+        "inner_doc_lines": num_doc_lines,
         "raises": sum(
             isinstance(node, ast.Raise) for module in package for node in ast.walk(module.tree)
         ),
         "any": mentions["Any"],
     }
-    return numbers | {name: len(found) for name, found in told.items()}, told
+    return numbers | {name: len(names) for name, names in counted.items()}, counted
+
+
+def check_counts(root: Path, limits: dict[str, Any]) -> bool:
+    """Print each count with its limit, and what exceeds it; return True if any is exceeded."""
+    values, counted = counts(root)
+    if limits.keys() != values.keys():
+        raise ValueError(
+            "[tool.house] and the counts differ in"
+            f" {', '.join(sorted(limits.keys() ^ values.keys()))}"
+        )
+    exceeded = [name for name, value in values.items() if value > limits[name]]
+    for name, value in values.items():
+        print(f"{name:18}{value:8,}  at most {limits[name]:,}" + "  TOO MANY" * (name in exceeded))
+    for name in exceeded:
+        print(
+            f"{name}: {', '.join(counted.get(name, []))}"
+            if counted.get(name)
+            else f"{name} is above its limit"
+        )
+    return bool(exceeded)
+
+
+def check_words(folder: Path, limits: dict[str, float]) -> bool:
+    """Print a folder's counts of words with their limits; return True if one is beyond its limit.
+
+    A limit whose name ends with `_per_k` is a lower one: a folder may have too few comments.
+    """
+    words, is_beyond = count_words(folder), False
+    for name, limit in limits.items():
+        value, is_lower = words.counts[name], name.endswith("_per_k")
+        is_wrong = value < limit if is_lower else value > limit
+        bound = f"at least {limit:,}" if is_lower else f"at most {limit:,}"
+        print(f"{folder.name} {name}".ljust(28) + f"{value:8,}  {bound}" + "  WRONG" * is_wrong)
+        if is_wrong:
+            print("\n".join(f"  {place}" for place in words.places.get(name, [])))
+        is_beyond |= is_wrong
+    return is_beyond
 
 
 def main(arguments: list[str]) -> int:
-    """Print each count with its limit, and by name what is above one."""
+    """Compare all counts with their limits; return 1 if one is beyond its limit."""
     root = Path(arguments[0]) if arguments else ROOT / "codrl_mj"
     limits: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["house"]
-    found, told = counts(root.resolve())
-    if limits.keys() != found.keys():
-        raise ValueError(
-            "[tool.house] and the counts differ in"
-            f" {', '.join(sorted(limits.keys() ^ found.keys()))}"
-        )
-    over = [name for name, value in found.items() if value > limits[name]]
-    for name, value in found.items():
-        print(f"{name:18}{value:8,}  at most {limits[name]:,}" + "  TOO MANY" * (name in over))
-    for name in over:
-        print(
-            f"{name}: {', '.join(told.get(name, []))}"
-            if told.get(name)
-            else f"{name} is above its limit"
-        )
-    return bool(over)
+    limits_of_words = limits.pop("words")
+    results = [check_counts(root.resolve(), limits)]
+    results += [check_words(ROOT / folder, bounds) for folder, bounds in limits_of_words.items()]
+    return int(any(results))
 
 
 if __name__ == "__main__":

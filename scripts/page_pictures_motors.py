@@ -1,7 +1,7 @@
-"""Pictures of the pages on motors, actuators and environments; `make pictures` makes them with the others.
+"""Pictures of the pages on motors, actuators and environments, made by `make pictures`.
 
-PICTURES has a function for each, which takes the path to write. All but two are what a command of
-its page draws.
+PICTURES has a function for each, which takes the output path. All but two pictures are drawn by a
+command of their page.
 """
 
 import re
@@ -23,13 +23,13 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 
 def run(*words: str) -> None:
-    """A command of ours, which has to succeed."""
+    """Run a codrl-mj command; exit if it fails."""
     if main(list(words)) != 0:
         raise SystemExit(f"codrl-mj {' '.join(words)} failed")
 
 
 def smaller(picture: Path, out: Path, width: int = 840) -> None:
-    """Write a picture with a palette of 256 colours."""
+    """Write a picture with a palette of 256 colors."""
     with Image.open(picture) as image:
         width = min(width, image.width)
         size = width, round(image.height * width / image.width)
@@ -39,8 +39,8 @@ def smaller(picture: Path, out: Path, width: int = 840) -> None:
 
 
 def motor_design(out: Path) -> None:
-    """The loop that docs/motors.md designs: gain and phase, with margins."""
-    with tempfile.TemporaryDirectory() as made:
+    """Draw the current loop that docs/motors.md designs: gain and phase, with margins."""
+    with tempfile.TemporaryDirectory() as folder:
         run(
             "motor",
             "design",
@@ -49,25 +49,25 @@ def motor_design(out: Path) -> None:
             "1500",
             "--delayed",
             "--out",
-            made,
+            folder,
         )
-        smaller(Path(made, "bode.png"), out, 720)
+        smaller(Path(folder, "bode.png"), out, 720)
 
 
-def own_motor(out: Path) -> None:
-    """The motor that docs/motors.md writes down."""
+def custom_motor(out: Path) -> None:
+    """Draw the motor that docs/motors.md defines."""
     written = re.search(r"```toml\n(.*?)```", (DOCS / "motors.md").read_text(), re.DOTALL)
-    with tempfile.TemporaryDirectory() as made:
-        Path(made, "my_motor.toml").write_text(written[1] if written else "")
-        run("motor", "show", str(Path(made, "my_motor.toml")), "--out", made)
-        smaller(Path(made, "torque_speed.png"), out)
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "my_motor.toml").write_text(written[1] if written else "")
+        run("motor", "show", str(Path(folder, "my_motor.toml")), "--out", folder)
+        smaller(Path(folder, "torque_speed.png"), out)
 
 
-def own_robot(out: Path) -> None:
-    """Five frames of the film of docs/own_robot.md, one above the other."""
+def custom_robot(out: Path) -> None:
+    """Stack five frames of the film of docs/own_robot.md."""
     example = DOCS.parent / "examples" / "own_robot" / "ball_and_beam.py"
-    with tempfile.TemporaryDirectory() as made:
-        trained, film = Path(made, "ball"), Path(made, "film")
+    with tempfile.TemporaryDirectory() as folder:
+        trained, film = Path(folder, "ball"), Path(folder, "film")
         run("train", f"{example}:TASK", "--total-steps", "100000", "--out", str(trained))
         run(
             "render",
@@ -90,9 +90,9 @@ def own_robot(out: Path) -> None:
     stacked.quantize(64).save(out, optimize=True)
 
 
-def foreign(out: Path) -> None:
-    """A frame of the film of docs/external_envs.md: HalfCheetah, its motors, random actions."""
-    with tempfile.TemporaryDirectory() as made:
+def third_party_env(out: Path) -> None:
+    """Write a frame of the film of docs/external_envs.md: HalfCheetah, its motors, random actions."""
+    with tempfile.TemporaryDirectory() as folder:
         film = (
             "--motor",
             "bthigh",
@@ -101,14 +101,17 @@ def foreign(out: Path) -> None:
             "--height",
             "300",
             "--out",
-            str(Path(made, "film")),
+            str(Path(folder, "film")),
         )
         run("render", "HalfCheetah-v5", "--actuator", "maxon-ec45-flat-50w", *film)
-        smaller(sorted(Path(made, "film").glob("*.png"))[-1], out, 640)
+        smaller(sorted(Path(folder, "film").glob("*.png"))[-1], out, 640)
 
 
 def actuators(out: Path) -> None:
-    """What families deliver of a torque that is asked for on a joint that turns freely, up to their speed limit."""
+    """Draw families' torques on a free joint after a step of the desired torque.
+
+    The joint accelerates to the families' speed limits.
+    """
     motor = GearMotor(
         resistance=1.0,
         inductance=1e-3,
@@ -122,13 +125,13 @@ def actuators(out: Path) -> None:
         "lag": Lag(0.1),
         "torque_speed": TorqueSpeed(stall_torque=5.0, no_load_speed=30.0, max_torque=3.5),
     }
-    timestep, asked, inertia = 1e-3, 4.0, 0.2
+    timestep, desired, inertia = 1e-3, 4.0, 0.2
     times = timestep * np.arange(1, 1501)
     curves = [
-        Curve(name, times, on_bench(one, timestep, inertia)(asked, times[-1])[:, 0])
-        for name, one in families.items()
+        Curve(name, times, on_bench(actuator, timestep, inertia)(desired, times[-1])[:, 0])
+        for name, actuator in families.items()
     ]
-    ideal = Curve("ideal", times, np.full_like(times, asked), reference=True, dashed=True)
+    ideal = Curve("ideal", times, np.full_like(times, desired), reference=True, dashed=True)
     title = "4 N·m asked for, on a joint that is free to turn"
     save_png(
         Plot(title, "time [s]", "torque at the joint [N·m]", (*curves, ideal)), out, (7.0, 3.8)
@@ -137,12 +140,12 @@ def actuators(out: Path) -> None:
 
 
 def actuators_in_numbers(out: Path) -> None:
-    """Shares of the largest force that the paper's actuators deliver on a blocked joint, on three tasks."""
+    """Draw the share of the largest force that the paper's actuators deliver on blocked joints."""
     plots = []
     for task in (
-        one
-        for one in PAPER_TASKS
-        if one.name in ("pendulum", "cartpole", "acrobot", "mountain_car")
+        task
+        for task in PAPER_TASKS
+        if task.name in ("pendulum", "cartpole", "acrobot", "mountain_car")
     ):
         timestep = task.step_duration / task.motor_inner_steps
         curves = []
@@ -161,10 +164,10 @@ def actuators_in_numbers(out: Path) -> None:
 
 PICTURES: dict[str, Callable[[Path], None]] = {
     "motor_design.png": motor_design,
-    "own_motor.png": own_motor,
-    "own_robot.png": own_robot,
-    "foreign.png": foreign,
+    "own_motor.png": custom_motor,
+    "own_robot.png": custom_robot,
+    "foreign.png": third_party_env,
     "actuators.png": actuators,
     "actuators_in_numbers.png": actuators_in_numbers,
 }
-"""Name in docs/pictures -> what writes it."""
+"""Name in docs/pictures -> function that writes it."""

@@ -1,8 +1,8 @@
-"""Film every task of docs/environments: a policy that was trained through the task's motor, and what the motor does.
+"""Film every task of docs/environments: a policy trained through the task's motor, and the motor.
 
-A film has the first seconds of a typical episode, and under it the strip of torque and voltage.
-`PICTURES` has what makes each, by its path below docs. Example: python
-scripts/page_pictures_tasks.py furuta; all six take five minutes.
+A film shows the first seconds of a typical episode, above a strip of torque and voltage. `PICTURES`
+has a function for each, by its path below docs. Example: python scripts/page_pictures_tasks.py
+furuta; all six take five minutes.
 """
 
 import argparse
@@ -25,23 +25,23 @@ from codrl_mj.viz.films.film import Panel, film
 
 DOCS = Path(__file__).parents[1] / "docs"
 WIDTH, HEIGHT = 320, 200
-"""Of the scene [px]; title and strip add to its height."""
+"""Width and height of the scene [px]; title and strip add to the height."""
 FRAMES, DURATION, LAST = 45, 3000, 1500
-"""Most frames of a film, how long it lasts, and how long its last frame stands still [ms]."""
+"""Maximum number of frames, duration of a film, and time that its last frame is shown [ms]."""
 
 
 class Scene(NamedTuple):
-    """What is filmed of a task."""
+    """Agent that learns a task, and the part of the episode that is filmed."""
 
     agent: str
     settings: str
     steps: int | None
-    """Environment steps that are shown; None: to the end of the episode."""
+    """Number of environment steps that are shown; None: the whole episode."""
     camera: str = "fixed"
 
     @property
     def flags(self) -> str:
-        """With which `codrl-mj train` trains the policy."""
+        """Flags of `codrl-mj train` that train this policy."""
         return f"--agent {self.agent}" + f" --settings {self.settings}" * (
             self.settings != "default"
         )
@@ -58,12 +58,12 @@ SCENES: Mapping[str, Scene] = {
 
 
 def make(task: str, path: Path) -> None:
-    """Train a policy of a task through the task's own motor, and film a typical episode."""
+    """Train a policy of a task through the task's motor, and film a typical episode."""
     scene = SCENES[task]
-    with tempfile.TemporaryDirectory() as made:
+    with tempfile.TemporaryDirectory() as folder:
         run = train(
             TrainConfig.preset(task, scene.agent, scene.settings),
-            Path(made) / "run",
+            Path(folder) / "run",
             tensorboard=False,
         )
         env = EnvConfig(task)
@@ -75,17 +75,18 @@ def make(task: str, path: Path) -> None:
         ]
         title = f"{scene.agent.upper()}, {len(typical.reward) * float(typical.time[0]):g} s"
         panel = Panel(task, typical, title=title)
-        frames = film([panel], Path(made) / "film", WIDTH, HEIGHT, scene.camera)
-        images = sorted(frames.iterdir())[:-1]  # the last one is faded, and says how it ended
-        chosen = sorted({round(at) for at in np.linspace(0, len(images) - 1, FRAMES)})
-        first, *others = (Image.open(images[at]).convert("RGB") for at in chosen)
-        shown = [round(DURATION / len(chosen))] * len(others) + [LAST]
+        frames = film([panel], Path(folder) / "film", WIDTH, HEIGHT, scene.camera)
+        # The last frame is faded, and says how the episode ended.
+        images = sorted(frames.iterdir())[:-1]
+        chosen = sorted({round(index) for index in np.linspace(0, len(images) - 1, FRAMES)})
+        first, *later_images = (Image.open(images[index]).convert("RGB") for index in chosen)
+        shown = [round(DURATION / len(chosen))] * len(later_images) + [LAST]
         with writing(path) as temporary:
             first.save(
                 temporary,
                 "webp",
                 save_all=True,
-                append_images=others,
+                append_images=later_images,
                 duration=shown,
                 loop=0,
                 quality=60,
@@ -103,7 +104,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("tasks", nargs="*", choices=[*SCENES, []], help="all unless some are named")
+    parser.add_argument("tasks", nargs="*", choices=[*SCENES, []], help="default: all")
     options = parser.parse_args()
     for task in options.tasks or SCENES:
         name = f"environments/{task}.webp"

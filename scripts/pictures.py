@@ -1,8 +1,8 @@
-"""Make pictures of what comes out, for the README, the gallery and the pages; some are of pages, which takes Chromium.
+"""Make pictures for the README, the gallery and the pages; screenshots of pages need Chromium.
 
-`PICTURES` has what makes each, by its name in docs/pictures, or by its path in docs where it has a
-folder. Those of the pages are in page_pictures_*.py beside this file. Example: python
-scripts/pictures.py motor.png log.png; or all, in half an hour.
+`PICTURES` has a function for each, by its name in docs/pictures, or by its path in docs if it has a
+folder. Other pages' pictures are in page_pictures_*.py beside this file. Example: python
+scripts/pictures.py motor.png log.png; all of them take half an hour.
 """
 
 import argparse
@@ -44,7 +44,7 @@ ROBOTS = {
     "Humanoid-v5": "lag",
     "Hopper-v5": "torque_speed",
 }
-"""Somebody's environment -> what its motors are in the gallery."""
+"""Third-party environment -> its motors in the gallery."""
 POSES = {
     "pendulum": (2.3, 0.0),
     "cartpole": (-0.8, 0.0, 0.15, 0.0),
@@ -53,17 +53,17 @@ POSES = {
     "mountain_car_continuous": (-0.9, 0.0),
     "furuta": (0.6, 2.6, 0.0, 0.0),
 }
-"""Task -> a state that shows what it is."""
+"""Task -> state in which its picture is taken."""
 
 
 def run(*words: str) -> None:
-    """A command of ours, which has to succeed."""
+    """Run a codrl-mj command; exit if it fails."""
     if command(list(words)) != 0:
         raise SystemExit(f"codrl-mj {' '.join(words)} failed")
 
 
 def smaller(picture: Image.Image | Path, out: Path, width: int = 960) -> None:
-    """Write a picture with a palette of 128 colours."""
+    """Write a picture with a palette of 128 colors."""
     image = Image.open(picture) if isinstance(picture, Path) else picture
     size = width, round(image.height * width / image.width)
     with writing(out) as temporary:
@@ -71,8 +71,8 @@ def smaller(picture: Image.Image | Path, out: Path, width: int = 960) -> None:
         small.save(temporary, "PNG", optimize=True)
 
 
-def photographed(page: Path, out: Path, folder: Path) -> None:
-    """Write what Chromium shows of a page."""
+def take_screenshot(page: Path, out: Path, folder: Path) -> None:
+    """Write a screenshot of a page, taken by Chromium."""
     chromium = (
         shutil.which("chromium")
         or shutil.which("chromium-browser")
@@ -89,8 +89,8 @@ def photographed(page: Path, out: Path, folder: Path) -> None:
 
 
 def motor(out: Path) -> None:
-    """A motor under a task."""
-    with tempfile.TemporaryDirectory() as made:
+    """Draw a motor's limits and a task's demands."""
+    with tempfile.TemporaryDirectory() as folder:
         run(
             "motor",
             "feasible",
@@ -99,16 +99,16 @@ def motor(out: Path) -> None:
             "--gear-ratio",
             "20",
             "--out",
-            made,
+            folder,
         )
-        smaller(Path(made) / "torque_speed.png", out)
+        smaller(Path(folder) / "torque_speed.png", out)
 
 
 def log(out: Path) -> None:
-    """The report of an identification."""
-    with tempfile.TemporaryDirectory() as made:
-        logs = [str(Path(made) / f"swing{seed}.csv") for seed in (1, 2)]
-        for seed, one in enumerate(logs, start=1):
+    """Draw the report of an identification."""
+    with tempfile.TemporaryDirectory() as folder:
+        logs = [str(Path(folder) / f"swing{seed}.csv") for seed in (1, 2)]
+        for seed, log_path in enumerate(logs, start=1):
             words = [
                 "--kind",
                 "prbs",
@@ -124,29 +124,29 @@ def log(out: Path) -> None:
                 "simulate",
                 "maxon-ec45-flat-50w",
                 "--out",
-                one,
+                log_path,
                 "--seed",
                 str(seed),
                 *words,
             )
         words = ["--columns", COLUMNS, "--rig", "free", "--known", "load_inertia=0"]
-        run("identify", *logs, *words, "--out", str(Path(made) / "found"))
-        photographed(Path(made) / "found" / "report.html", out, Path(made))
+        run("identify", *logs, *words, "--out", str(Path(folder) / "found"))
+        take_screenshot(Path(folder) / "found" / "report.html", out, Path(folder))
 
 
 def sheet(frames: Mapping[str, np.ndarray], columns: int) -> Image.Image:
-    """Frames of one size side by side, each above its name."""
+    """Arrange frames of equal size in a grid, each below its name."""
     width = next(iter(frames.values())).shape[1]
     cells = [
         np.vstack([frame, draw_text(name, width, 40)[..., :3]]) for name, frame in frames.items()
     ]
     cells += [np.full_like(cells[0], 255)] * (-len(cells) % columns)
-    rows = [np.hstack(cells[at : at + columns]) for at in range(0, len(cells), columns)]
+    rows = [np.hstack(cells[start : start + columns]) for start in range(0, len(cells), columns)]
     return Image.fromarray(np.vstack(rows))
 
 
 def tasks(out: Path) -> None:
-    """The six tasks."""
+    """Draw the six tasks."""
     frames = {}
     for name in TASKS:
         env = codrl_mj.make(name, render_mode="rgb_array", width=480, height=360, pretty=True)
@@ -158,7 +158,7 @@ def tasks(out: Path) -> None:
 
 
 def robots(out: Path) -> None:
-    """Environments of others with motors in them, a second into an episode of random actions."""
+    """Draw third-party environments with motors after 0.4 s of random actions."""
     frames = {}
     for name, actuator in ROBOTS.items():
         env = codrl_mj.make(name, actuator, render_mode="rgb_array", width=480, height=360)
@@ -171,25 +171,25 @@ def robots(out: Path) -> None:
     smaller(sheet(frames, 2), out)
 
 
-OTHERS = "page_pictures_motors", "page_pictures_runs", "page_pictures_tasks"
+PICTURE_MODULES = "page_pictures_motors", "page_pictures_runs", "page_pictures_tasks"
 
 
 def pictures() -> dict[str, Callable[[Path], None]]:
-    """All of them."""
-    found: dict[str, Callable[[Path], None]] = {
+    """Return the functions of all pictures, by name."""
+    functions: dict[str, Callable[[Path], None]] = {
         "motor.png": motor,
         "log.png": log,
         "tasks.png": tasks,
         "robots.png": robots,
     }
-    for name in OTHERS:
+    for name in PICTURE_MODULES:
         if (Path(__file__).parent / f"{name}.py").is_file():
-            found |= importlib.import_module(name).PICTURES
-    return found
+            functions |= importlib.import_module(name).PICTURES
+    return functions
 
 
 def main() -> None:
-    """Make those that are named, or all."""
+    """Make the named pictures, or all."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

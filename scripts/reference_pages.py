@@ -1,7 +1,7 @@
-"""Writes docs/reference/: the command line, a page a verb; every public name, a page a room; every field of a setting.
+"""Write docs/reference/: pages of the commands, of public names, and of all settings' fields.
 
-All of it comes from docstrings, the fields' own bounds and units, and `--help`. `make docs` runs
-this; what it writes is not kept. Only python.md is written by hand.
+Everything comes from docstrings, the fields' bounds and units, and `--help`. `make docs` runs this
+script, and its output is not committed. Only python.md is written by hand.
 """
 
 import ast
@@ -29,7 +29,7 @@ from codrl_mj.training import TrainConfig
 
 FOLDER = Path(__file__).parent.parent / "docs" / "reference"
 WIDTH = "80"
-"""Of the help [characters]."""
+"""Width of the help texts [characters]."""
 ROOMS = (
     *(
         "actuators",
@@ -45,8 +45,8 @@ ROOMS = (
     ),
     *("physics", "study", "tasks", "training", "validation", "viz.replay"),
 )
-"""Rooms with an `__all__`."""
-ALONE = {
+"""Subpackages with an `__all__`."""
+MODULE_NAMES = {
     "viz.films": ("film.film", "film.Panel", "film.record"),
     "external_envs": (
         "building.motors_added",
@@ -73,47 +73,48 @@ ALONE = {
     ),
     "viz.view": ("session.Session",),
 }
-"""Rooms that are imported by their modules -> names for others."""
+"""Subpackages that are imported by their modules -> public names."""
 
 
 def help_of(*words: str) -> str:
-    """What `codrl-mj WORDS --help` prints, without its frames."""
+    """Return the output of `codrl-mj WORDS --help`, without frames."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         cli.main([*words, "--help"])
     lines = [re.sub(r"^╭─ (.*?) ─*╮$", r"\n\1:", line) for line in printed.getvalue().splitlines()]
-    kept = [
+    content = [
         line.strip("│").rstrip() for line in lines if not re.fullmatch(r"[│ ]*[╰─]+[╯│ ]*", line)
     ]
-    long = int(WIDTH) + 5
+    max_width = int(WIDTH) + 5
     return "\n".join(
-        textwrap.fill(one, int(WIDTH)) if len(one) > long and one[0] != " " else one for one in kept
+        textwrap.fill(line, int(WIDTH)) if len(line) > max_width and line[0] != " " else line
+        for line in content
     ).strip()
 
 
 def verbs() -> list[str]:
-    """The first words of command lines."""
+    """Return the first words of all commands."""
     return list(dict.fromkeys(name.split()[0] for name in cli.VERBS))
 
 
 def verb_page(verb: str) -> str:
-    """A verb, and each that it has below it."""
+    """Return the page of a command and its subcommands."""
     text = help_of(verb)
-    named = re.match(rf"usage: codrl-mj {verb} \[-h\] \{{(.*?)\}}", text)
-    below = [name.split()[1] for name in cli.VERBS if name.startswith(f"{verb} ")]
-    below = below or (named[1].split(",") if named else [])
+    subcommands = re.match(rf"usage: codrl-mj {verb} \[-h\] \{{(.*?)\}}", text)
+    names = [name.split()[1] for name in cli.VERBS if name.startswith(f"{verb} ")]
+    names = names or (subcommands[1].split(",") if subcommands else [])
     parts = [f"# codrl-mj {verb}", fenced(text)]
-    parts += [f"## {verb} {name}\n\n{fenced(help_of(verb, name))}" for name in below]
+    parts += [f"## {verb} {name}\n\n{fenced(help_of(verb, name))}" for name in names]
     return "\n\n".join(parts)
 
 
 def fenced(text: str) -> str:
-    """As it stands."""
+    """Format a text as a code block."""
     return f"```text\n{text}\n```"
 
 
 def verbs_page() -> str:
-    """The first sentence of every verb."""
+    """Return a table with the first sentence of every command."""
     rows = []
     for verb in verbs():
         sentence = help_of(verb).split("\n\n")[1]
@@ -125,76 +126,87 @@ def verbs_page() -> str:
 
 
 def room_page(room: str) -> str:
-    """Every public name of a room: what is called, and a table of the others."""
+    """Return the page of a subpackage: classes and functions, then a table of constants."""
     module = importlib.import_module(f"codrl_mj.{room}")
-    called, others = [], []
-    for name in ALONE.get(room) or module.__all__:
-        home, _, last = f"{module.__name__}.{name}".rpartition(".")
-        found = getattr(importlib.import_module(home), last)
-        made = inspect.unwrap(found) if callable(found) else found
-        if (inspect.isclass(made) or inspect.isfunction(made)) and made.__module__.startswith(
-            "codrl_mj."
-        ):
-            called.append(f"::: {made.__module__}.{made.__qualname__}")
+    directives, constants = [], []
+    for name in MODULE_NAMES.get(room) or module.__all__:
+        module_name, _, attribute = f"{module.__name__}.{name}".rpartition(".")
+        value = getattr(importlib.import_module(module_name), attribute)
+        unwrapped = inspect.unwrap(value) if callable(value) else value
+        if (
+            inspect.isclass(unwrapped) or inspect.isfunction(unwrapped)
+        ) and unwrapped.__module__.startswith("codrl_mj."):
+            directives.append(f"::: {unwrapped.__module__}.{unwrapped.__qualname__}")
         else:
-            others.append((f"`{last}`", shortened(found), said_of(module.__name__, last, found)))
-    parts = [f"# codrl_mj.{room}", (inspect.getdoc(module) or "").partition("\n\n")[0], *called]
+            constants.append(
+                (
+                    f"`{attribute}`",
+                    shortened(value),
+                    constant_doc(module.__name__, attribute, value),
+                )
+            )
+    parts = [f"# codrl_mj.{room}", (inspect.getdoc(module) or "").partition("\n\n")[0], *directives]
     return "\n\n".join(
-        [*parts, *(["## Constants", table(("name", "value", "is"), others)] if others else [])]
+        [
+            *parts,
+            *(["## Constants", table(("name", "value", "is"), constants)] if constants else []),
+        ]
     )
 
 
 def shortened(value: Any) -> str:
-    """A constant in a cell: of a mapping its keys, of others that are long the beginning."""
+    """Format a constant for a table: a mapping by its keys, a long value by its type."""
     if isinstance(value, Mapping):
         return "a mapping of " + ", ".join(f"`{key}`" for key in value)
     text = repr(value)
     return f"`{text}`" if len(text) <= 60 and "`" not in text else f"a `{type(value).__name__}`"
 
 
-def said_of(room: str, name: str, value: Any) -> str:
-    """The docstring below a constant, wherever in its room it is defined."""
-    for home, module in list(sys.modules.items()):
-        if f"{home}.".startswith(f"{room}.") and vars(module).get(name) is value:
-            for line, doc in itertools.pairwise(ast.parse(inspect.getsource(module)).body):
+def constant_doc(room: str, name: str, value: Any) -> str:
+    """Return the docstring of a constant, from whichever module of the subpackage defines it."""
+    for module_name, module in list(sys.modules.items()):
+        if f"{module_name}.".startswith(f"{room}.") and vars(module).get(name) is value:
+            for statement, next_statement in itertools.pairwise(
+                ast.parse(inspect.getsource(module)).body
+            ):
                 targets = (
-                    line.targets
-                    if isinstance(line, ast.Assign)
-                    else [getattr(line, "target", None)]
+                    statement.targets
+                    if isinstance(statement, ast.Assign)
+                    else [getattr(statement, "target", None)]
                 )
-                named = [one.id for one in targets if isinstance(one, ast.Name)]
+                names = [target.id for target in targets if isinstance(target, ast.Name)]
                 if (
-                    name in named
-                    and isinstance(doc, ast.Expr)
-                    and isinstance(doc.value, ast.Constant)
+                    name in names
+                    and isinstance(next_statement, ast.Expr)
+                    and isinstance(next_statement.value, ast.Constant)
                 ):
-                    return " ".join(str(doc.value.value).split())
+                    return " ".join(str(next_statement.value.value).split())
     return ""
 
 
 def settings() -> dict[str, list[type]]:
-    """Every configuration, by what it is of."""
+    """Return all dataclasses of settings, by section title."""
     rooms = {
         room: importlib.import_module(f"codrl_mj.{room}")
         for room in ("actuators", "agents", "disturbances")
     }
-    of = {
+    dataclasses_by_room = {
         room: [
-            one
+            kind
             for name in module.__all__
-            if dataclasses.is_dataclass(one := getattr(module, name))
-            and isinstance(one, type)
-            and dataclasses.fields(one)
+            if dataclasses.is_dataclass(kind := getattr(module, name))
+            and isinstance(kind, type)
+            and dataclasses.fields(kind)
         ]
         for room, module in rooms.items()
     }
     options = [task.options for task in TASKS.values() if task.options._fields]
     bench = importlib.import_module("codrl_mj.identify.synthetic")
     return {
-        "Environments": [EnvConfig, *of["disturbances"]],
-        "Training": [TrainConfig, *of["agents"]],
-        "Actuators": of["actuators"],
-        "What an actuator is told": [Inputs],
+        "Environments": [EnvConfig, *dataclasses_by_room["disturbances"]],
+        "Training": [TrainConfig, *dataclasses_by_room["agents"]],
+        "Actuators": dataclasses_by_room["actuators"],
+        "Inputs of an actuator": [Inputs],
         "A task of your own": [Task],
         "Options of tasks": options,
         "Synthetic logs": [bench.Excitation, bench.Load, bench.Sensor, bench.Sampler],
@@ -202,7 +214,7 @@ def settings() -> dict[str, list[type]]:
 
 
 def rows_of(kind: type) -> Iterator[tuple[str, ...]]:
-    """Name, default, unit, bound and meaning of each field of a dataclass or a `NamedTuple`."""
+    """Yield name, default, unit, bound and meaning of each field of a dataclass or `NamedTuple`."""
     docs = field_docs(kind)
     if not dataclasses.is_dataclass(kind):
         for name in kind._fields:  # type: ignore[attr-defined]
@@ -214,18 +226,18 @@ def rows_of(kind: type) -> Iterator[tuple[str, ...]]:
         default = field.default
         if default is dataclasses.MISSING and field.default_factory is not dataclasses.MISSING:
             default = field.default_factory()
-        said = f"{bound} or none" if bound and optional else bound
+        bound_text = f"{bound} or none" if bound and optional else bound
         yield (
             f"`{field.name}`",
             shown(default),
             field.metadata.get("unit", ""),
-            said,
+            bound_text,
             docs.get(field.name, ""),
         )
 
 
 def shown(default: Any) -> str:
-    """A default in a cell: of a part, that it is one."""
+    """Format a default for a table; a part by its class."""
     if default is dataclasses.MISSING:
         return "required"
     if dataclasses.is_dataclass(default):
@@ -234,10 +246,8 @@ def shown(default: Any) -> str:
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """In Markdown, without the columns that are empty."""
-    columns = [
-        column for column in zip(header, *rows, strict=True) if any(column[1:])
-    ]  # those that say something
+    """Return a Markdown table without empty columns."""
+    columns = [column for column in zip(header, *rows, strict=True) if any(column[1:])]
     head, *rest = zip(*columns, strict=True)
     lines = [head, ["---"] * len(head), *rest]
     return "\n".join(
@@ -246,7 +256,7 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def settings_page() -> str:
-    """Every field of every configuration."""
+    """Return the page of every field of every configuration."""
     parts = [
         "# Settings",
         (
@@ -263,22 +273,25 @@ def settings_page() -> str:
                 if kind.__name__ == "Options"
                 else kind.__name__
             )
-            told = (inspect.getdoc(kind) or "").partition("\n\n")[0]
-            parts += [f"### {name}", " ".join(told.split())]
+            summary = (inspect.getdoc(kind) or "").partition("\n\n")[0]
+            parts += [f"### {name}", " ".join(summary.split())]
             parts.append(table(("field", "default", "unit", "bound", "is"), rows_of(kind)))
     return "\n\n".join(parts)
 
 
 def pages() -> dict[str, str]:
-    """Path below docs/reference -> text."""
+    """Return all pages by their path below docs/reference."""
+    # argparse and tyro take the width of the terminal from this variable.
     os.environ["COLUMNS"] = WIDTH
-    made = {"command_line.md": verbs_page(), "settings.md": settings_page()}
-    made |= {f"command_line/{verb}.md": verb_page(verb) for verb in verbs()}
-    return made | {f"rooms/{room}.md": room_page(room) for room in sorted((*ROOMS, *ALONE))}
+    pages_by_path = {"command_line.md": verbs_page(), "settings.md": settings_page()}
+    pages_by_path |= {f"command_line/{verb}.md": verb_page(verb) for verb in verbs()}
+    return pages_by_path | {
+        f"rooms/{room}.md": room_page(room) for room in sorted((*ROOMS, *MODULE_NAMES))
+    }
 
 
 def main() -> int:
-    """Write them."""
+    """Write all pages."""
     for name, text in pages().items():
         path = FOLDER / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -19,14 +19,15 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("run", type=Path, help="run folder of a finished training")
-    parser.add_argument("actuators", nargs="+", help="such as ideal or weaker")
-    parser.add_argument("--seed", type=int, default=0, help="of the episode")
+    parser.add_argument("actuators", nargs="+", help="actuators, such as ideal or weaker")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the episode")
     parser.add_argument("--out", type=Path, default=Path("rollouts.mp4"))
     options = parser.parse_args()
 
     trained, policy = load_config(options.run).env, load_policy(options.run)
     panels = []
     for name in options.actuators:
+        # A time limit of the training does not apply to the film.
         env = dataclasses.replace(trained, actuator=name, max_episode_steps=None)
         (episode,) = run_episodes(policy, env.make, 1, options.seed)
         panels.append(Panel(env.task, episode, title=f"on {name}: return {episode.total:.0f}"))

@@ -1,6 +1,6 @@
-"""The paper's experiments done again: the trainings behind docs/results/reproduction.md.
+"""Repeat the paper's experiments: the trainings behind docs/results/reproduction.md.
 
-python scripts/reproduce.py --dry-run
+Example: python scripts/reproduce.py --dry-run
 """
 
 import sys

@@ -1,9 +1,9 @@
-"""A million environment steps over randomised actuators: no growth of memory, no dependence on threads.
+"""Run a million steps with random actuators: memory must not grow, threads must not matter.
 
-Two vector environments whose actuators are drawn anew for every episode, one stepped on one thread
-and one on two, take the same random actions. Whatever they return must be equal bit for bit, each
-episode that ends and each unstable draw must be accounted for in the infos, no unstable actuator
-may be let through, and memory may not grow after the first tenth.
+Two vector environments draw new actuators for every episode and take the same random actions, one
+on one thread, one on two. Their results must be equal bit for bit. The infos must account for each
+end of an episode and each unstable draw. No unstable actuator may be used, and memory must not grow
+after the first tenth.
 """
 
 # isort: skip - before mujoco, which chooses its OpenGL platform when it is imported
@@ -27,16 +27,16 @@ from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.tasks import PAPER_TASKS, TASKS, named_actuator
 
 GROWTH = 4 * 2**20
-"""Largest growth of resident memory after the first tenth [bytes]: 4 MiB, less than 5 bytes a step."""
+"""Maximum growth of memory after the first tenth [bytes]: 4 MiB, less than 5 bytes a step."""
 
 
 def resident() -> int:
-    """Resident memory of this process [bytes]."""
+    """Return the resident memory of this process [bytes]."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 RANDOMIZE = {
-    # wide enough that a fifth or so of the draws are unstable at the tasks' steps
+    # The ranges are so wide that about a fifth of the draws are unstable at the tasks' steps.
     "motor.resistance": LogUniform(0.3, 3.0),
     "motor.inductance": LogUniform(0.1, 1.0),
     "motor.torque_constant": LogUniform(0.3, 3.0),
@@ -44,11 +44,11 @@ RANDOMIZE = {
     "controller.ki": LogUniform(0.3, 30.0),
     "controller.max_voltage": LogUniform(1.0, 30.0),
 }
-"""What is drawn anew for every episode."""
+"""Distributions of the actuators, which are drawn for every episode."""
 
 
 def unstable(env: ActuatedVectorEnv) -> int:
-    """How many of the actuators in use have an unstable loop, each judged by itself."""
+    """Return the number of actuators in use whose loop is unstable, each judged separately."""
     drawn = env.randomization
     assert drawn is not None
     nominal, timestep = (
@@ -60,7 +60,7 @@ def unstable(env: ActuatedVectorEnv) -> int:
 
 
 def digest(results: tuple[Any, ...]) -> bytes:
-    """A checksum of what a step returned, infos included."""
+    """Return a checksum of everything that a step returned, including infos."""
     checksum = hashlib.blake2b(digest_size=8)
     *arrays, infos = results
     for array in arrays:
@@ -73,10 +73,10 @@ def digest(results: tuple[Any, ...]) -> bytes:
 
 
 def soak(task: str, num_envs: int, steps: int) -> int:
-    """Step both environments; print what was found.
+    """Step both environments and print the results.
 
     Returns:
-        0, or 1 if something was wrong.
+            0, or 1 if anything was wrong.
     """
     generator = np.random.default_rng(0)
     limit = TASKS[task].max_episode_steps
@@ -91,39 +91,42 @@ def soak(task: str, num_envs: int, steps: int) -> int:
     ]
     first, _ = (env.reset(seed=0)[1] for env in envs)
     rejected = int(first["randomization"]["rejected"].sum())
-    draws, let_through = num_envs, unstable(envs[0])
+    draws, num_unstable = num_envs, unstable(envs[0])
     space = envs[0].single_action_space
     lengths = np.zeros(num_envs, dtype=np.int64)
-    ended = truncations = finished_steps = differing = missing = 0
+    ended = truncations = finished_steps = differing = unaccounted = 0
     base, start = 0, time.perf_counter()
     for step in range(1, steps + 1):
         if isinstance(space, Discrete):
             actions = generator.integers(space.n, size=num_envs)
         else:
             actions = generator.uniform(space.low, space.high, (num_envs, 1)).astype(np.float32)  # type: ignore[attr-defined]
-        one, other = (env.step(actions) for env in envs)
-        differing += digest(one) != digest(other)
-        _, _, terminated, truncated, infos = one
+        single_threaded, two_threaded = (env.step(actions) for env in envs)
+        differing += digest(single_threaded) != digest(two_threaded)
+        _, _, terminated, truncated, infos = single_threaded
         ends = terminated | truncated
         lengths += 1
-        missing += int((lengths > limit).sum()) + int((truncated & (lengths != limit)).sum())
+        unaccounted += int((lengths > limit).sum()) + int((truncated & (lengths != limit)).sum())
         if ends.any():
-            missing += int(
+            unaccounted += int(
                 (infos["_final_obs"] != ends).sum()
                 + (infos["final_info"]["_current"] != ends).sum()
             )
-            missing += sum(not np.isfinite(seen).all() for seen in infos["final_obs"][ends])
-            missing += int((infos["_randomization"] != ends).sum())
+            unaccounted += sum(
+                not np.isfinite(observation).all() for observation in infos["final_obs"][ends]
+            )
+            unaccounted += int((infos["_randomization"] != ends).sum())
             rejected += int(infos["randomization"]["rejected"][ends].sum())
             draws += int(ends.sum())
         ended += int(ends.sum())
         truncations += int(truncated.sum())
         finished_steps += int(lengths[ends].sum())
+        # After the first tenth all buffers have their final size.
         lengths[ends] = 0
         if step == max(1, steps // 10):
             base = resident()
         if step % max(1, steps // 10) == 0:
-            let_through += unstable(envs[0])
+            num_unstable += unstable(envs[0])
             rate = 2 * step * num_envs / (time.perf_counter() - start)
             growth = (resident() - base) / 2**20
             console().print(
@@ -131,7 +134,7 @@ def soak(task: str, num_envs: int, steps: int) -> int:
                 f" {ended:,} episodes ({truncations:,} to the limit); memory {growth:+.1f} MiB"
                 " since the first tenth"
             )
-    missing += abs(finished_steps + int(lengths.sum()) - steps * num_envs)
+    unaccounted += abs(finished_steps + int(lengths.sum()) - steps * num_envs)
     same_end = all(
         np.array_equal(envs[0].snapshot()[name], value)
         for name, value in envs[1].snapshot().items()
@@ -143,18 +146,18 @@ def soak(task: str, num_envs: int, steps: int) -> int:
         ),
         f"steps that differ between 1 and 2 threads: {differing}": differing == 0,
         "physics, generators and counters are equal at the end": same_end,
-        f"episodes or steps unaccounted for: {missing}": missing == 0,
-        f"unstable actuators let through: {let_through} ({draws:,} drawn, {rejected:,} more rejected)": (
-            let_through == 0 and rejected > 0
+        f"episodes or steps unaccounted for: {unaccounted}": unaccounted == 0,
+        f"unstable actuators in use: {num_unstable} ({draws:,} drawn, {rejected:,} rejected)": (
+            num_unstable == 0 and rejected > 0
         ),
     }
-    for verdict, fine in verdicts.items():
-        console().print(f"{'ok  ' if fine else 'FAIL'} {verdict}")
+    for verdict, is_ok in verdicts.items():
+        console().print(f"{'ok  ' if is_ok else 'FAIL'} {verdict}")
     return 0 if all(verdicts.values()) else 1
 
 
 def main() -> int:
-    """Run the soak."""
+    """Run the soak test."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,6 +1,6 @@
-"""What does an actuator cost? The study behind docs/results/actuators.md and `codrl-mj advise`.
+"""Study of the cost of an actuator, behind docs/results/actuators.md and `codrl-mj advise`.
 
-python scripts/study_actuators.py --dry-run
+Example: python scripts/study_actuators.py --dry-run
 """
 
 import sys

@@ -1,6 +1,6 @@
-"""What insures a policy against an actuator that nobody has measured? The study behind docs/results/insurance.md.
+"""Study of protecting a policy from unmeasured actuators, behind docs/results/insurance.md.
 
-python scripts/study_insurance.py --dry-run
+Example: python scripts/study_insurance.py --dry-run
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Train an agent through an actuator, from Python: what `codrl-mj train` does with its defaults.
+"""Train an agent through an actuator from Python, like `codrl-mj train` with its defaults.
 
 Example: python scripts/train.py pendulum sac weak --total-steps 20000 --out runs/pendulum-sac-weak
 """
@@ -10,19 +10,19 @@ from codrl_mj.training import Progress, TrainConfig, train
 
 
 def report(progress: Progress) -> None:
-    """Print how far it is."""
+    """Print the progress of a training."""
     print(f"{progress.steps:>10,} steps  mean return {progress.mean_return:10.2f}", flush=True)
 
 
 def main() -> None:
-    """Train, or go on with a training that was stopped."""
+    """Train, or resume a training that was stopped."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("task", help="such as cartpole; or module:NAME of your own")
-    parser.add_argument("agent", help="such as ppo; or module:Class of your own")
+    parser.add_argument("task", help="such as cartpole; or module:NAME of a custom task")
+    parser.add_argument("agent", help="such as ppo; or module:Class of a custom agent")
     parser.add_argument(
-        "actuator", help="such as paper, weak or lag; a YAML file; or module:NAME of your own"
+        "actuator", help="such as paper, weak or lag; a YAML file; or module:NAME of a custom one"
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--total-steps", type=int, default=200_000)

@@ -1,8 +1,8 @@
-"""Your own agent on our environments: proximal policy optimisation in plain torch, all of it in this file.
+"""Train a custom agent on our environments: proximal policy optimization (PPO) in plain torch.
 
-Of ours it needs the registered environments, which `gym.make_vec` steps together, and nothing of
-any agent library. Copy it and change what you like. `docs/other_agents.md` says how the weights are
-used.
+The whole agent is in this file. It uses the registered environments, which `gym.make_vec` steps
+together, and no agent library. Copy it and change it as you like. `docs/other_agents.md` shows how
+the weights are used.
 
 Example: python scripts/train_custom_agent.py --task pendulum --actuator paper --total-steps 400000
 """
@@ -27,6 +27,7 @@ from torch.distributions import Categorical, Distribution, Independent, Normal
 from codrl_mj.runs.files import writing
 from codrl_mj.tasks import TASKS
 
+# These options must be at least 1, those of AMOUNTS at least 0.
 COUNTS = (
     "num_envs",
     "total_steps",
@@ -35,7 +36,7 @@ COUNTS = (
     "minibatches",
     "hidden",
     "eval_episodes",
-)  # 1 or more
+)
 AMOUNTS = (
     "seed",
     "learning_rate",
@@ -44,7 +45,7 @@ AMOUNTS = (
     "target_kl",
     "gamma",
     "gae_lambda",
-)  # 0 or more
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,17 +53,17 @@ class Options:
     """Train PPO through an actuator, evaluate it greedily, and save its weights."""
 
     task: Literal[tuple(TASKS)] = "cartpole"  # type: ignore[valid-type]
-    """What to learn."""
+    """Task to learn."""
     actuator: str = "default"
-    """What the force goes through: ideal, paper, weak, weaker or open_loop."""
+    """Actuator: ideal, paper, weak, weaker or open_loop."""
     num_envs: int = 64
-    """Environments side by side, >= 1."""
+    """Number of parallel environments, >= 1."""
     total_steps: int = 200_000
-    """Environment steps in all, >= 1; rounded up to whole rollouts."""
+    """Number of environment steps, >= 1; rounded up to whole rollouts."""
     seed: int = 0
     """Seed of weights, actions and environments, >= 0; the same seed gives the same weights."""
     out: Path = Path("runs/custom.safetensors")
-    """The file of weights to write."""
+    """File for the weights."""
     rollout: int = 32
     """Steps of every environment between two updates, >= 1."""
     epochs: int = 10
@@ -74,26 +75,29 @@ class Options:
     gamma: float = 0.99
     """Discount factor, from 0 to 1."""
     gae_lambda: float = 0.97
-    """Generalised advantage estimation's lambda, from 0 to 1."""
+    """Lambda of generalized advantage estimation, from 0 to 1."""
     clip: float = 0.2
     """Clip range of the probability ratio, >= 0."""
     entropy: float = 0.0
     """Weight of the entropy bonus, >= 0."""
     target_kl: float = 0.015
-    """Passes over a rollout stop when the policy has moved this far [nat], >= 0."""
+    """KL divergence [nat] from the old policy at which passes over a rollout stop, >= 0."""
     hidden: int = 64
     """Units in each of the two hidden layers of actor and critic, >= 1."""
     eval_episodes: int = 100
-    """Episodes of the evaluation, >= 1."""
+    """Number of evaluation episodes, >= 1."""
 
     def check(self) -> None:
         """Raise ValueError, naming field, value and bound, if a number is out of bounds."""
         for name in COUNTS + AMOUNTS:
-            least, most = int(name in COUNTS), 1 if name in ("gamma", "gae_lambda") else math.inf
-            if not least <= getattr(self, name) <= most:
+            minimum, maximum = (
+                int(name in COUNTS),
+                1 if name in ("gamma", "gae_lambda") else math.inf,
+            )
+            if not minimum <= getattr(self, name) <= maximum:
                 raise ValueError(
-                    f"--{name.replace('_', '-')} {getattr(self, name)}: must be from {least} to"
-                    f" {most}"
+                    f"--{name.replace('_', '-')} {getattr(self, name)}: must be from {minimum} to"
+                    f" {maximum}"
                 )
         if (size := self.num_envs * self.rollout) < 2 * self.minibatches:
             raise ValueError(
@@ -103,7 +107,7 @@ class Options:
 
 
 class Moments(nn.Module):
-    """Mean and variance of everything seen so far, to bring observations and rewards to a common scale."""
+    """Running mean and variance, which bring observations and rewards to a common scale."""
 
     mean: Tensor
     variance: Tensor
@@ -116,23 +120,23 @@ class Moments(nn.Module):
         self.register_buffer("count", torch.zeros(()))
 
     def update(self, batch: Tensor) -> None:
-        """Take in a batch (n, size), as Chan, Golub and LeVeque (1979) do."""
-        total, apart = self.count + len(batch), batch.mean(0) - self.mean
+        """Include a batch (n, size), by the formula of Chan, Golub and LeVeque (1979)."""
+        total, difference = self.count + len(batch), batch.mean(0) - self.mean
         squares = self.variance * self.count + batch.var(0, correction=0) * len(batch)
-        self.variance = (squares + apart**2 * self.count * len(batch) / total) / total
-        self.mean, self.count = self.mean + apart * len(batch) / total, total
+        self.variance = (squares + difference**2 * self.count * len(batch) / total) / total
+        self.mean, self.count = self.mean + difference * len(batch) / total, total
 
     def scale(self) -> Tensor:
-        """Standard deviations (size,), never 0."""
+        """Return the standard deviations (size,), never 0."""
         return (self.variance + 1e-8).sqrt()
 
     def forward(self, values: Tensor) -> Tensor:
-        """Values centred and scaled, within 10 standard deviations."""
+        """Center and scale values, and clip them at 10 standard deviations."""
         return ((values - self.mean) / self.scale()).clamp(-10.0, 10.0)
 
 
 def network(inputs: int, hidden: int, outputs: int, gain: float) -> nn.Sequential:
-    """Two hidden layers of tanh units; orthogonal weights, the last layer's with the given gain."""
+    """Create two hidden tanh layers with orthogonal weights; `gain` scales the last layer's."""
     layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, outputs)]
     for layer, scale in zip(layers, (math.sqrt(2), math.sqrt(2), gain), strict=True):
         nn.init.orthogonal_(layer.weight, scale)
@@ -141,7 +145,10 @@ def network(inputs: int, hidden: int, outputs: int, gain: float) -> nn.Sequentia
 
 
 class Agent(nn.Module):
-    """Actor and critic. Continuous actions are Gaussian on a scale where the bounds are -1 and 1, and cut there."""
+    """Actor and critic.
+
+    Continuous actions are Gaussian, on a scale where the bounds are -1 and 1, and clipped there.
+    """
 
     def __init__(self, observations: gym.Space[Any], actions: Any, hidden: int) -> None:  # noqa: D107
         super().__init__()
@@ -161,7 +168,7 @@ class Agent(nn.Module):
             self.register_buffer("reach", torch.as_tensor(actions.high - actions.low) / 2)
 
     def policy(self, observations: Tensor) -> Distribution:
-        """The distribution of actions for observations (..., k)."""
+        """Return the distribution of actions for observations (..., k)."""
         outputs = self.actor(self.seen(observations))
         if self.discrete:
             return Categorical(logits=outputs, validate_args=False)
@@ -170,12 +177,12 @@ class Agent(nn.Module):
         )
 
     def value(self, observations: Tensor) -> Tensor:
-        """The discounted return to expect, in units of `Trainer.returns`'s scale (...,)."""
+        """Return the expected discounted return (...,), in units of the scale in `train`."""
         return self.critic(self.seen(observations)).squeeze(-1)
 
     @torch.no_grad()
     def act(self, observations: np.ndarray, greedy: bool = True) -> tuple[Tensor, np.ndarray]:
-        """Actions for observations (n, k): as the policy has them, and as the environments take them."""
+        """Return actions for observations (n, k): as the policy draws them, and as commands."""
         policy = self.policy(torch.as_tensor(observations))
         actions = policy.mode if greedy else policy.sample()
         return (
@@ -193,21 +200,21 @@ def advantages(
     gamma: float,
     lam: float,
 ) -> Tensor:
-    """Generalised advantage estimation (Schulman et al., arXiv 1506.02438); everything is of shape (T, N).
+    """Estimate advantages (GAE, Schulman et al., arXiv 1506.02438); all shapes are (T, N).
 
-    `values` are of the observation before each step, `next_values` of the one that it led to, which
-    is the last of the episode where that `ended`. Nothing comes after an episode that the task
-    `terminated`; what would have come after one that the time limit cut off counts.
+    `values` are of the observation before each step, `next_values` of the one after it, which is
+    the last one of the episode if it `ended`. Rewards after an episode that the task `terminated`
+    are zero; after a time limit their expected value counts.
     """
     errors = rewards + gamma * next_values * ~terminated - values
-    result, later = torch.zeros_like(rewards), torch.zeros_like(rewards[0])
+    result, next_advantage = torch.zeros_like(rewards), torch.zeros_like(rewards[0])
     for step in reversed(range(len(rewards))):
-        result[step] = later = errors[step] + gamma * lam * later * ~ended[step]
+        result[step] = next_advantage = errors[step] + gamma * lam * next_advantage * ~ended[step]
     return result
 
 
 def make_envs(options: Options, num_envs: int) -> VectorEnv[Any, Any, Any]:
-    """The environments, on one thread; one whose episode ends starts another in the same step."""
+    """Create environments on one thread, which reset in the step that ends an episode."""
     arguments: Any = {
         "actuator": options.actuator,
         "num_threads": 1,
@@ -218,13 +225,20 @@ def make_envs(options: Options, num_envs: int) -> VectorEnv[Any, Any, Any]:
 
 
 def train(options: Options, on_rollout: Callable[[int, float], None] | None = None) -> Agent:
-    """Train an agent; `on_rollout` is told the steps so far and the mean return of the last 100 episodes (or NaN).
+    """Train an agent.
+
+    Args:
+        options: options of the command line.
+        on_rollout: called with the steps so far and the mean return of the last 100 episodes, NaN
+            before the first has ended.
+
 
     Raises:
         ValueError: an option is out of bounds, or the actuator is unknown or unstable.
     """
     options.check()
-    torch.set_num_threads(1)  # networks this small run slower on several
+    # Networks of this size are slower on several threads.
+    torch.set_num_threads(1)
     torch.manual_seed(options.seed)
     envs = make_envs(options, options.num_envs)
     agent = Agent(envs.single_observation_space, envs.single_action_space, options.hidden)
@@ -238,35 +252,48 @@ def train(options: Options, on_rollout: Callable[[int, float], None] | None = No
         steps = []
         for _ in range(options.rollout):
             actions, commands = agent.act(observations, greedy=False)
-            following, rewards, terminated, truncated, infos = envs.step(commands)
-            ended, led_to = terminated | truncated, following.copy()
+            next_observations, rewards, terminated, truncated, infos = envs.step(commands)
+            ended, final_observations = terminated | truncated, next_observations.copy()
             if ended.any():
-                led_to[ended] = np.stack(
-                    infos["final_obs"][ended]
-                )  # `following` holds the next episode's first there
+                # Here `next_observations` has the first observation of the next episode.
+                final_observations[ended] = np.stack(infos["final_obs"][ended])
             discounted, undiscounted = rewards + options.gamma * discounted, rewards + undiscounted
-            steps.append((observations, actions, rewards, led_to, terminated, ended, discounted))
+            steps.append(
+                (observations, actions, rewards, final_observations, terminated, ended, discounted)
+            )
             finished += undiscounted[ended].tolist()
             discounted, undiscounted, observations = (
                 discounted * ~ended,
                 undiscounted * ~ended,
-                following,
+                next_observations,
             )
         columns = (torch.as_tensor(np.stack(column)) for column in zip(*steps, strict=True))
-        seen, acted, earned, ahead, terminations, ends, sums = columns
-        returns.update(sums.float().reshape(-1, 1))
+        states, taken_actions, scaled_rewards, next_states, terminations, ends, discounted_sums = (
+            columns
+        )
+        returns.update(discounted_sums.float().reshape(-1, 1))
         with torch.no_grad():
-            before, values, next_values = (
-                agent.policy(seen).log_prob(acted),
-                agent.value(seen),
-                agent.value(ahead),
+            log_probs, values, next_values = (
+                agent.policy(states).log_prob(taken_actions),
+                agent.value(states),
+                agent.value(next_states),
             )
-        earned = earned.float() / returns.scale()
+        # The scale of the discounted sums adapts the critic's targets to any task's rewards.
+        scaled_rewards = scaled_rewards.float() / returns.scale()
         gains = advantages(
-            earned, values, next_values, terminations, ends, options.gamma, options.gae_lambda
+            scaled_rewards,
+            values,
+            next_values,
+            terminations,
+            ends,
+            options.gamma,
+            options.gae_lambda,
         )
         optimizer.param_groups[0]["lr"] = options.learning_rate * (1 - rollout / rollouts)
-        batch = [tensor.flatten(0, 1) for tensor in (seen, acted, before, gains, gains + values)]
+        batch = [
+            tensor.flatten(0, 1)
+            for tensor in (states, taken_actions, log_probs, gains, gains + values)
+        ]
         improve(agent, optimizer, batch, options)
         agent.seen.update(batch[0])
         if on_rollout is not None:
@@ -278,36 +305,35 @@ def train(options: Options, on_rollout: Callable[[int, float], None] | None = No
 def improve(
     agent: Agent, optimizer: torch.optim.Optimizer, batch: list[Tensor], options: Options
 ) -> None:
-    """Climb PPO's clipped objective (Schulman et al., arXiv 1707.06347).
+    """Take gradient steps on PPO's clipped objective (Schulman et al., arXiv 1707.06347).
 
-    `batch` is n observations, actions, their log-probabilities when they were chosen, advantages,
+    `batch` has n observations, actions, their log-probabilities under the old policy, advantages,
     and returns.
     """
     for _ in range(options.epochs):
-        moved = []
+        divergences = []
         for rows in torch.randperm(len(batch[0])).tensor_split(options.minibatches):
-            seen, acted, before, gains, targets = (tensor[rows] for tensor in batch)
+            states, taken_actions, log_probs, gains, targets = (tensor[rows] for tensor in batch)
             gains = (gains - gains.mean()) / (gains.std() + 1e-8)
-            policy = agent.policy(seen)
-            change = policy.log_prob(acted) - before
-            ratio = change.exp()
+            policy = agent.policy(states)
+            log_ratio = policy.log_prob(taken_actions) - log_probs
+            ratio = log_ratio.exp()
             objective = torch.minimum(
                 ratio * gains, ratio.clamp(1 - options.clip, 1 + options.clip) * gains
             ).mean()
-            error = (agent.value(seen) - targets).square().mean()
+            error = (agent.value(states) - targets).square().mean()
             optimizer.zero_grad()
             (error / 2 - objective - options.entropy * policy.entropy().mean()).backward()
             nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
             optimizer.step()
-            moved.append(
-                (ratio - 1 - change).mean().item()
-            )  # an estimate of the divergence that is never negative
-        if np.mean(moved) > options.target_kl:
+            # This estimate of the KL divergence is never negative.
+            divergences.append((ratio - 1 - log_ratio).mean().item())
+        if np.mean(divergences) > options.target_kl:
             return
 
 
 def evaluate(agent: Agent, options: Options) -> np.ndarray:
-    """Returns of greedy episodes, shape (eval_episodes,), from initial states of their own."""
+    """Return the returns of greedy episodes, shape (eval_episodes,), from other initial states."""
     envs = make_envs(options, options.eval_episodes)
     observations, _ = envs.reset(seed=2**31 + options.seed)
     returns, running = np.zeros(options.eval_episodes), np.ones(options.eval_episodes, dtype=bool)
@@ -320,14 +346,16 @@ def evaluate(agent: Agent, options: Options) -> np.ndarray:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Train, evaluate, save."""
+    """Train, evaluate and save."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     try:
         with writing(options.out) as out, Progress() as bar:
             row = bar.add_task(options.task, total=options.total_steps)
 
-            def show(steps: int, back: float) -> None:
-                bar.update(row, completed=steps, description=f"{options.task}, return {back:.0f}")
+            def show(steps: int, mean_return: float) -> None:
+                bar.update(
+                    row, completed=steps, description=f"{options.task}, return {mean_return:.0f}"
+                )
 
             agent = train(options, show)
             out.write_bytes(save(agent.state_dict()))

@@ -1,10 +1,10 @@
-"""What trainings cost: processor time until evaluations reach a return, and in all, over several seeds.
+"""Measure what trainings cost: processor time until evaluations reach a return, and in total.
 
     python scripts/training_cost.py cartpole pendulum --seeds 5
     python scripts/training_cost.py acrobot --actuator ideal --changes '{"num_envs": 8}'
 
 Compilation, which a process does once, is left out: a short training comes first. Processor time is
-that of all threads.
+the sum over all threads.
 """
 
 import argparse
@@ -27,25 +27,25 @@ ENOUGH = {
     "mountain_car_continuous": 90.0,
     "furuta": 200.0,
 }
-"""Task -> mean return of an evaluation that counts as learnt."""
+"""Task -> mean return of an evaluation at which the task counts as learned."""
 
 
 class Clock:
-    """Notes when evaluations were good enough."""
+    """Progress callback that records when evaluations are good enough."""
 
     def __init__(self, enough: float) -> None:
-        """Start."""
+        """Start the clock."""
         self.enough, self.start = enough, time.process_time()
-        self.learnt = "-"
+        self.learned = "-"
         self.curve: list[str] = []
 
     def __call__(self, progress: Progress) -> None:
-        """Take a report, and the evaluation in it if there was one."""
+        """Record the evaluation of a progress report, if it has one."""
         if math.isnan(progress.evaluation_return):
             return
         self.curve.append(f"{progress.evaluation_return:.0f}")
-        if self.learnt == "-" and progress.evaluation_return >= self.enough:
-            self.learnt = f"{progress.steps:6d} steps {self.seconds:5.1f} s"
+        if self.learned == "-" and progress.evaluation_return >= self.enough:
+            self.learned = f"{progress.steps:6d} steps {self.seconds:5.1f} s"
 
     @property
     def seconds(self) -> float:
@@ -54,7 +54,7 @@ class Clock:
 
 
 def run(config: TrainConfig, enough: float) -> tuple[Clock, dict[str, Any]]:
-    """Train in a folder that is thrown away."""
+    """Train in a temporary folder."""
     clock = Clock(enough)
     with tempfile.TemporaryDirectory() as folder:
         out = train(config, Path(folder) / "run", on_progress=clock, tensorboard=False)
@@ -74,7 +74,7 @@ def main() -> None:
         "--changes",
         type=json.loads,
         default={},
-        help="JSON of a configuration's keys to set otherwise",
+        help="JSON of configuration keys to change",
     )
     options = parser.parse_args()
     for task in options.tasks:
@@ -87,8 +87,8 @@ def main() -> None:
         for seed in range(options.seeds):
             clock, result = run(dataclasses.replace(config, seed=seed), ENOUGH[task])
             print(
-                f"{task} {options.agent} {options.actuator} seed {seed}: learnt after"
-                f" {clock.learnt}; in all {result['steps']} steps {clock.seconds:5.1f} s,"
+                f"{task} {options.agent} {options.actuator} seed {seed}: learned after"
+                f" {clock.learned}; in all {result['steps']} steps {clock.seconds:5.1f} s,"
                 f" {result['steps'] / clock.seconds:5.0f} steps/s; evaluations"
                 f" {' '.join(clock.curve)}",
                 flush=True,

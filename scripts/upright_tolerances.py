@@ -1,7 +1,7 @@
-"""How strict is 'upright and still'? Pendulum's success under other tolerances, of policies that the study trained.
+"""Measure Pendulum's success under other tolerances of "upright and still".
 
-In the episodes that the study tests by. Writes docs/upright_tolerances.csv, and prints it as the
-table of docs/evaluation.md. The study's run folders have to be there: python
+Uses the policies and the test episodes of the study. Writes docs/upright_tolerances.csv, and prints
+it as the table of docs/evaluation.md. The study's run folders must exist: python
 scripts/study_actuators.py
 """
 
@@ -20,7 +20,7 @@ from codrl_mj.tasks.pendulum import GOAL_HOLD, upright_angle
 from codrl_mj.training import finished
 
 TOLERANCES = ((0.05, 0.05), (0.1, 0.1), (0.2, 0.1), (0.1, 0.2), (0.2, 0.5), (0.5, 1.0))
-"""Angle [rad] and speed [rad/s]."""
+"""Pairs of angle [rad] and speed [rad/s]."""
 TRIALS = (
     *(
         "ideal on ideal",
@@ -38,20 +38,20 @@ TRIALS = (
     ),
     *("weakness on weakness 0.25", "marginal motor on marginal motor", "weaker on weaker"),
 )
-"""Trained on, and tested on."""
+"""Names of trials: trained on, and tested on."""
 
 
 def row(name: str, study: ActuatorStudy) -> dict[str, object]:
-    """Share of episodes of all finished policies of a trial that end upright and still, by tolerance."""
+    """Return the share of a trial's episodes that end upright and still, by tolerance."""
     step = find_task("pendulum").step_duration
-    held = round(GOAL_HOLD / step) + 1
+    num_held = round(GOAL_HOLD / step) + 1
     worst: list[np.ndarray] = []
     tests = study.grid.deployments
     policies = [tests[f"pendulum: {name}", seed] for seed in range(study.seeds)]
     policies = [test for test in policies if finished(test.run)]
     for test in policies:
         for episode in run_episodes(load_policy(test.run), test.env.make, test.episodes, test.seed):
-            end = episode.state[-held:]
+            end = episode.state[-num_held:]
             worst.append(np.array([np.abs(upright_angle(end.T)).max(), np.abs(end[:, 1]).max()]))
     reached = np.array(worst).reshape(-1, 2)
     shares = {
@@ -79,7 +79,7 @@ def main() -> int:
     )
     options = parser.parse_args()
     study = ActuatorStudy(root=options.root, tasks=("pendulum",))
-    rows = [found for name in TRIALS if (found := row(name, study))["seeds"]]
+    rows = [table_row for name in TRIALS if (table_row := row(name, study))["seeds"]]
     if not rows:
         print(
             f"no finished training in {options.root}: run python scripts/study_actuators.py first",
@@ -87,7 +87,7 @@ def main() -> int:
         )
         return 1
     write_csv(options.out, rows)
-    lines = [list(rows[0]), ["---"] * len(rows[0]), *(found.values() for found in rows)]
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(table_row.values() for table_row in rows)]
     print("\n".join(f"| {' | '.join(map(str, line))} |" for line in lines))
     print(f"wrote {options.out}")
     return 0

@@ -1,9 +1,9 @@
-"""Environments of others through motors that `choose` finds, and through smaller ones: what is lost, what comes back.
+"""Train third-party environments through chosen and smaller motors, and compare the returns.
 
-An agent learns each environment on ideal actuators; the motors are chosen for what the first seed's
-policy asks of them; the others are the strongest of the catalogue that lack something. Agents then
-learn through both, and every policy is tested on all three. Trainings that were interrupted go on.
-Writes docs/worked_examples.csv and prints its means; `--steps 0.01` tries it.
+An agent learns each environment on ideal actuators. Motors are chosen for the demands of the first
+seed's policy; smaller ones are the strongest that lack something. Agents then learn through both,
+and every policy is tested on all three. Interrupted trainings are resumed. Writes
+docs/worked_examples.csv and prints its means; `--steps 0.01` is a quick trial.
 """
 
 import argparse
@@ -18,7 +18,8 @@ import numpy as np
 import yaml
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "examples"))  # where servo_arm is
+# servo_arm is in this folder.
+sys.path.insert(0, str(ROOT / "examples"))
 
 from codrl_mj.evaluation import evaluate  # noqa: E402
 from codrl_mj.runs.files import writing  # noqa: E402
@@ -33,7 +34,7 @@ SAC: dict[str, Any] = {
     "learning_rate": 1e-3,
 }
 EXAMPLES: dict[str, tuple[str, int]] = {
-    # name -> id, environment steps of a training
+    # Name -> environment id, and environment steps of a training.
     "double pendulum": ("InvertedDoublePendulum-v5", 15_000),
     "cheetah": ("HalfCheetah-v5", 20_000),
     "servo arm": ("servo_arm:ServoArm-v0", 15_000),
@@ -53,7 +54,7 @@ COLUMNS = (
 
 
 def main() -> None:
-    """Train, choose, train, test, write."""
+    """Train, choose motors, train through them, test, and write the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -89,7 +90,7 @@ def main() -> None:
 
 
 def _example(name: str, options: Any) -> None:
-    """All of one environment; a test that is written is not made again."""
+    """Run one environment; finished tests are not repeated."""
     folder, (env_id, steps) = options.runs / name.replace(" ", "_"), EXAMPLES[name]
     if (folder / "tests.json").exists():
         return
@@ -124,16 +125,20 @@ def _example(name: str, options: Any) -> None:
         )
         for tested in THROUGH:
             env = dataclasses.replace(config.env, actuator=motors[tested])
-            found = evaluate(load_policy(path), env, EPISODES, TEST_SEED)
-            success = "" if found.success is None else found.success.mean
-            heat = "" if found.copper_loss is None else round(found.copper_loss.mean, 2)
-            saturated = "" if found.saturated_percent is None else round(found.saturated_percent, 2)
+            evaluation = evaluate(load_policy(path), env, EPISODES, TEST_SEED)
+            success = "" if evaluation.success is None else evaluation.success.mean
+            heat = "" if evaluation.copper_loss is None else round(evaluation.copper_loss.mean, 2)
+            saturated = (
+                ""
+                if evaluation.saturated_percent is None
+                else round(evaluation.saturated_percent, 2)
+            )
             values = (
                 name,
                 through,
                 seed,
                 tested,
-                round(found.returns.mean, 3),
+                round(evaluation.returns.mean, 3),
                 saturated,
                 heat,
                 success,
@@ -145,14 +150,17 @@ def _example(name: str, options: Any) -> None:
 
 
 def _motors(folder: Path, ideal: Path) -> dict[str, Any]:
-    """`chosen` and `smaller`: pattern -> mapping, also as YAML files that `--actuators` takes; made once."""
+    """Return the `chosen` and `smaller` motors by pattern, from YAML files that are made once.
+
+    `--actuators` takes the same files.
+    """
     files = {name: folder / f"{name}.yaml" for name in THROUGH[1:]}
     if not all(path.exists() for path in files.values()):
-        found: dict[str, dict[str, Any]] = {name: {} for name in files}
+        choices: dict[str, dict[str, Any]] = {name: {} for name in files}
         for motor, demand in demands_of(ideal, episodes=5, trust=True).items():
             ranked = choose(demand)
             for name, choice in (("chosen", ranked[0]), ("smaller", _smaller(ranked))):
-                found[name][motor] = choice, demand
+                choices[name][motor] = choice, demand
                 verdict = choice.lacks or "does it"
                 print(
                     f"{motor} {name}: {choice.name}, gear {choice.ratio:.4g}, {choice.power:.0f} W:"
@@ -160,20 +168,25 @@ def _motors(folder: Path, ideal: Path) -> dict[str, Any]:
                 )
         for name, path in files.items():
             with writing(path) as temporary:
-                temporary.write_text(yaml.safe_dump(actuators_of(found[name]), sort_keys=False))
+                temporary.write_text(yaml.safe_dump(actuators_of(choices[name]), sort_keys=False))
     return {name: yaml.safe_load(path.read_text()) for name, path in files.items()}
 
 
 def _smaller(ranked: list[Candidate]) -> Candidate:
-    """The strongest motor of less power than the first that lacks a third of the voltage or the current for it."""
+    """Return the strongest motor that has less power than the first and clearly lacks something.
+
+    It lacks a third of the voltage or the current.
+    """
     weaker = [
-        one for one in ranked[1:] if one.power < ranked[0].power and one.feasibility.margin < -1 / 3
+        candidate
+        for candidate in ranked[1:]
+        if candidate.power < ranked[0].power and candidate.feasibility.margin < -1 / 3
     ]
-    return max(weaker, key=lambda one: one.power) if weaker else ranked[-1]
+    return max(weaker, key=lambda candidate: candidate.power) if weaker else ranked[-1]
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
-    """Mean return over seeds [lowest, highest], a row for each training, a column for each test; Markdown."""
+    """Return Markdown with the mean return [min, max] over seeds, by training and test."""
     lines = [
         "| environment | trained through | on ideal | on the chosen | on the smaller |",
         "| --- | --- | --- | --- | --- |",
@@ -182,13 +195,13 @@ def _table(rows: list[dict[str, Any]]) -> str:
         for through in THROUGH:
             cells = []
             for tested in THROUGH:
-                own = (name, through, tested)
-                each = [
+                key = (name, through, tested)
+                matching_rows = [
                     row
                     for row in rows
-                    if (row["environment"], row["trained through"], row["tested on"]) == own
+                    if (row["environment"], row["trained through"], row["tested on"]) == key
                 ]
-                returns = [float(row["return"]) for row in each]
+                returns = [float(row["return"]) for row in matching_rows]
                 cells.append(
                     f"{np.mean(returns):.1f} [{min(returns):.1f}, {max(returns):.1f}]"
                     if returns

@@ -1,4 +1,4 @@
-"""The page of numbers: what the bench in the engine measures is what closed forms and datasheets say."""
+"""Page of actuators in numbers: bench results agree with closed forms and datasheets."""
 
 import csv
 import importlib.util
@@ -23,13 +23,13 @@ SCRIPT = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(SCRIPT)
 
 
-def written(kind):
+def read_table(kind):
     with (DOCS / SCRIPT.TABLES[kind]).open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def same(row, computed):
-    """Whether a row of a CSV file is what is computed: words exactly, numbers to the digits that are written."""
+def check_row(row, computed):
+    """Check that a row of a CSV file has the computed words, and numbers to the written digits."""
     assert list(row) == list(computed)
     for name, value in computed.items():
         if isinstance(value, float):
@@ -38,11 +38,11 @@ def same(row, computed):
             assert row[name] == str(value)
 
 
-# the files
+# files
 
 
-def test_the_page_is_what_the_tables_say_and_they_have_every_name():
-    tables = {kind: written(kind) for kind in SCRIPT.TABLES}
+def test_the_page_agrees_with_the_tables_which_have_every_actuator():
+    tables = {kind: read_table(kind) for kind in SCRIPT.TABLES}
     assert (DOCS / SCRIPT.PAGE).read_text() == SCRIPT.page(tables)
     assert [row["motor"] for row in tables["motors"]] == motor_names()
     named = [name for name in SCRIPT.NAMED if name != "ideal"]
@@ -52,17 +52,20 @@ def test_the_page_is_what_the_tables_say_and_they_have_every_name():
 
 
 @pytest.mark.parametrize("index", matrix_params([4], range(20)))
-def test_the_tasks_table_is_what_is_measured(index):
-    row = written("tasks")[index]
-    same(row, SCRIPT.task_row(row["task"], row["actuator"]))
+def test_the_table_of_tasks_agrees_with_the_bench(index):
+    row = read_table("tasks")[index]
+    check_row(row, SCRIPT.task_row(row["task"], row["actuator"]))
 
 
 # closed forms
 
 
-def test_the_loop_of_the_cartpole_is_python_control_s():
-    """PID and plain Euler winding in z; delivered is the current after the step, so a sample early."""
-    row, h, resistance, inductance = written("tasks")[4], 0.02, 1.0, 0.1
+def test_cartpoles_loop_agrees_with_python_control():
+    """The PID and the Euler winding are transfer functions in z.
+
+    The delivered current is the one after the step, so it comes a sample early.
+    """
+    row, h, resistance, inductance = read_table("tasks")[4], 0.02, 1.0, 0.1
     assert (row["task"], row["actuator"]) == ("cartpole", "paper")
     kp, ki, kd, kff, arm, voltage = 4.3, 1.0, 1e-6, 0.6, 0.15, 24.0
     z = control.TransferFunction([1, 0], [1], h)
@@ -80,18 +83,18 @@ def test_the_loop_of_the_cartpole_is_python_control_s():
     assert float(row["no_load_speed"]) == pytest.approx(voltage * arm)  # kE = 1
 
 
-def test_a_motor_s_row_is_that_of_the_closed_forms():
-    """The EC 45 flat, whose loop is P/(z - 1)."""
-    row = next(row for row in written("motors") if row["motor"] == "maxon-ec45-flat-50w")
-    numbers, rate, share = motor_entry(row["motor"]).numbers, 20e3, -math.expm1(-0.349)
-    left, constant, free = 1 - share, numbers.torque_constant, 0.238
-    angle = math.acos((1 + left**2 - 2 * share**2) / (2 * left))
+def test_a_motors_row_agrees_with_closed_forms():
+    """The loop of the EC 45 flat is P/(z - 1)."""
+    row = next(row for row in read_table("motors") if row["motor"] == "maxon-ec45-flat-50w")
+    numbers, rate, gain = motor_entry(row["motor"]).numbers, 20e3, -math.expm1(-0.349)
+    pole, constant, friction_current = 1 - gain, numbers.torque_constant, 0.238
+    angle = math.acos((1 + pole**2 - 2 * gain**2) / (2 * pole))
     expected = {
-        "settled_2_ms": 1e3 * math.ceil(math.log(0.02) / math.log(left)) / rate,
+        "settled_2_ms": 1e3 * math.ceil(math.log(0.02) / math.log(pole)) / rate,
         "bandwidth_hz": angle / math.tau * rate,
-        "stall_torque": constant * (24.0 / 0.942 - free),
-        "no_load_speed": (24.0 - 0.942 * free) / numbers.back_emf_constant,
-        "continuous_torque": constant * (2.52 - free),
+        "stall_torque": constant * (24.0 / 0.942 - friction_current),
+        "no_load_speed": (24.0 - 0.942 * friction_current) / numbers.back_emf_constant,
+        "continuous_torque": constant * (2.52 - friction_current),
         "mechanical_time_constant_ms": (
             1e3 * 0.942 * 135e-7 / (constant * numbers.back_emf_constant)
         ),
@@ -103,12 +106,15 @@ def test_a_motor_s_row_is_that_of_the_closed_forms():
 
 
 @pytest.mark.parametrize("name", motor_names())
-def test_every_motor_of_the_catalogue_does_in_the_engine_what_its_datasheet_prints(name):
-    """To 5 %; and what follows from its constants, whether that is printed or not."""
+def test_every_motor_of_the_catalogue_agrees_with_its_datasheet_in_the_engine(name):
+    """The datasheet's values hold to 5 %, values from its constants to 0.2 %."""
     entry, row = motor_entry(name), SCRIPT.motor_row(name)
-    same(next(row for row in written("motors") if row["motor"] == name), row)
+    check_row(next(row for row in read_table("motors") if row["motor"] == name), row)
     numbers, printed = entry.numbers, entry.datasheet.readings()
-    ratio, passed = numbers.gear_ratio, (numbers.gear_efficiency or 1.0) * numbers.torque_constant
+    ratio, torque_per_current = (
+        numbers.gear_ratio,
+        (numbers.gear_efficiency or 1.0) * numbers.torque_constant,
+    )
     coulomb, viscous = numbers.coulomb_friction or 0.0, numbers.viscous_friction or 0.0
     volts, ohms, emf = numbers.voltage or 24.0, numbers.resistance, numbers.back_emf_constant
     measured = {
@@ -116,18 +122,18 @@ def test_every_motor_of_the_catalogue_does_in_the_engine_what_its_datasheet_prin
         "no_load_speed": row["no_load_speed"],
         "mechanical_time_constant": 1e-3 * row["mechanical_time_constant_ms"],
     }
-    damping = passed * emf / ohms + viscous
-    follows = {
-        "stall_torque": ratio * (passed * volts / ohms - coulomb),
-        "no_load_speed": (passed * volts / ohms - coulomb) / damping / ratio,
+    damping = torque_per_current * emf / ohms + viscous
+    expected = {
+        "stall_torque": ratio * (torque_per_current * volts / ohms - coulomb),
+        "no_load_speed": (torque_per_current * volts / ohms - coulomb) / damping / ratio,
         "mechanical_time_constant": (
             math.nan if numbers.rotor_inertia is None else numbers.rotor_inertia / damping
         ),
     }
-    assert measured == pytest.approx(follows, rel=2e-3, nan_ok=True)
+    assert measured == pytest.approx(expected, rel=2e-3, nan_ok=True)
     for field in measured.keys() & printed.keys():
         at_motor = printed[field].shaft == "motor" and field != "mechanical_time_constant"
-        seen = (
+        at_output = (
             printed[field].value * (ratio if field == "stall_torque" else 1.0 / ratio) ** at_motor
         )
-        assert measured[field] == pytest.approx(seen, rel=0.05), field
+        assert measured[field] == pytest.approx(at_output, rel=0.05), field

@@ -1,4 +1,4 @@
-"""Whatever a user hands over is refused in a sentence, and costs nobody a file."""
+"""Corrupted input: a command refuses it with a message and damages no file."""
 
 import importlib
 import os
@@ -22,16 +22,16 @@ def corrupt():
 
 
 @pytest.mark.matrix
-def test_thirty_of_each_kind_end_with_a_word(tmp_path):
+def test_thirty_cases_of_each_kind_pass(tmp_path):
     command = [sys.executable, str(SCRIPT), "--count", "30", "--log", str(tmp_path / "log")]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    assert "0 of 90 failed" in ended.stdout
+    completed = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
+    assert completed.returncode == 0, completed.stdout + completed.stderr
+    assert "0 of 90 failed" in completed.stdout
 
 
-def _ends(status, word=""):
+def _ends(status, message=""):
     def program():
-        print(word, end="", file=sys.stderr)
+        print(message, end="", file=sys.stderr)
         return status
 
     return program
@@ -46,7 +46,8 @@ def _ends_by_a_signal():
 
 
 def _does(change):
-    """A program that changes a file and succeeds."""
+    """Return a program that changes a file and succeeds."""
+    # `change` may return anything; the program's exit status is 0.
     return lambda: 0 * bool(change())
 
 
@@ -69,7 +70,7 @@ def _ends_at_ctrl_c():
         (_ends(0), []),
         (_ends(2, "codrl-mj: error: there is no such thing\n"), []),
         (_ends_at_ctrl_c, []),
-        (_ends(2), ["no word on it"]),
+        (_ends(2), ["no message"]),
         (_crashes, ["exit status 99", "traceback"]),
         (_ends_by_a_signal, ["exit status -9"]),
         (_does(lambda: Path("mine").write_text("theirs")), ["lost: mine"]),
@@ -78,7 +79,7 @@ def _ends_at_ctrl_c():
         (_dies_of_ctrl_c, ["exit status -2"]),
     ],
 )
-def test_every_kind_of_failure_is_seen(corrupt, tmp_path, monkeypatch, program, failures):
+def test_each_kind_of_failure_is_detected(corrupt, tmp_path, monkeypatch, program, failures):
     folder = tmp_path / "case"
     folder.mkdir()
     (folder / "mine").write_text("mine")
@@ -87,10 +88,10 @@ def test_every_kind_of_failure_is_seen(corrupt, tmp_path, monkeypatch, program, 
     assert outcome.failures == failures, outcome
 
 
-def test_a_case_is_drawn_from_its_name_alone(corrupt):
-    drawn = [
+def test_a_case_only_depends_on_its_name(corrupt):
+    texts = [
         corrupt.change_text(corrupt.MOTOR, random.Random(f"files/{seed}"))
         for seed in (0, 0, *range(1, 20))
     ]
-    assert drawn[0] == drawn[1]
-    assert len(set(drawn)) > 15
+    assert texts[0] == texts[1]
+    assert len(set(texts)) > 15

@@ -1,4 +1,4 @@
-"""An agent of one's own: the script learns, repeats itself, looks beyond time limits, and refuses nonsense."""
+"""Custom agent of scripts/train_custom_agent.py: learning, seeds, time limits and errors."""
 
 import importlib
 import itertools
@@ -36,7 +36,7 @@ def script():
 
 
 @pytest.mark.matrix
-def test_it_learns_to_balance_and_the_file_holds_what_was_evaluated(script, tmp_path, capsys):
+def test_it_learns_to_balance_and_saves_the_evaluated_policy(script, tmp_path, capsys):
     out = tmp_path / "new" / "agent.safetensors"
     line = (
         "--task cartpole --actuator paper --total-steps 40000 --num-envs 16 --rollout 128"
@@ -45,9 +45,8 @@ def test_it_learns_to_balance_and_the_file_holds_what_was_evaluated(script, tmp_
     assert script.main([*line.split(), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     mean = float(re.search(r"greedy return: ([\d.]+)", printed)[1])
-    assert (
-        mean >= 195
-    )  # what Gymnasium's first CartPole called solved; doing nothing useful gives 10 to 25
+    # Gymnasium's first CartPole counts as solved at 195; doing nothing useful gives 10 to 25.
+    assert mean >= 195
     assert str(out) in printed.replace("\n", "")
 
     options = script.Options(task="cartpole", actuator="paper", eval_episodes=20)
@@ -59,7 +58,7 @@ def test_it_learns_to_balance_and_the_file_holds_what_was_evaluated(script, tmp_
 
 
 @pytest.mark.parametrize("task", ["cartpole", "pendulum"])  # discrete and continuous actions
-def test_a_seed_repeats_the_weights_and_another_does_not(script, task, tmp_path):
+def test_equal_seeds_give_equal_weights_and_other_seeds_do_not(script, task, tmp_path):
     weights = []
     for name, seed in {"one": "3", "two": "3", "other": "4"}.items():
         out = tmp_path / name
@@ -71,11 +70,11 @@ def test_a_seed_repeats_the_weights_and_another_does_not(script, task, tmp_path)
 
 def test_advantages_are_the_discounted_sum_of_errors_within_each_episode(script):
     generator = torch.Generator().manual_seed(0)
-    rewards, values, after = torch.randn(3, 7, 2, generator=generator)
+    rewards, values, next_values = torch.randn(3, 7, 2, generator=generator)
     ended = torch.rand(7, 2, generator=generator) < 0.3
     terminated = ended & (torch.rand(7, 2, generator=generator) < 0.5)
-    gains = script.advantages(rewards, values, after, terminated, ended, 0.9, 0.7)
-    errors = rewards + 0.9 * after * ~terminated - values
+    gains = script.advantages(rewards, values, next_values, terminated, ended, 0.9, 0.7)
+    errors = rewards + 0.9 * next_values * ~terminated - values
     for row, start in itertools.product(range(2), range(7)):
         last = next((step for step in range(start, 7) if ended[step, row]), 6)
         weights = (0.9 * 0.7) ** torch.arange(last + 1 - start)
@@ -84,7 +83,7 @@ def test_advantages_are_the_discounted_sum_of_errors_within_each_episode(script)
         )
 
 
-def test_at_a_time_limit_the_episodes_own_last_observation_is_valued(script, monkeypatch):
+def test_at_a_time_limit_the_last_observation_of_the_episode_is_valued(script, monkeypatch):
     recorded = {}
     original = script.advantages
 
@@ -93,19 +92,19 @@ def test_at_a_time_limit_the_episodes_own_last_observation_is_valued(script, mon
         return original(rewards, values, next_values, terminated, ended, gamma, lam)
 
     monkeypatch.setattr(script, "advantages", record)
-    monkeypatch.setattr(
-        script.Agent, "value", lambda _, observations: observations[..., 2]
-    )  # the pendulum's speed
+    # The value is the pendulum's speed, which shows the observation that was valued.
+    monkeypatch.setattr(script.Agent, "value", lambda _, observations: observations[..., 2])
     script.train(
         script.Options("pendulum", "ideal", num_envs=4, rollout=210, total_steps=1, minibatches=2)
     )
     values, next_values, ended = recorded["values"], recorded["next_values"], recorded["ended"]
-    assert ended.sum() == 4  # the limit of 200 steps
+    # Every environment reaches the limit of 200 steps once.
+    assert ended.sum() == 4
     assert not recorded["terminated"].any()
     running = ~ended[:-1]
     assert (next_values[:-1][running] == values[1:][running]).all()
     assert (next_values[:-1][~running] != values[1:][~running]).all()
-    # in one step gravity and the motor change the speed by no more than (15 + 3 * 2) * 0.05 rad/s
+    # In one step gravity and the motor change the speed by at most (15 + 3 * 2) * 0.05 rad/s.
     assert (next_values - values).abs().max() <= 1.05 + 1e-4
 
 
@@ -122,7 +121,7 @@ def test_at_a_time_limit_the_episodes_own_last_observation_is_valued(script, mon
         (["--actuator", "strong"], "strong"),
     ],
 )
-def test_bad_arguments_cost_one_line_and_leave_nothing(
+def test_invalid_arguments_give_one_line_and_leave_no_file(
     script, arguments, message, tmp_path, capsys
 ):
     assert script.main([*arguments, "--out", str(tmp_path / "agent.safetensors")]) == 2
@@ -133,7 +132,7 @@ def test_bad_arguments_cost_one_line_and_leave_nothing(
     assert not list(tmp_path.iterdir())
 
 
-def test_an_unknown_task_is_answered_with_those_there_are(script, capsys):
+def test_an_unknown_task_is_refused_with_a_list_of_tasks(script, capsys):
     with pytest.raises(SystemExit, match="2"):
         script.main(["--task", "unicycle"])
     error = capsys.readouterr().err
@@ -141,7 +140,7 @@ def test_an_unknown_task_is_answered_with_those_there_are(script, capsys):
     assert "mountain_car_continuous" in error
 
 
-def test_the_documented_commands_are_understood(script):
+def test_the_documented_commands_are_valid(script):
     commands = re.findall(r"^\$ python scripts/train_custom_agent\.py (.*)$", PAGE, re.MULTILINE)
     assert commands
     for command in commands:

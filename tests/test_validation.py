@@ -516,11 +516,11 @@ TWO_MOTORS = """
 <body pos="1 0 0.2"><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody><actuator>
 <general name="left" joint="a" gear="10" dyntype="user" actdim="14" gainprm="0" biastype="user"
  ctrllimited="true" ctrlrange="-1 1"
- user="250700 268401 843097 1 0.1 1 1 4.3 1 1e-6 0.6 24 1 1 0 0 0 0 inf 0"/>
+ user="250700 268401 814523 1 0.1 1 1 4.3 1 1e-6 0.6 24 1 1 0 0 0 0 inf 0"/>
 <position name="foreign" joint="a" kp="1"/>
 <general name="right" joint="b" gear="5" dyntype="user" actdim="14" gainprm="0" biastype="user"
  ctrllimited="true" ctrlrange="-1 1"
- user="250700 268401 843097 1 0.1 1 1 4.3 1 1e-6 0.6 2 0 4 0.1 0.01 0 0 inf 0"/>
+ user="250700 268401 814523 1 0.1 1 1 4.3 1 1e-6 0.6 2 0 4 0.1 0.01 0 0 inf 0"/>
 </actuator></mujoco>
 """
 

@@ -97,7 +97,8 @@ def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
     if family is None:
         raise ValueError(
             f"family {user[2]:g} is not known in this process: import its module and call "
-            "codrl_mj.engine.load_family first"
+            "codrl_mj.engine.load_family first; if an earlier version of codrl_mj saved the model,"
+            " build it again, because a family's number changes with the name of its class"
         )
     size, names = slot_size(family), parameters_type(family)._fields
     if uses_plugin:

@@ -6,33 +6,36 @@ import numpy as np
 
 import codrl_mj
 
-HALF_LENGTH = 0.2  # m, of the beam
-MAX_TORQUE = 0.4  # N*m
+HALF_LENGTH = 0.2  # of the beam [m]
+MAX_TORQUE = 0.4  # [N*m]
 
 
 def initial_bounds(options):
-    """The ball within 8 cm of the middle, the beam nearly level."""
+    """Return bounds of the initial state: ball within 8 cm of the middle, beam nearly level."""
     return np.array([-0.05, -0.08, 0.0, 0.0]), np.array([0.05, 0.08, 0.0, 0.0])
 
 
 def initial_state(draws):
-    """The draws themselves."""
+    """Return the initial state, which is drawn directly."""
     return draws[0], draws[1], draws[2], draws[3]
 
 
 def observation(state):
-    """The state, in numbers around one."""
+    """Return the state, scaled to numbers around one."""
     return 5.0 * state[0], state[1] / HALF_LENGTH, 0.5 * state[2], 2.0 * state[3]
 
 
 def reward(state, force, next_state, options):
-    """1 for a ball in the middle of a level beam, 0 at the edge; never negative, so that falling earns nothing."""
-    off, effort = next_state[1] / HALF_LENGTH, force / MAX_TORQUE
-    return np.maximum(0.0, 1.0 - off * off - next_state[0] * next_state[0] - 0.01 * effort * effort)
+    """Return 1 for a ball in the middle of a level beam, 0 at the edge; never less."""
+    # A negative reward would make it pay to drop the ball early.
+    position, effort = next_state[1] / HALF_LENGTH, force / MAX_TORQUE
+    return np.maximum(
+        0.0, 1.0 - position * position - next_state[0] * next_state[0] - 0.01 * effort * effort
+    )
 
 
 def terminated(state):
-    """The ball rolls off the end, or the beam stands too steep for the groove."""
+    """Return True if the ball has left the beam, or the beam is too steep for the groove."""
     return (np.abs(state[1]) > HALF_LENGTH) | (np.abs(state[0]) > 0.7)
 
 

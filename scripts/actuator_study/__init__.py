@@ -1,1 +1,1 @@
-"""The study of what an actuator costs: docs/results/plan.md says what is asked, and how it is answered."""
+"""Study of the cost of an actuator; docs/results/plan.md has its questions and methods."""

@@ -1,4 +1,4 @@
-"""How right `codrl-mj advise` is: what it says of every actuator that was tested, without that actuator's own tests."""
+"""Accuracy of `codrl-mj advise` on every tested actuator, without that actuator's own tests."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -13,19 +13,19 @@ from codrl_mj.study.questions import MARGIN
 
 
 def tested(task: str) -> dict[str, tuple[str, Any]]:
-    """Test -> what to call the actuator, and the actuator, of all that are none of the doses."""
-    found = {"good motor": arms.GOOD[task]} | (
+    """Return the label and the actuator of each test that is not a severity of a single axis."""
+    motors = {"good motor": arms.GOOD[task]} | (
         {"marginal motor": arms.MARGINAL[task]} if task in arms.MARGINAL else {}
     )
     called = {
-        test: (motor_name(motor), posed(task, motor).actuator) for test, motor in found.items()
+        test: (motor_name(motor), posed(task, motor).actuator) for test, motor in motors.items()
     }
     if task not in arms.LOOPED:
         return called
     loops = {loop: arms.designed(task) if loop == "designed" else loop for loop in LOOPS}
     return called | {
-        loop: (f"paper's motor, {loop} loop", posed(task, one).actuator)
-        for loop, one in loops.items()
+        loop: (f"paper's motor, {loop} loop", posed(task, loop_actuator).actuator)
+        for loop, loop_actuator in loops.items()
     }
 
 
@@ -34,19 +34,19 @@ LOOPS = ("weaker", "paper", "designed")
 
 
 def motor_name(motor: Mapping[str, Any]) -> str:
-    """A motor of the catalogue with its gear, and its supply where that is not the nominal one."""
+    """Return a motor's name with its gear, and its supply voltage if that is not nominal."""
     volts = f", {motor['supply']['voltage']:g} V" if "supply" in motor else ""
     return f"{motor['name']}, {motor['motor']['gear_ratio']:g}:1{volts}"
 
 
 def measured(evidence: Evidence, task: str, test: str) -> dict[str, Prospect]:
-    """What policies lost on an actuator, by what was done."""
+    """Return the measured loss of policies on an actuator, by training option."""
     trained = {IDEAL: ("ideal", test), THROUGH: (test, test)}
     if test in ("weaker", "paper"):
         trained[LOOP] = ("ideal", "designed")
     outcomes = {
-        name: evidence.outcome(task, arm, there, "ideal" if arm == "ideal" else None)
-        for name, (arm, there) in trained.items()
+        name: evidence.outcome(task, arm, deployed, "ideal" if arm == "ideal" else None)
+        for name, (arm, deployed) in trained.items()
     }
     return {
         name: Prospect(outcome, outcome)
@@ -55,55 +55,63 @@ def measured(evidence: Evidence, task: str, test: str) -> dict[str, Prospect]:
     }
 
 
-def judged(said: str, options: Mapping[str, Prospect]) -> str:
-    """Whether a verdict is right: what it says to do loses nothing, or surely less than doing nothing."""
-    if said == MEASURE:
+def judged(verdict: str, options: Mapping[str, Prospect]) -> str:
+    """Judge a verdict: right if its option loses nothing, or surely less than doing nothing."""
+    if verdict == MEASURE:
         return "says nothing"
-    if said == BUY:
+    if verdict == BUY:
         return "right" if decide(options) == BUY else "wrong"
-    if said not in options:
+    if verdict not in options:
         return "not tested"
-    return "right" if decide({IDEAL: options[IDEAL], said: options[said]}) == said else "wrong"
+    return (
+        "right"
+        if decide({IDEAL: options[IDEAL], verdict: options[verdict]}) == verdict
+        else "wrong"
+    )
 
 
 def rows(evidence: Evidence) -> Iterator[dict[str, Any]]:
-    """A row for every actuator and task: losses that were predicted and measured, what is said, and whether rightly."""
+    """Yield a row for each actuator and task: predicted loss, measured loss, verdict, judgment."""
     for task in SECONDS:
         for test, (name, actuator) in tested(task).items():
             options = measured(evidence, task, test)
-            found = advise(actuator, task, evidence.without(test))
-            if IDEAL not in options or not found.options:
+            # The actuator's own tests are removed, so that advice has to predict them.
+            advice = advise(actuator, task, evidence.without(test))
+            if IDEAL not in options or not advice.options:
                 continue
-            predicted, seen = found.options[IDEAL].least, options[IDEAL].least
+            predicted, outcome = advice.options[IDEAL].least, options[IDEAL].least
             assert predicted is not None
-            assert seen is not None
+            assert outcome is not None
             yield {
                 "task": task,
                 "actuator": name,
-                "beyond": found.options[IDEAL].most is None,
+                "beyond": advice.options[IDEAL].most is None,
                 **{f"predicted_{key}": value for key, value in predicted.loss._asdict().items()},
-                **{f"measured_{key}": value for key, value in seen.loss._asdict().items()},
-                "measured_failed": seen.failed,
-                "measured_success_lost": seen.success_lost.mean,
-                "said": found.verdict,
+                **{f"measured_{key}": value for key, value in outcome.loss._asdict().items()},
+                "measured_failed": outcome.failed,
+                "measured_success_lost": outcome.success_lost.mean,
+                "said": advice.verdict,
                 "measured": (
-                    decide(options) if THROUGH in options or seen.spared else "not trained through"
+                    decide(options)
+                    if THROUGH in options or outcome.spared
+                    else "not trained through"
                 ),
-                "judged": judged(found.verdict or MEASURE, options),
+                "judged": judged(advice.verdict or MEASURE, options),
             }
 
 
 def left_out(evidence: Evidence) -> dict[str, float]:
-    """Every dose but none and the largest, predicted from its neighbours: how far off, and what of it matters."""
+    """Predict each inner severity from its neighbors; return errors and number of flipped verdicts."""
     errors, flips = [], 0
     for task in SECONDS:
         for axis, known in AXES.items():
-            for dose in known.doses[1:-1]:
-                seen = evidence.loss(task, axis, dose)
-                expected = evidence.without(f"{axis} {dose:g}").loss(task, axis, dose)
-                if seen is not None and expected is not None:
-                    errors.append(abs(seen.outcome.loss.mean - expected.outcome.loss.mean))
-                    flips += seen.outcome.spared != expected.outcome.spared
+            # The first and the last severity have a neighbor on one side only.
+            for severity in known.doses[1:-1]:
+                loss = evidence.loss(task, axis, severity)
+                expected = evidence.without(f"{axis} {severity:g}").loss(task, axis, severity)
+                if loss is not None and expected is not None:
+                    errors.append(abs(loss.outcome.loss.mean - expected.outcome.loss.mean))
+                    flips += loss.outcome.spared != expected.outcome.spared
     return {
         "doses": len(errors),
         "mean_error": float(np.mean(errors or [0.0])),

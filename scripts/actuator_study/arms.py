@@ -1,4 +1,4 @@
-"""Who is trained on what, in the study of what an actuator costs. docs/results/plan.md has the reasons."""
+"""Training arms of the study of the cost of an actuator; docs/results/plan.md gives the reasons."""
 
 import dataclasses
 import functools
@@ -12,14 +12,14 @@ from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import named_actuator
 
 TRAINED = ("pendulum", "furuta")
-"""The tasks on which doses are trained through: those whose score every dose moves, and that have
-no ceiling nearby. (CartPole's is reached by ideal-trained policies under every dose but lag and
-delay.)
+"""Tasks with policies trained at a severity: all axes change their scores, far from a ceiling.
+
+CartPole's ceiling is reached by ideal-trained policies under every severity but lag and delay.
 """
 LOOPED = ("pendulum", "cartpole")
-"""The tasks on which loops around the paper's motor are compared."""
+"""Tasks on which current loops around the paper's motor are compared."""
 DRAWN = ("lag", "weakness", "supply", "noise")
-"""The axes that can be drawn anew for every episode; delay and friction are none of an actuator's numbers."""
+"""Axes that can be randomized per episode; delay and friction are not fields of an actuator."""
 GOOD: dict[str, dict[str, Any]] = {
     "pendulum": {"name": "maxon-dcx22l", "motor": {"gear_ratio": 59.0}},
     "cartpole": {"name": "maxon-dcx22l", "motor": {"gear_ratio": 605.0}},
@@ -28,63 +28,66 @@ GOOD: dict[str, dict[str, Any]] = {
     "mountain_car": {"name": "faulhaber-1331-006", "motor": {"gear_ratio": 1039.0}},
     "mountain_car_continuous": {"name": "faulhaber-1331-006", "motor": {"gear_ratio": 1038.0}},
 }
-"""Task -> the smallest motor of the catalogue that `codrl-mj motor choose` finds sufficient, with its gear."""
+"""Task -> smallest motor, with gear, that `codrl-mj motor choose` finds sufficient."""
 MARGINAL: dict[str, dict[str, Any]] = {
     task: known["marginal motor"] for task, known in REAL.items()
 }
-"""Task -> a motor that it calls `try it`."""
+"""Task -> motor for which `codrl-mj motor choose` answers `try it`."""
 
 
-def otherwise(env: EnvConfig, **fields: Any) -> EnvConfig:
-    """An environment whose actuator is otherwise in some fields of its parts, such as motor__resistance."""
+def with_fields(env: EnvConfig, **fields: Any) -> EnvConfig:
+    """Return an environment with other values of actuator fields, such as motor__resistance=1.0."""
     changes = {name.replace("__", "."): value for name, value in fields.items()}
     return dataclasses.replace(env, actuator=env.actuator.replaced(changes))
 
 
 @functools.cache
 def drawn(task: str, axis: str, trained: float | None = None) -> Arm:
-    """Trained on doses that are drawn anew for every episode, evenly from none to `drawn_up_to`.
+    """Return the arm trained on severities drawn per episode, uniformly from none to `drawn_up_to`.
 
-    `trained` is the dose that others are trained through, where it is not the axis' own.
+    Args:
+        task: task name.
+        axis: axis of the severities.
+        trained: severity of the `matched` arm, half of the largest one drawn; None: the axis' own.
     """
-    most = AXES[axis].at(
+    largest_env = AXES[axis].at(
         task, drawn_up_to(axis, AXES[axis].trained[task] if trained is None else trained)
     )
-    none, actuator = AXES[axis].at(task, 0.0).actuator, most.actuator
+    zero_env, actuator = AXES[axis].at(task, 0.0).actuator, largest_env.actuator
     text = {
         "lag": lambda: f"time_constant=uniform(0, {actuator.time_constant:g})",
         "weakness": lambda: f"gain=uniform({actuator.gain:g}, 1)",
         "supply": lambda: (
-            f"supply.voltage=uniform({actuator.supply.voltage:g}, {none.supply.voltage:g})"
+            f"supply.voltage=uniform({actuator.supply.voltage:g}, {zero_env.supply.voltage:g})"
         ),
         "noise": lambda: (
             f"controller.current_noise=uniform(0, {actuator.controller.current_noise:g})"
         ),
     }[axis]()
-    return arm(task, f"{axis}, drawn", dataclasses.replace(most, randomize=(text,)))
+    return arm(task, f"{axis}, drawn", dataclasses.replace(largest_env, randomize=(text,)))
 
 
 def drawn_up_to(axis: str, trained: float) -> float:
-    """The largest dose that is drawn: twice the one that others are trained through, or the largest that is tested."""
+    """Return the largest drawn severity: twice the trained one, at most the largest tested one."""
     return min(2.0 * trained, AXES[axis].doses[-1])
 
 
 def designed(task: str) -> Drive:
-    """The paper's motor and supply under a designed loop."""
+    """Return the paper's motor and supply with a designed current loop."""
     return redesigned(named_actuator("paper", task), task)
 
 
 @functools.cache
 def matched(task: str, axis: str) -> Arm:
-    """Trained through one dose of one thing."""
+    """Return the arm trained at a fixed severity of one axis."""
     return arm(task, axis, AXES[axis].at(task, AXES[axis].trained[task]))
 
 
-def dosed(arm: Arm, axis: str, dose: float) -> Trial:
-    """Policies tested on a dose."""
-    return Trial(arm, f"{axis} {dose:g}", AXES[axis].at(arm.task, dose))
+def trial_at(arm: Arm, axis: str, severity: float) -> Trial:
+    """Return the test of an arm's policies at a severity."""
+    return Trial(arm, f"{axis} {severity:g}", AXES[axis].at(arm.task, severity))
 
 
-def undosed(arm: Arm, axis: str) -> Trial:
-    """Policies tested on none of it: on ideal forces, or on the axis' motor."""
-    return dosed(arm, axis, 0.0) if AXES[axis].own_motor else at_home(arm)
+def trial_at_zero(arm: Arm, axis: str) -> Trial:
+    """Return the test of an arm's policies at severity 0: on ideal forces or the axis' motor."""
+    return trial_at(arm, axis, 0.0) if AXES[axis].own_motor else at_home(arm)

@@ -1,9 +1,9 @@
-"""What was looked at beyond the plan: more tests of the study's policies, tabulated and concluded from with care."""
+"""Exploratory tests of the study's policies, which its plan does not have."""
 
 import dataclasses
 
 from actuator_study import arms
-from actuator_study.arms import dosed, otherwise
+from actuator_study.arms import trial_at, with_fields
 from actuator_study.questions import on_loop, through_loop
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.doses import AXES, SECONDS, ideal, posed, supply, timestep
@@ -11,52 +11,49 @@ from codrl_mj.study.trials import Trial
 from codrl_mj.tasks import find_task
 
 
-def wound_up(task: str, dose: float) -> EnvConfig:
-    """A supply that comes short, under a loop whose integrator goes on while the voltage saturates."""
-    return otherwise(supply(task, dose), controller__anti_windup="none")
+def wound_up(task: str, severity: float) -> EnvConfig:
+    """Return an environment with too low a supply and no anti-windup in its current loop."""
+    return with_fields(supply(task, severity), controller__anti_windup="none")
 
 
 def windup() -> dict[str, list[tuple[Trial, Trial]]]:
-    """Task -> ideal-trained policies on every dose of the supply, with anti-windup and without."""
+    """Return tests at all supply severities with and without anti-windup, by task."""
     return {
         task: [
             (
-                dosed(ideal(task), "supply", dose),
-                Trial(ideal(task), f"supply {dose:g}, winding up", wound_up(task, dose)),
+                trial_at(ideal(task), "supply", severity),
+                Trial(ideal(task), f"supply {severity:g}, winding up", wound_up(task, severity)),
             )
-            for dose in AXES["supply"].doses[1:]
+            for severity in AXES["supply"].doses[1:]
         ]
         for task in SECONDS
     }
 
 
 def paper_loops(task: str) -> dict[str, EnvConfig]:
-    """The paper's motor and loop otherwise than the paper has them, by name.
+    """Return variants of the paper's motor and loop, by name.
 
     The integration step is varied for motor and mechanics alike. The study's is a tenth of the
-    policy's step, the paper's the whole of it.
+    policy's step, the paper's is the whole step.
     """
     nominal, step = posed(task, "paper"), find_task(task).step_duration
     motor = nominal.actuator.motor
     return {
-        "feed-forward 0": otherwise(nominal, controller__kff=0.0),
-        "feed-forward R": otherwise(nominal, controller__kff=motor.resistance),
-        "half the arm": otherwise(nominal, motor__arm_radius=0.5 * motor.arm_radius),
-        "twice the arm": otherwise(nominal, motor__arm_radius=2.0 * motor.arm_radius),
+        "feed-forward 0": with_fields(nominal, controller__kff=0.0),
+        "feed-forward R": with_fields(nominal, controller__kff=motor.resistance),
+        "half the arm": with_fields(nominal, motor__arm_radius=0.5 * motor.arm_radius),
+        "twice the arm": with_fields(nominal, motor__arm_radius=2.0 * motor.arm_radius),
         "step of the policy": dataclasses.replace(nominal, timestep=step),
         "step of a hundredth": dataclasses.replace(nominal, timestep=timestep(task) / 10.0),
     }
 
 
 def around_the_paper() -> dict[str, list[Trial]]:
-    """Column of a table -> policies on the paper's loop, and on what is otherwise; ideal-trained and trained on it."""
+    """Return tests on the paper's loop and its variants, by column of a table."""
     return {
         f"{task}, {name}": [
             on_loop(arm, "paper"),
-            *(
-                Trial(arm, f"paper, {otherwise}", env)
-                for otherwise, env in paper_loops(task).items()
-            ),
+            *(Trial(arm, f"paper, {variant}", env) for variant, env in paper_loops(task).items()),
         ]
         for task in arms.LOOPED
         for name, arm in (
@@ -67,10 +64,10 @@ def around_the_paper() -> dict[str, list[Trial]]:
 
 
 def explored() -> dict[str, Trial]:
-    """Every trial of the exploration once, by name; some are the plan's."""
+    """Return every explored trial once, by name; some also belong to the plan."""
     pairs = [pair for rows in windup().values() for pair in rows]
-    found = [
+    trials_explored = [
         *(trial for pair in pairs for trial in pair),
         *(t for column in around_the_paper().values() for t in column),
     ]
-    return {trial.name: trial for trial in found}
+    return {trial.name: trial for trial in trials_explored}

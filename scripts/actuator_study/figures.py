@@ -1,4 +1,4 @@
-"""The study's figures: dose and response, bars of what was trained on what, and what to do about an actuator."""
+"""Figures of the study: losses by severity, scores by training arm, and a map of verdicts."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from actuator_study import arms
-from actuator_study.units import THINGS, dose_text, size
+from actuator_study.units import THINGS, severity_text, size
 from codrl_mj.evaluation.measures import bootstrap_mean
 from codrl_mj.study.advice import (
     BUY,
@@ -25,7 +25,8 @@ from codrl_mj.study.pages import COLOURS, MARKERS, TITLES, legend, save
 from codrl_mj.study.questions import Scores
 from codrl_mj.study.trials import Trial
 
-_LOWEST = -0.1  # of the span; what is worse is as lost
+# Lowest score that is drawn, as a share of the span: worse policies are equally lost.
+_LOWEST = -0.1
 _REGIONS = {
     IDEAL: "#d9f0e3",
     RANDOMISE: "#dbe9f6",
@@ -36,13 +37,13 @@ _REGIONS = {
 
 
 def losses(path: Path, evidence: Evidence) -> bool:
-    """Draw what ideal-trained policies lose, a panel for each axis, a row for each task, a column for each dose.
+    """Draw the losses of ideal-trained policies: panel per axis, row per task, column per severity.
 
-    A cell has the mean loss, and below it how many policies lose more than `FAILED`, where any
-    does.
+    A cell shows the mean loss, and below it the share of policies that lose more than `FAILED`,
+    if there are any.
 
     Returns:
-        Whether anything could be drawn.
+        True if there was anything to draw.
     """
     from matplotlib.figure import Figure
 
@@ -52,10 +53,10 @@ def losses(path: Path, evidence: Evidence) -> bool:
     for number, (panel, (name, axis)) in enumerate(zip(panels, AXES.items(), strict=True)):
         means = np.full((len(SECONDS), len(axis.doses) - 1), np.nan)
         for row, task in enumerate(SECONDS):
-            for column, dose in enumerate(axis.doses[1:]):
-                if (found := evidence.loss(task, name, dose)) is None:
+            for column, severity in enumerate(axis.doses[1:]):
+                if (loss := evidence.loss(task, name, severity)) is None:
                     continue
-                outcome, drawn = found.outcome, True
+                outcome, drawn = loss.outcome, True
                 means[row, column] = outcome.loss.mean
                 text = f"{outcome.loss.mean:z.2f}" + (
                     f"\n{outcome.failed:.0%} fail" if outcome.failed else ""
@@ -65,7 +66,9 @@ def losses(path: Path, evidence: Evidence) -> bool:
         shown = panel.imshow(
             np.clip(means, 0.0, 1.0), cmap="YlOrBr", vmin=0.0, vmax=1.0, aspect="auto"
         )
-        panel.set_xticks(range(len(axis.doses) - 1), [f"{dose:g}" for dose in axis.doses[1:]])
+        panel.set_xticks(
+            range(len(axis.doses) - 1), [f"{severity:g}" for severity in axis.doses[1:]]
+        )
         named = [f"{TITLES[task]}\n{size(task)}" for task in SECONDS]
         panel.set_yticks(range(len(SECONDS)), named if number % 3 == 0 else [], fontsize=8)
         panel.set(xlabel=axis.unit, title=THINGS[name].capitalize())
@@ -75,10 +78,10 @@ def losses(path: Path, evidence: Evidence) -> bool:
 
 
 def insured(path: Path, evidence: Evidence) -> bool:
-    """Draw what policies score at the doses that were trained through, by what they were trained on; every one a dot.
+    """Draw policies' scores at the trained severities as dots, grouped by training arm.
 
     Returns:
-        Whether anything could be drawn.
+        True if there was anything to draw.
     """
     from matplotlib.figure import Figure
 
@@ -92,23 +95,23 @@ def insured(path: Path, evidence: Evidence) -> bool:
     panels: Any = figure.subplots(2, 1, sharey=True)
     drawn = False
     for panel, task in zip(panels, arms.TRAINED, strict=True):
-        for place, (name, axis) in enumerate(AXES.items()):
+        for axis_index, (name, axis) in enumerate(AXES.items()):
             trained = {"drawn": f"{name}, drawn", "matched": name}
             for number, (kind, label) in enumerate(kinds.items()):
-                found = evidence.outcome(
+                outcome = evidence.outcome(
                     task, trained.get(kind, kind), f"{name} {axis.trained[task]:g}"
                 )
-                if found is not None:
+                if outcome is not None:
                     drawn = True
                     dots(
                         panel,
-                        place + 0.19 * (number - 1.5),
-                        1.0 - found.lost,
+                        axis_index + 0.19 * (number - 1.5),
+                        1.0 - outcome.lost,
                         COLOURS[number],
                         label,
                     )
         named = [
-            f"{thing} {dose_text(task, name, AXES[name].trained[task])}"
+            f"{thing} {severity_text(task, name, AXES[name].trained[task])}"
             for name, thing in THINGS.items()
         ]
         panel.set_xticks(range(len(AXES)), named)
@@ -122,43 +125,49 @@ def insured(path: Path, evidence: Evidence) -> bool:
 
 
 def dots(
-    panel: Any, at: float, scores: Sequence[float] | np.ndarray, colour: str, label: str
+    panel: Any, x: float, scores: Sequence[float] | np.ndarray, color: str, label: str
 ) -> None:
-    """Draw every policy's score as a dot, and a line at their mean; what is below the panel is drawn at its end."""
+    """Draw each policy's score as a dot and their mean as a line; clip scores below the panel."""
     clipped = np.sort(np.maximum(scores, _LOWEST))
     spread = np.linspace(-0.045, 0.045, len(clipped))
-    panel.plot(at + spread, clipped, ".", color=colour, markersize=3.5, alpha=0.7, label=label)
-    panel.plot([at - 0.06, at + 0.06], [np.mean(clipped)] * 2, color=colour, lw=1.5)
+    panel.plot(x + spread, clipped, ".", color=color, markersize=3.5, alpha=0.7, label=label)
+    panel.plot([x - 0.06, x + 0.06], [np.mean(clipped)] * 2, color=color, lw=1.5)
 
 
 def bars(
     path: Path, scores: Scores, groups: Mapping[str, Sequence[tuple[str, Trial]]], title: str
 ) -> None:
-    """Draw scores of trials in groups, every policy as a dot, and the mean with its 95 % interval.
+    """Draw scores of groups of trials: a dot per policy, and the mean with its 95 % interval.
 
     Args:
         path: SVG file.
         scores: of the study.
-        groups: name -> label and trial of each of its bars; the same label has the same colour.
-        title: above it.
+        groups: name -> label and trial of each bar; bars of the same label have the same color.
+        title: title above the figure.
     """
     from matplotlib.figure import Figure
 
-    labels = list(dict.fromkeys(label for each in groups.values() for label, _ in each))
+    labels = list(dict.fromkeys(label for group in groups.values() for label, _ in group))
     figure = Figure(figsize=(max(6.0, 1.2 + 1.5 * len(groups)), 3.9), layout="constrained")
     axes: Any = figure.subplots()
-    for place, each in enumerate(groups.values()):
-        for number, (label, trial) in enumerate(each):
+    for group_index, group in enumerate(groups.values()):
+        for number, (label, trial) in enumerate(group):
             values = _values(scores, trial)
             if values.size:
-                at = place + 0.8 * ((number + 0.5) / len(each) - 0.5)
+                x = group_index + 0.8 * ((number + 0.5) / len(group) - 0.5)
                 kind = labels.index(label)
-                colour, marker = COLOURS[kind % len(COLOURS)], MARKERS[kind % len(MARKERS)]
-                seen = np.maximum(values, _LOWEST)
+                color, marker = COLOURS[kind % len(COLOURS)], MARKERS[kind % len(MARKERS)]
+                clipped = np.maximum(values, _LOWEST)
+                # The dots stand beside the error bar so that they do not hide it.
                 axes.plot(
-                    np.full(len(seen), at + 0.06), seen, ".", color=colour, markersize=3, alpha=0.6
+                    np.full(len(clipped), x + 0.06),
+                    clipped,
+                    ".",
+                    color=color,
+                    markersize=3,
+                    alpha=0.6,
                 )
-                _bars(axes, np.array([at]), [bootstrap_mean(values)], colour, marker, label)
+                _bars(axes, np.array([x]), [bootstrap_mean(values)], color, marker, label)
     axes.set_xticks(range(len(groups)), groups)
     axes.set(ylabel="score [share of the span]", title=title, xlim=(-0.5, len(groups) - 0.5))
     axes.grid(axis="y", color="0.9")
@@ -168,18 +177,18 @@ def bars(
 
 
 def chart(path: Path, evidence: Evidence) -> bool:
-    """Draw what to do about an actuator that is late or short of voltage and nothing else, a panel for each task.
+    """Draw the verdicts for an actuator that only lags or lacks voltage, a panel for each task.
 
-    A task on which nothing was trained through one thing alone is hatched.
+    Tasks on which nothing was trained through a single axis are hatched.
 
     Returns:
-        Whether anything could be drawn: the results of a task are all there.
+        True if there was anything to draw: all results of a task are present.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    lags, lacks = np.geomspace(0.05, 8.0, 41), np.linspace(0.0, 0.8, 33)
+    lags, shortfalls = np.geomspace(0.05, 8.0, 41), np.linspace(0.0, 0.8, 33)
     tasks = [
         task
         for task in SECONDS
@@ -189,34 +198,41 @@ def chart(path: Path, evidence: Evidence) -> bool:
         return False
     figure = Figure(figsize=(10.0, 6.4), layout="constrained")
     panels: Any = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
-    none, seen = dict.fromkeys(AXES, 0.0), set[int]()
+    zero_severities, shown_regions = dict.fromkeys(AXES, 0.0), set[int]()
     for panel, task in zip(panels, tasks, strict=False):
         points = tests_through(evidence, task)
         regions = np.array(
             [
                 [
                     list(_REGIONS).index(
-                        decide(known(evidence, task, none | {"lag": lag, "supply": lack}, points))
+                        decide(
+                            known(
+                                evidence,
+                                task,
+                                zero_severities | {"lag": lag, "supply": shortfall},
+                                points,
+                            )
+                        )
                     )
                     for lag in lags
                 ]
-                for lack in lacks
+                for shortfall in shortfalls
             ]
         )
-        seen.update(regions.flat)
-        colours = ListedColormap(list(_REGIONS.values()))
+        shown_regions.update(regions.flat)
+        colors = ListedColormap(list(_REGIONS.values()))
         panel.pcolormesh(
             lags,
-            1.0 - lacks,
+            1.0 - shortfalls,
             regions,
-            cmap=colours,
+            cmap=colors,
             vmin=-0.5,
             vmax=len(_REGIONS) - 0.5,
             rasterized=True,
         )
         if task not in arms.TRAINED:
             panel.contourf(
-                lags, 1.0 - lacks, regions, levels=[0.5, 99], colors="none", hatches=["//"]
+                lags, 1.0 - shortfalls, regions, levels=[0.5, 99], colors="none", hatches=["//"]
             )
         panel.set(title=TITLES[task], xscale="log")
         panel.set_xticks([0.1, 0.3, 1.0, 3.0], ["0.1", "0.3", "1", "3"])
@@ -227,8 +243,8 @@ def chart(path: Path, evidence: Evidence) -> bool:
         )
     for panel in panels[::3]:
         panel.set_ylabel("voltage there is [needed voltage]")
-    shown = [one for number, one in enumerate(_REGIONS.items()) if number in seen]
-    handles = [Patch(facecolor=colour, edgecolor="0.6", label=name) for name, colour in shown]
+    shown = [region for number, region in enumerate(_REGIONS.items()) if number in shown_regions]
+    handles = [Patch(facecolor=color, edgecolor="0.6", label=name) for name, color in shown]
     handles.append(
         Patch(
             facecolor="white",
@@ -247,10 +263,10 @@ def _values(scores: Scores, trial: Trial) -> np.ndarray:
 
 
 def _bars(
-    axes: Any, places: np.ndarray, means: Sequence[Any], colour: str, marker: str, label: str
+    axes: Any, x: np.ndarray, means: Sequence[Any], color: str, marker: str, label: str
 ) -> None:
-    """Means with their intervals; what is below the figure is drawn at its edge."""
-    middle = np.maximum([one.mean for one in means], _LOWEST)
-    low = np.maximum(middle - np.maximum([one.low for one in means], _LOWEST), 0.0)
-    high = np.maximum(np.maximum([one.high for one in means], _LOWEST) - middle, 0.0)
-    axes.errorbar(places, middle, [low, high], fmt=marker, color=colour, ms=5, lw=1.2, label=label)
+    """Draw means with their intervals; clip values below the figure."""
+    middle = np.maximum([mean.mean for mean in means], _LOWEST)
+    low = np.maximum(middle - np.maximum([mean.low for mean in means], _LOWEST), 0.0)
+    high = np.maximum(np.maximum([mean.high for mean in means], _LOWEST) - middle, 0.0)
+    axes.errorbar(x, middle, [low, high], fmt=marker, color=color, ms=5, lw=1.2, label=label)

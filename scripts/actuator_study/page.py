@@ -1,4 +1,4 @@
-"""The study's page: the answer to each hypothesis that was written down before, and the figures."""
+"""Page of the study: the verdict on each preregistered hypothesis, and the figures."""
 
 import collections
 import itertools
@@ -18,7 +18,7 @@ from actuator_study.questions import (
     through_loop,
     through_motor,
 )
-from actuator_study.units import THINGS, dose_text, scale, short, size
+from actuator_study.units import THINGS, scale, severity_text, short, size
 from codrl_mj.runs.files import write_json
 from codrl_mj.study.advice import BUY, IDEAL, RANDOMISE, THROUGH
 from codrl_mj.study.doses import AXES, FLOORS, SECONDS, at_home, ideal
@@ -31,7 +31,7 @@ from codrl_mj.study.trials import FAILED, RUNS, TOTALS, Collected, Trial, run_ro
 PAGE, FOLDER = "actuators.md", "actuators"
 """The page, and the folder beside it with its figures and tables."""
 TRIALS, HYPOTHESES, ADVISED = "trials.csv", "hypotheses.csv", "advised.csv"
-"""A row for every trial, for every question, and for every actuator that advice was asked about."""
+"""Tables with a row for every trial, for every question, and for every actuator of `advise`."""
 QUESTIONS: Mapping[str, str] = {
     "matters": "When does an actuator matter?",
     "tune": "Tune or train?",
@@ -39,28 +39,31 @@ QUESTIONS: Mapping[str, str] = {
     "motors": "Motors that exist",
     "command": "What should the policy command and see?",
 }
-"""The questions by name."""
+"""Titles of the sections of questions, by name."""
 
 
 def write(collected: Collected, out: Path) -> list[Path]:
     """Write page, figures and tables.
 
     Args:
-        collected: of the study; whatever is missing is named on the page.
-        out: folder for the page.
+        collected: results of the study; missing ones are named on the page.
+        out: folder of the page.
 
     Returns:
-        The files that were written.
+        Files that were written.
     """
     folder, scores = (
         out / FOLDER,
         Scores(collected, FLOORS, [at_home(ideal(task)) for task in SECONDS]),
     )
-    first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
-    tables = write_tables(folder, collected, scores, first, others)
+    primary_verdicts, secondary_verdicts = (
+        judge(scores, primary(), primary=True),
+        judge(scores, secondary()),
+    )
+    tables = write_tables(folder, collected, scores, primary_verdicts, secondary_verdicts)
     evidence = Evidence.read(*(path for study in STUDIES if (path := out / study / RUNS).is_file()))
-    said = list(advised.rows(evidence))
-    write_csv(folder / ADVISED, said)
+    advice_rows = list(advised.rows(evidence))
+    write_csv(folder / ADVISED, advice_rows)
     drawn = _draw(scores, evidence, folder)
     parts = [
         "# What does an actuator cost?\n",
@@ -68,9 +71,9 @@ def write(collected: Collected, out: Path) -> list[Path]:
         _borne(evidence, drawn),
         _insured(drawn),
         _motors(evidence, drawn),
-        _advised(evidence, said, drawn),
-        _verdicts(first, others),
-        _secondary(others, drawn),
+        _advised(evidence, advice_rows, drawn),
+        _verdicts(primary_verdicts, secondary_verdicts),
+        _secondary(secondary_verdicts, drawn),
         _method(collected, scores),
         _missing(collected),
     ]
@@ -82,14 +85,17 @@ def write_tables(
     folder: Path,
     collected: Collected,
     scores: Scores,
-    first: Sequence[Verdict],
-    others: Sequence[Verdict],
+    primary_verdicts: Sequence[Verdict],
+    secondary_verdicts: Sequence[Verdict],
 ) -> list[Path]:
-    """Write a row for every policy and test, for every trial and for every question, and what the trainings took."""
+    """Write the tables: policies by test, trials, questions, and the cost of the trainings."""
     tables = {
         RUNS: run_rows(collected, scores.of),
         TRIALS: trial_rows(collected, scores.of),
-        HYPOTHESES: (verdict.row(len(first)) for verdict in (*first, *others)),
+        HYPOTHESES: (
+            verdict.row(len(primary_verdicts))
+            for verdict in (*primary_verdicts, *secondary_verdicts)
+        ),
     }
     for name, table in tables.items():
         write_csv(folder / name, list(table))
@@ -98,12 +104,14 @@ def write_tables(
 
 
 def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
-    """The figures by name, of which there is something to draw."""
-    made = {"losses": figures.losses, "insured": figures.insured, "chart": figures.chart}
-    found = {
-        name: path for name, draw in made.items() if draw(path := folder / f"{name}.svg", evidence)
+    """Draw the figures; return their paths by name, without those that have no data."""
+    drawers = {"losses": figures.losses, "insured": figures.insured, "chart": figures.chart}
+    paths = {
+        name: path
+        for name, draw in drawers.items()
+        if draw(path := folder / f"{name}.svg", evidence)
     }
-    found |= {name: folder / f"{name}.svg" for name in ("tune", "motors")}
+    paths |= {name: folder / f"{name}.svg" for name in ("tune", "motors")}
     loops: dict[str, list[tuple[str, Trial]]] = {
         f"{TITLES[task]},\n{loop}": [
             ("ideal-trained", on_loop(ideal(task), loop)),
@@ -112,7 +120,7 @@ def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
         for task in arms.LOOPED
         for loop in ("weaker", "paper", "designed")
     }
-    figures.bars(found["tune"], scores, loops, "The paper's motor under three loops")
+    figures.bars(paths["tune"], scores, loops, "The paper's motor under three loops")
     motors: dict[str, list[tuple[str, Trial]]] = {}
     for task in SECONDS:
         home = ideal(task)
@@ -131,36 +139,39 @@ def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
                 else []
             ),
         ]
-    figures.bars(found["motors"], scores, motors, "Motors of the catalogue")
-    return found
+    figures.bars(paths["motors"], scores, motors, "Motors of the catalogue")
+    return paths
 
 
-def _figure(drawn: Mapping[str, Path], name: str, says: str) -> str:
-    return f"![{says}]({FOLDER}/{drawn[name].name})\n" if name in drawn else ""
+def _figure(drawn: Mapping[str, Path], name: str, caption: str) -> str:
+    return f"![{caption}]({FOLDER}/{drawn[name].name})\n" if name in drawn else ""
 
 
 def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
-    """A table of what ideal-trained policies bear in a task's own units, and the map of all losses."""
+    """Return the section on tolerated severities, in a task's units, with the map of all losses."""
     rows = []
     for task in SECONDS:
         rows.append([f"{TITLES[task]}: {size(task)}"])
         for name, axis in AXES.items():
             known = [
-                (dose, one.outcome)
-                for dose in axis.doses[1:]
-                if (one := evidence.loss(task, name, dose))
+                (severity, loss.outcome)
+                for severity in axis.doses[1:]
+                if (loss := evidence.loss(task, name, severity))
             ]
-            borne = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].spared, known)]
-            hurt = next(((dose, one) for dose, one in known if one.hurt), None)
-            factor, of = scale(task, name)
-            text = f"≤{short(factor * borne[-1] if borne else 0.0)}"
+            # Only severities below the first harmful one count, whatever follows.
+            harmless = [
+                severity for severity, _ in itertools.takewhile(lambda pair: pair[1].spared, known)
+            ]
+            hurt = next(((severity, outcome) for severity, outcome in known if outcome.hurt), None)
+            factor, unit_text = scale(task, name)
+            text = f"≤{short(factor * harmless[-1] if harmless else 0.0)}"
             if hurt is not None:
                 text += (
-                    f", ≥{short(factor * hurt[0])} {of}"
+                    f", ≥{short(factor * hurt[0])} {unit_text}"
                     f" ({round(hurt[1].failed * len(hurt[1].lost))})"
                 )
             else:
-                text += f" {of}"
+                text += f" {unit_text}"
             rows[-1].append(text if known else "–")
     return f"""## What policies bear
 
@@ -181,7 +192,10 @@ def _insured(drawn: Mapping[str, Path]) -> str:
     if "insured" not in drawn:
         return ""
     rows = [
-        [TITLES[task], *(dose_text(task, name, axis.trained[task]) for name, axis in AXES.items())]
+        [
+            TITLES[task],
+            *(severity_text(task, name, axis.trained[task]) for name, axis in AXES.items()),
+        ]
         for task in arms.TRAINED
     ]
     return f"""## Train through it, or randomise?
@@ -197,14 +211,15 @@ is tested on Pendulum, and 0.8 of its two steps of delay; on Furuta four times t
 
 
 def _motors(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
-    """A row for every motor and task: what policies lose on it, with those that fail and success."""
+    """Return the section on motors: for each motor and task, loss, failures and success."""
     rows = []
     for task in SECONDS:
         for test, (name, _) in advised.tested(task).items():
             if test.endswith("motor"):
-                told = advised.measured(evidence, task, test)
+                prospects = advised.measured(evidence, task, test)
                 cells = [
-                    _lost(told[kind].most) if kind in told else "–" for kind in (IDEAL, THROUGH)
+                    _lost(prospects[kind].most) if kind in prospects else "–"
+                    for kind in (IDEAL, THROUGH)
                 ]
                 rows.append([TITLES[task], name, test.removesuffix(" motor"), *cells])
     header = ["task", "motor, gear", "", "trained on ideal forces", "trained through it"]
@@ -234,38 +249,42 @@ def _lost(outcome: Outcome | None) -> str:
 
 
 def _advised(
-    evidence: Evidence, said: Sequence[Mapping[str, Any]], drawn: Mapping[str, Path]
+    evidence: Evidence, advice_rows: Sequence[Mapping[str, Any]], drawn: Mapping[str, Path]
 ) -> str:
-    """What `codrl-mj advise` says of every actuator that was tested, and how far off it is."""
-    if not said:
+    """Return the section on the accuracy of `codrl-mj advise` on every tested actuator."""
+    if not advice_rows:
         return ""
     rows = []
-    for one in said:
-        if one["judged"] != "right":
+    for row in advice_rows:
+        if row["judged"] != "right":
             numbers = (
-                f"{'≥ ' * one['beyond']}{one['predicted_mean']:z.2f}",
-                f"{one['measured_mean']:z.2f}",
+                f"{'≥ ' * row['beyond']}{row['predicted_mean']:z.2f}",
+                f"{row['measured_mean']:z.2f}",
             )
             rows.append(
-                [TITLES[one["task"]], one["actuator"], *numbers, one["said"], one["measured"]]
+                [TITLES[row["task"]], row["actuator"], *numbers, row["said"], row["measured"]]
             )
-    errors = [abs(one["predicted_mean"] - one["measured_mean"]) for one in said]
+    errors = [abs(row["predicted_mean"] - row["measured_mean"]) for row in advice_rows]
     large = [
-        error for error, one in zip(errors, said, strict=True) if one["measured_mean"] > MARGIN
+        error
+        for error, row in zip(errors, advice_rows, strict=True)
+        if row["measured_mean"] > MARGIN
     ] or [0.0]
-    told = [one["judged"] for one in said]
-    right = collections.Counter(one["said"] for one in said if one["judged"] == "right")
+    judgments = [row["judged"] for row in advice_rows]
+    right = collections.Counter(row["said"] for row in advice_rows if row["judged"] == "right")
     never = [
         f"*{verdict}*"
         for verdict in (RANDOMISE, THROUGH, BUY)
-        if verdict not in {one["said"] for one in said}
+        if verdict not in {row["said"] for row in advice_rows}
     ]
     left = advised.left_out(evidence)
     header = ["task", "actuator", "predicted", "measured", "advise says", "measurement says"]
-    text = f"""Of {len(told)} actuators that none of the doses was taken from, `codrl-mj advise` ([how](../advise.md))
-was right about {told.count("right")} ({", ".join(f"{count} times *{one}*" for one, count in right.most_common())}) and
-wrong about {told.count("wrong")}, without what was measured on the one it is asked about. For
-{told.count("says nothing")} it says to measure, and for {told.count("not tested")} what was not tested. It never said
+    text = f"""Of {len(judgments)} actuators that none of the doses was taken from, `codrl-mj advise`
+([how](../advise.md)) was right about {judgments.count("right")}
+({", ".join(f"{count} times *{verdict}*" for verdict, count in right.most_common())}) and wrong about
+{judgments.count("wrong")}, without what was measured on the one it is asked about. For
+{judgments.count("says nothing")} it says to measure, and for
+{judgments.count("not tested")} what was not tested. It never said
 {", ".join(never)}: these are untested. All that are not right:"""
     return f"""## What `advise` says, and how right it is
 
@@ -280,34 +299,36 @@ lost. Of {left["doses"]} doses, each predicted from its neighbours, {left["off"]
 
 
 def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
-    """The primary hypotheses, one row each, and what those are worth that hold."""
+    """Return the section on the primary hypotheses, a row each, with a comment on their worth."""
     rows = []
     for verdict in verdicts:
-        says = verdict.question.statement.replace(_EACH, " *")
+        statement = verdict.question.statement.replace(_EACH, " *")
         if (
             verdict.outcome == "open"
             and (seeds := verdict.seeds_to_close(len(verdicts))) is not None
         ):
-            says += f" (about {seeds} seeds would tell)"
-        tested, wanted = verdict.strata
-        if tested < wanted:
-            says += f" ({tested} of {wanted} comparisons have runs)"
+            statement += f" (about {seeds} seeds would tell)"
+        tested, planned = verdict.strata
+        if tested < planned:
+            statement += f" ({tested} of {planned} comparisons have runs)"
         rows.append(
             [
                 verdict.question.name,
                 verdict.outcome,
                 effect_text(verdict),
                 p_text(verdict.corrected),
-                says,
+                statement,
             ]
         )
     header = ["", "holds", "effect [95 %]", "corrected p", "says"]
     wrong = [
-        one
-        for one in others
-        if " 25 % over nominal" in one.question.statement.replace("-", "").replace("+", "")
+        verdict
+        for verdict in others
+        if " 25 % over nominal" in verdict.question.statement.replace("-", "").replace("+", "")
     ]
-    sizes = [abs(one.effect.mean) for one in wrong if not np.isnan(one.effect.mean)] or [0.0]
+    sizes = [
+        abs(verdict.effect.mean) for verdict in wrong if not np.isnan(verdict.effect.mean)
+    ] or [0.0]
     return f"""## The twelve hypotheses
 
 {markdown_table(header, rows)}
@@ -320,37 +341,43 @@ over {len(wrong)} cases, the largest {np.max(sizes):.3f}. P6, P7, P8, P11 and P1
 
 
 _EACH = ": policies trained through it score higher on it than policies trained on ideal forces"
-"""What six of the hypotheses say."""
+"""Common ending of the statements of six hypotheses."""
 
 
 def effect_text(verdict: Verdict) -> str:
-    """A difference of scores with its interval."""
+    """Format a difference of scores with its interval."""
     mean, low, high = verdict.effect
     return "–" if np.isnan(mean) else f"{mean:+.3f} [{low:+.3f}, {high:+.3f}]"
 
 
 def p_text(value: float) -> str:
-    """A probability, to three digits."""
+    """Format a p-value with three digits."""
     if np.isnan(value):
         return "–"
     return "<0.001" if value < 0.001 else f"{value:.3f}"
 
 
 def decided_table(verdicts: Sequence[Verdict], titles: Mapping[str, str]) -> str:
-    """How many comparisons of each section, by its title, were decided, of those that were judged."""
+    """Return a table of each section's comparisons: how many were judged and how many decided."""
     rows = []
     for name, title in titles.items():
-        mine = [one for one in verdicts if one.question.section == name and not np.isnan(one.p)]
-        decided = [verdict for verdict in mine if verdict.outcome != "open"]
-        beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
-        rows.append([title, *map(str, (len(mine), len(decided), beyond))])
+        judged = [
+            verdict
+            for verdict in verdicts
+            if verdict.question.section == name and not np.isnan(verdict.p)
+        ]
+        decided = [verdict for verdict in judged if verdict.outcome != "open"]
+        beyond = sum(
+            verdict.effect.low > MARGIN or verdict.effect.high < -MARGIN for verdict in decided
+        )
+        rows.append([title, *map(str, (len(judged), len(decided), beyond))])
     return markdown_table(
         ["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"], rows, numbers=3
     )
 
 
 def _secondary(verdicts: Sequence[Verdict], drawn: Mapping[str, Path]) -> str:
-    """How many of each question's secondary comparisons were decided, what was explored, and the figure of loops."""
+    """Return the section on secondary comparisons, with the figure of current loops."""
     return f"""## The other comparisons
 
 With a false discovery rate of 5 %, and by how much by the 95 % interval:
@@ -385,7 +412,7 @@ def _missing(collected: Collected) -> str:
 
 def _method(collected: Collected, scores: Scores) -> str:
     grid, totals = collected.grid, collected.totals
-    done, wanted = totals.trainings, len(grid.cells)
+    num_trained, num_planned = totals.trainings, len(grid.cells)
     tested, tests = sum(map(len, collected.evaluations.values())), len(grid.deployments)
     codes = (
         ", ".join(f"`{code}` ({count})" for code, count in sorted(totals.codes.items())) or "none"
@@ -394,9 +421,10 @@ def _method(collected: Collected, scores: Scores) -> str:
         f"{task} {FLOORS[task]:g} to {ceiling:.1f}" for task, ceiling in scores.ceilings.items()
     ]
     runs = max(len(grid.seeds_of(grid.arms[0])), 2)
-    about = f"""By [the plan](plan.md): {done} of {wanted} trainings ({totals.seconds / 3600:.1f} hours of one core) and
-{tested} of {tests} tests; code with its runs: {codes}. `scripts/study_actuators.py` ([how](../studies.md)) writes this
-page, [hypotheses]({FOLDER}/{HYPOTHESES}), [trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}) and
+    about = f"""By [the plan](plan.md): {num_trained} of {num_planned} trainings
+({totals.seconds / 3600:.1f} hours of one core) and {tested} of {tests} tests; code with its runs: {codes}.
+`scripts/study_actuators.py` ([how](../studies.md)) writes this page,
+[hypotheses]({FOLDER}/{HYPOTHESES}), [trials]({FOLDER}/{TRIALS}), [runs]({FOLDER}/{RUNS}) and
 [advised]({FOLDER}/{ADVISED}). `examples/recompute.py` recomputes the conclusions without this package."""
     text = f"""A score is the mean return over {grid.episodes} test episodes in shares of the span: 0 is what random
 actions get on ideal forces, 1 what ideal-trained policies get there on the mean ({"; ".join(known) or "none yet"}).
@@ -406,7 +434,9 @@ count once on every task. Intervals are by Student's t, p of permutation tests, 
 with a margin of {MARGIN:g}; primary ones are corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds
 a difference of {detectable(runs, LEVEL / 12):.2f} standard deviations is found with a chance of 80 % at the strictest
 level."""
+    # Links may be longer than a line and must not be broken.
     wrapped = (
-        textwrap.fill(" ".join(each.split()), 120, break_long_words=False) for each in (about, text)
+        textwrap.fill(" ".join(paragraph.split()), 120, break_long_words=False)
+        for paragraph in (about, text)
     )
     return "## How it was measured\n\n" + "\n\n".join(wrapped) + "\n"

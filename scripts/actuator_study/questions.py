@@ -1,4 +1,4 @@
-"""The hypotheses of the study, as they were written down before it: docs/results/plan.md has them in words."""
+"""Hypotheses of the study, as preregistered; docs/results/plan.md states them in words."""
 
 import dataclasses
 import functools
@@ -12,10 +12,10 @@ from actuator_study.arms import (
     LOOPED,
     MARGINAL,
     TRAINED,
-    dosed,
     matched,
-    otherwise,
-    undosed,
+    trial_at,
+    trial_at_zero,
+    with_fields,
 )
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
@@ -25,14 +25,14 @@ from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
 
 
-def _trained_dose(arm: Arm, axis: str) -> Trial:
-    return dosed(arm, axis, AXES[axis].trained[arm.task])
+def _trained_trial(arm: Arm, axis: str) -> Trial:
+    return trial_at(arm, axis, AXES[axis].trained[arm.task])
 
 
-def _contrasts(axis: str, one: Any, other: Any) -> tuple[Contrast, ...]:
-    """At the axis' trained dose, on every task: arms made by functions of the task."""
+def _contrasts(axis: str, arm_of: Any, reference_arm_of: Any) -> tuple[Contrast, ...]:
+    """Return the contrasts at the axis' trained severity between two arms of each task."""
     return tuple(
-        Contrast(_trained_dose(one(task), axis), _trained_dose(other(task), axis))
+        Contrast(_trained_trial(arm_of(task), axis), _trained_trial(reference_arm_of(task), axis))
         for task in TRAINED
     )
 
@@ -43,26 +43,26 @@ def _generic(task: str) -> Arm:
 
 
 def on_loop(arm: Arm, loop: str) -> Trial:
-    """Policies tested on the paper's motor under a loop."""
+    """Return the test of an arm's policies on the paper's motor under a current loop."""
     return Trial(
         arm, loop, posed(arm.task, arms.designed(arm.task) if loop == "designed" else loop)
     )
 
 
 def through_loop(task: str, loop: str) -> Arm:
-    """Trained on the paper's motor under a loop."""
+    """Return the arm trained on the paper's motor under a current loop."""
     return arm(task, loop, posed(task, arms.designed(task) if loop == "designed" else loop))
 
 
 def on_motor(arm: Arm, kind: str) -> Trial:
-    """Policies tested on a motor of the catalogue."""
+    """Return the test of an arm's policies on a motor of the catalogue."""
     chosen = {"good": GOOD, "marginal": MARGINAL}[kind]
     return Trial(arm, f"{kind} motor", posed(arm.task, chosen[arm.task]))
 
 
-def through_motor(task: str, otherwise: str = "", **changes: Any) -> Arm:
-    """Trained through the marginal motor of the catalogue, with changes that have a name."""
-    named = ", ".join(filter(None, ["marginal motor", otherwise]))
+def through_motor(task: str, label: str = "", **changes: Any) -> Arm:
+    """Return the arm trained through the marginal motor, with labeled changes to it."""
+    named = ", ".join(filter(None, ["marginal motor", label]))
     return arm(task, named, posed(task, MARGINAL[task], **changes))
 
 
@@ -71,18 +71,20 @@ WRONG: dict[str, tuple[str, float]] = {
     for name in ("resistance", "inductance")
     for factor in (0.5, 0.75, 0.9, 1.1, 1.25, 1.5)
 }
-"""What of the motor is otherwise than in training, by what factor. A torque constant that the loop
-does not know of is an axis of its own, `weakness`.
+"""Label -> motor parameter that differs from the trained one, and by what factor.
+
+A torque constant that the loop does not know is the axis `weakness`.
 """
 
 
 def wrong_motors(task: str) -> dict[str, EnvConfig]:
-    """The actuator `weaker`, otherwise than trained through, by name: `WRONG`, and shares of the largest force."""
+    """Return environments whose actuator differs from the trained `weaker`, by name."""
     nominal, step, force = (
         posed(task, "weaker"),
         find_task(task).step_duration,
         find_task(task).max_force,
     )
+    # Pushes and friction are given as shares of the task's largest force.
     motor = nominal.actuator.motor
 
     def pushed(share: float) -> EnvConfig:
@@ -96,19 +98,19 @@ def wrong_motors(task: str) -> dict[str, EnvConfig]:
 
     noise = 0.2 * motor.arm_radius * force / motor.torque_constant  # A
     return {
-        name: otherwise(nominal, **{f"motor__{field}": getattr(motor, field) * factor})
+        name: with_fields(nominal, **{f"motor__{field}": getattr(motor, field) * factor})
         for name, (field, factor) in WRONG.items()
     } | {
         "friction 5 %": rubbed(0.05),
         "friction 20 %": rubbed(0.2),
-        "current noise 20 %": otherwise(nominal, controller__current_noise=noise),
+        "current noise 20 %": with_fields(nominal, controller__current_noise=noise),
         "pulses 25 %": pushed(0.25),
         "pulses 50 %": pushed(0.5),
     }
 
 
 def identified(task: str) -> Arm:
-    """Trained on what an identification leaves open: R within 2 %, L within 10 %, for every episode anew."""
+    """Return the arm trained on what identification leaves open: R within 2 %, L within 10 %."""
     nominal = posed(task, "weaker")
     motor = nominal.actuator.motor
 
@@ -130,7 +132,7 @@ def _mean_wrong(task: str, names: Iterable[str]) -> list[Contrast]:
 
 @functools.cache
 def primary() -> list[Question]:
-    """The twelve that are corrected together."""
+    """Return the twelve primary questions, whose p-values are corrected together."""
     numbered = enumerate(AXES, start=1)
     quarter = [name for name in WRONG if name.endswith("25 %")]
     return [
@@ -140,6 +142,8 @@ def primary() -> list[Question]:
                 "matters",
                 f"{AXES[axis].title}: policies trained through it score higher on it than policies"
                 " trained on ideal forces",
+                # `axis=axis` binds the loop variable now; a plain closure would see the last
+                # axis.
                 _contrasts(axis, lambda task, axis=axis: matched(task, axis), ideal),
             )
             for number, axis in numbered
@@ -147,7 +151,7 @@ def primary() -> list[Question]:
         Question(
             "P7",
             "matters",
-            "Over all six: training through the very actuator scores higher than generic"
+            "Over all six: training through the same actuator scores higher than generic"
             " robustification as the plan has it",
             tuple(
                 pair
@@ -158,7 +162,7 @@ def primary() -> list[Question]:
         Question(
             "P8",
             "matters",
-            "Over four: policies trained on drawn doses score as high as those trained on the very"
+            "Over four: policies trained on drawn doses score as high as those trained on the same"
             " dose",
             tuple(
                 pair
@@ -218,76 +222,97 @@ def primary() -> list[Question]:
 
 @functools.cache
 def secondary() -> list[Question]:
-    """All others, by section; each is one contrast."""
-    found: list[tuple[str, str, Trial, Trial]] = []
+    """Return all secondary questions by section; each is one contrast."""
+    contrasts: list[tuple[str, str, Trial, Trial]] = []
     for task in SECONDS:
         home = ideal(task)
         for axis, described in AXES.items():
-            for dose in described.doses[1:]:
-                says = f"{task}, ideal-trained: {axis} {dose:g} over none"
-                found.append(("matters", says, dosed(home, axis, dose), undosed(home, axis)))
+            for severity in described.doses[1:]:
+                statement = f"{task}, ideal-trained: {axis} {severity:g} over none"
+                contrasts.append(
+                    (
+                        "matters",
+                        statement,
+                        trial_at(home, axis, severity),
+                        trial_at_zero(home, axis),
+                    )
+                )
     for task in TRAINED:
         for axis in AXES:
             through, generic = matched(task, axis), _generic(task)
-            for one, other in ((through, ideal(task)), (through, generic), (generic, ideal(task))):
-                pair = _trained_dose(one, axis), _trained_dose(other, axis)
-                found.append(("matters", f"{pair[0].name}, over {other.name}", *pair))
+            for trained, reference in (
+                (through, ideal(task)),
+                (through, generic),
+                (generic, ideal(task)),
+            ):
+                pair = _trained_trial(trained, axis), _trained_trial(reference, axis)
+                contrasts.append(("matters", f"{pair[0].name}, over {reference.name}", *pair))
         for axis in DRAWN:
             pair = (
-                _trained_dose(arms.drawn(task, axis), axis),
-                _trained_dose(matched(task, axis), axis),
+                _trained_trial(arms.drawn(task, axis), axis),
+                _trained_trial(matched(task, axis), axis),
             )
-            found.append(("matters", f"{task}, {axis}: drawn over matched", *pair))
+            contrasts.append(("matters", f"{task}, {axis}: drawn over matched", *pair))
     for task in LOOPED:
         home, nominal, open_ = ideal(task), through_loop(task, "weaker"), identified(task)
         for loop in ("weaker", "paper", "designed"):
-            says = f"{task}, {loop} loop: trained through it over ideal-trained"
-            found.append(
-                ("tune", says, on_loop(through_loop(task, loop), loop), on_loop(home, loop))
+            statement = f"{task}, {loop} loop: trained through it over ideal-trained"
+            contrasts.append(
+                ("tune", statement, on_loop(through_loop(task, loop), loop), on_loop(home, loop))
             )
-        says = f"{task}: designed loop over the paper's, ideal-trained"
-        found.append(("tune", says, on_loop(home, "designed"), on_loop(home, "paper")))
+        statement = f"{task}: designed loop over the paper's, ideal-trained"
+        contrasts.append(("tune", statement, on_loop(home, "designed"), on_loop(home, "paper")))
         for name, env in wrong_motors(task).items():
-            there = Trial(nominal, name, env)
-            found.append(
-                ("wrong", f"{task}, {name} over nominal", there, on_loop(nominal, "weaker"))
+            wrong_trial = Trial(nominal, name, env)
+            contrasts.append(
+                ("wrong", f"{task}, {name} over nominal", wrong_trial, on_loop(nominal, "weaker"))
             )
-            found.append(
-                ("wrong", f"{task}, {name}: drawn over nominal", Trial(open_, name, env), there)
+            contrasts.append(
+                (
+                    "wrong",
+                    f"{task}, {name}: drawn over nominal",
+                    Trial(open_, name, env),
+                    wrong_trial,
+                )
             )
     for task in SECONDS:
         home = ideal(task)
-        found.append(
+        contrasts.append(
             ("motors", f"{task}: good motor over ideal", on_motor(home, "good"), at_home(home))
         )
     for task in MARGINAL:
-        there = on_motor(ideal(task), "marginal")
-        found.append(("motors", f"{task}: marginal motor over ideal", there, at_home(ideal(task))))
-        says = f"{task}, marginal motor: trained through it over ideal-trained"
-        found.append(("motors", says, on_motor(through_motor(task), "marginal"), there))
-    told = [
+        marginal_trial = on_motor(ideal(task), "marginal")
+        contrasts.append(
+            ("motors", f"{task}: marginal motor over ideal", marginal_trial, at_home(ideal(task)))
+        )
+        statement = f"{task}, marginal motor: trained through it over ideal-trained"
+        contrasts.append(
+            ("motors", statement, on_motor(through_motor(task), "marginal"), marginal_trial)
+        )
+    observing_arms = [
         through_motor(task, "current and reference observed", observe_actuator=True)
         for task in TRAINED
     ]
-    # on Pendulum the marginal drive's current limit would bind the torque arm alone
-    for arm_told in (*told, through_motor("furuta", "voltage", action="voltage")):
-        plain = on_motor(through_motor(arm_told.task), "marginal")
-        found.append(
+    # On Pendulum the current limit of the marginal drive would bind only the arm with torque
+    # commands, so only Furuta is trained with voltage commands.
+    for command_arm in (*observing_arms, through_motor("furuta", "voltage", action="voltage")):
+        torque_trial = on_motor(through_motor(command_arm.task), "marginal")
+        contrasts.append(
             (
                 "command",
-                f"{arm_told.name}, over torque and no more",
-                on_motor(arm_told, "marginal"),
-                plain,
+                f"{command_arm.name}, over torque and no more",
+                on_motor(command_arm, "marginal"),
+                torque_trial,
             )
         )
     return [
-        Question(f"S{number}", section, says, (Contrast(one, other),))
-        for number, (section, says, one, other) in enumerate(found, start=1)
+        Question(f"S{number}", section, statement, (Contrast(trial, reference),))
+        for number, (section, statement, trial, reference) in enumerate(contrasts, start=1)
     ]
 
 
 @functools.cache
 def trials() -> tuple[Trial, ...]:
-    """Every trial of the study once."""
+    """Return every trial of the study once."""
     pairs = [pair for question in (*primary(), *secondary()) for pair in question.contrasts]
     return tuple({trial.name: trial for pair in pairs for trial in pair}.values())

@@ -1,4 +1,4 @@
-"""The study of what an actuator costs, as a program: its grid, and what it writes."""
+"""Command line of the study of the cost of an actuator: its grid of runs, and its outputs."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -16,10 +16,10 @@ from codrl_mj.study.trials import Grid
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ActuatorStudy(Program):
-    """Run the study of what an actuator costs, or go on with it, and write its page: docs/studies.md.
+    """Run or resume the study of the cost of an actuator, and write its page: docs/studies.md.
 
-    What is finished is not computed again, so the same command resumes a study, adds seeds to it,
-    and writes its page anew. Example: python scripts/study_actuators.py --dry-run, or with --tasks
+    Finished results are not computed again, so the same command resumes a study, adds seeds, and
+    rewrites its page. Example: python scripts/study_actuators.py --dry-run, or with --tasks
     pendulum --seeds 3 --jobs 2
     """
 
@@ -32,7 +32,7 @@ class ActuatorStudy(Program):
     episodes: int = integer(50, least=1)
     """Test episodes of every policy."""
     total_steps: int | None = integer(None, least=1)
-    """Environment steps of every training, for trying things out; None: the agents' own budgets."""
+    """Environment steps of every training, for quick trials; None: the agents' own budgets."""
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -41,15 +41,15 @@ class ActuatorStudy(Program):
 
     @property
     def grid(self) -> Grid:
-        """Its trainings and tests."""
+        """Trainings and tests of the study."""
         every = {trial.name: trial for trial in trials()} | explored()
         chosen = [trial for trial in every.values() if trial.arm.task in self.tasks]
         if self.total_steps is not None:
-            for place, trial in enumerate(chosen):
+            for index, trial in enumerate(chosen):
                 short = dataclasses.replace(
                     trial.arm.config, total_steps=self.total_steps, total_episodes=None
                 )
-                chosen[place] = dataclasses.replace(
+                chosen[index] = dataclasses.replace(
                     trial, arm=dataclasses.replace(trial.arm, config=short)
                 )
         return Grid(
@@ -57,6 +57,6 @@ class ActuatorStudy(Program):
         )
 
     def write(self) -> tuple[Iterable[Path], Mapping[str, str]]:
-        """The page of all results that there are, and what failed."""
+        """Write the page of all existing results; return its files and the failures."""
         collected = self.grid.collect()
         return write(collected, self.out), collected.failures

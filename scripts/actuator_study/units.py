@@ -1,4 +1,4 @@
-"""Doses in the units of a task: milliseconds, newton metres, percent; and what they are of."""
+"""Severities in the units of a task, such as milliseconds and newton meters."""
 
 from collections.abc import Mapping
 
@@ -12,16 +12,16 @@ THINGS: Mapping[str, str] = {
     "friction": "friction",
     "noise": "noise",
 }
-"""What the doses of each axis are of, in the order of `AXES`."""
+"""Axis -> name of its quantity on the page, in the order of `AXES`."""
 
 
 def unit(task: str) -> str:
-    """Of a task's force."""
+    """Return the unit of a task's force."""
     return "N" if task in ("cartpole", "mountain_car", "mountain_car_continuous") else "N·m"
 
 
 def scale(task: str, axis: str) -> tuple[float, str]:
-    """What a dose is to be multiplied by, and its unit then."""
+    """Return the factor from a severity to a physical quantity, and its unit."""
     if axis in ("lag", "delay"):
         return 1000.0 * find_task(task).step_duration, "ms"
     return (
@@ -30,18 +30,18 @@ def scale(task: str, axis: str) -> tuple[float, str]:
 
 
 def short(value: float) -> str:
-    """A number to two digits."""
+    """Format a number with two significant digits."""
     return f"{float(f'{value:.2g}'):g}"
 
 
-def dose_text(task: str, axis: str, dose: float) -> str:
-    """A dose in the units of a task."""
-    factor, of = scale(task, axis)
-    return f"{short(factor * dose)} {of}"
+def severity_text(task: str, axis: str, severity: float) -> str:
+    """Format a severity in the units of a task."""
+    factor, unit_text = scale(task, axis)
+    return f"{short(factor * severity)} {unit_text}"
 
 
 def size(task: str) -> str:
-    """What doses of a task are shares of: its policy's step and its largest force."""
+    """Format the scales of a task's severities: the policy's step and the largest force."""
     return (
         f"{1000 * find_task(task).step_duration:g} ms, {find_task(task).max_force:g} {unit(task)}"
     )

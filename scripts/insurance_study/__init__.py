@@ -1,1 +1,1 @@
-"""The study of what insures a policy against actuators that nobody has measured: docs/results/insurance_plan.md."""
+"""Study of protecting a policy from unmeasured actuators: docs/results/insurance_plan.md."""

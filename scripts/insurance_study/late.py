@@ -1,7 +1,7 @@
-"""An actuator of the study's own: a lag that remembers commands for four steps of the policy, and can show them.
+"""Custom actuator of the study: a lag that stores and can show commands of four policy steps.
 
-The package's `Lag` remembers eight integration steps, which is less than the delays that are drawn
-here. What it does is the same: a test holds one against the other.
+The package's `Lag` stores eight integration steps, which is less than the delays of the study.
+Otherwise both do the same, and a test compares them.
 """
 
 import dataclasses
@@ -12,11 +12,11 @@ from codrl_mj.actuators import ActuatorModel, Inputs
 from codrl_mj.fields import real
 
 LONGEST = 4
-"""The longest delay, and the commands that are shown, in steps of the policy."""
+"""Maximum delay, and number of shown commands, in steps of the policy."""
 
 
 class State(NamedTuple):
-    """The delivered torque [N*m], integration steps since the policy chose, and its commands, the newest first."""
+    """Torque [N*m], integration steps since the last command, and commands, newest first."""
 
     torque: float
     since: float
@@ -28,7 +28,7 @@ class State(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """The last commands, the newest first, in shares of the largest."""
+    """The last commands, newest first, as shares of the largest."""
 
     command_1: float
     command_2: float
@@ -39,12 +39,13 @@ class Signals(NamedTuple):
 def advance(
     parameters: Any, timestep: float, state: State, inputs: Inputs
 ) -> tuple[State, float, Signals]:
-    """As `codrl_mj.actuators.lag.advance`, of commands that are held for `held` steps."""
+    """Do the same as `codrl_mj.actuators.lag.advance`, with commands that last `held` steps."""
     newest, since = inputs.desired_torque, state.since
     commands = (newest, state.c1, state.c2, state.c3, state.c4)
     if since == 0.0:
         commands = (newest, state.c0, state.c1, state.c2, state.c3)
     steps = parameters.delay / timestep
+    # 1e-9 absorbs the rounding of delay / timestep.
     whole = math.floor(steps + 1e-9)
     fraction = steps - whole if steps - whole > 1e-9 else 0.0
     near = min(max(math.ceil((whole - since) / parameters.held - 1e-9), 0), 4)
@@ -54,9 +55,12 @@ def advance(
         math.exp(-timestep / parameters.time_constant) if parameters.time_constant > 0.0 else 0.0
     )
     torque = arrived + (state.torque - arrived) * decay
+    # The state stores floats, so the counter is compared halfway between two steps.
     later = since + 1.0 if since + 1.5 < parameters.held else 0.0
-    one = parameters.largest
-    shown = Signals(commands[0] / one, commands[1] / one, commands[2] / one, commands[3] / one)
+    largest = parameters.largest
+    shown = Signals(
+        commands[0] / largest, commands[1] / largest, commands[2] / largest, commands[3] / largest
+    )
     return (
         State(torque, later, commands[0], commands[1], commands[2], commands[3], commands[4]),
         torque,
@@ -70,13 +74,13 @@ def observe(
     signals: Signals,
     inputs: Inputs,  # noqa: ARG001
 ) -> tuple[float, float, float, float]:
-    """The last commands: what a policy could have kept for itself."""
+    """Return the last commands, which a policy could also have stored itself."""
     return signals.command_1, signals.command_2, signals.command_3, signals.command_4
 
 
 @dataclasses.dataclass(frozen=True)
 class Late(ActuatorModel):
-    """Strength, lag and delay, with `observe_actuator` showing the last four commands.
+    """Gain, lag and delay, whose last four commands are shown with `observe_actuator`.
 
     Raises:
         ValueError: a field is out of bounds.
@@ -93,14 +97,14 @@ class Late(ActuatorModel):
     delay: float = real(0.0, least=0.0, unit="s")
     """Delay of the command [s], >= 0, at most `LONGEST` steps of the policy."""
     gain: float = real(1.0, above=0.0)
-    """What of the torque is delivered in the end, > 0."""
+    """Share of the desired torque that is delivered in steady state, > 0."""
     held: float = real(10.0, least=1.0)
-    """Integration steps to a step of the policy, >= 1."""
+    """Number of integration steps per policy step, >= 1."""
     largest: float = real(1.0, above=0.0, unit="N*m")
-    """The torque [N*m] that a shown command of one stands for, > 0."""
+    """Torque [N*m] at which a shown command is 1, > 0."""
 
     def check(self, timestep: float) -> None:
-        """Refuse a delay longer than what is remembered.
+        """Raise an error if the delay is longer than the stored commands.
 
         Raises:
             ValueError: the delay is more than `LONGEST` steps of the policy.

@@ -1,4 +1,4 @@
-"""The page of what insures a policy: a table and a figure of all kinds of training, and the verdicts."""
+"""Page of the study: a table and a figure of all kinds of training, and the verdicts."""
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +17,7 @@ from actuator_study.page import (
     p_text,
     write_tables,
 )
-from actuator_study.units import THINGS, dose_text
+from actuator_study.units import THINGS, severity_text
 from codrl_mj.study.doses import AXES, FLOORS, at_home, ideal
 from codrl_mj.study.pages import (
     COLOURS,
@@ -34,94 +34,94 @@ from codrl_mj.study.trials import FAILED, RUNS, Collected, Trial
 from codrl_mj.tasks import find_task
 from insurance_study.learning import LEARNING, learning_rows, still_rising
 from insurance_study.questions import (
-    DOSES,
     KINDS,
     REMEMBERED,
+    SEVERITIES,
     TASKS,
     home,
     primary,
     reach,
     secondary,
-    under,
+    trial_at,
 )
 
 PAGE, FOLDER, FIGURE = "insurance.md", "insurance", "insured.svg"
 """The page, the folder beside it with its figure and tables, and the figure."""
-SAYS: Mapping[str, str] = {
+KIND_NAMES: Mapping[str, str] = {
     "ideal": "ideal forces",
-    "matched": "the very dose",
-    "drawn": "the very thing, drawn (without delay, friction)",
-    "remembering": "the very dose, seeing its last commands (lag, delay alone)",
+    "matched": "the same dose",
+    "drawn": "the same thing, drawn (without delay, friction)",
+    "remembering": "the same dose, seeing its last commands (lag, delay alone)",
     "random": "random actuators",
     "half": "random actuators, half the reach",
     "double": "random actuators, twice the reach",
     "pushes": "random pushes alone",
     "strength": "random strength alone",
 }
-"""What policies of each kind were trained on."""
+"""Kind of training -> name on the page."""
 PLANNED = 20
-"""Policies of every kind, without which nothing is judged."""
+"""Number of policies of every kind that a verdict needs."""
 _AXES: Mapping[str, Sequence[str]] = {"drawn": DRAWN, "remembering": REMEMBERED}
 
 
 _SHOWN: Mapping[str, str] = {
     "ideal": "ideal forces",
-    "matched": "the very dose",
+    "matched": "the same dose",
     "drawn": "drawn",
     "random": "random",
     "double": "random, twice",
 }
-"""Kinds that stand beside each other for every thing, and the columns' names."""
+"""Kinds that are compared for every axis -> column name."""
 
 
-class Found(NamedTuple):
-    """What policies of a kind came to in some tests, a number for each policy and test."""
+class Summary(NamedTuple):
+    """Results of a kind of policies in some tests, a value for each policy and test."""
 
     scores: np.ndarray
     success: np.ndarray
 
     @property
     def text(self) -> str:
-        """Mean, median, how many fail, success."""
+        """Mean, median, number of failures, and success."""
         return (
-            self._told(f", {np.median(self.scores):z.2f}", f" of {self.scores.size}")
+            self._format(f", {np.median(self.scores):z.2f}", f" of {self.scores.size}")
             if self.scores.size
             else "–"
         )
 
     @property
     def short(self) -> str:
-        """Mean, how many fail, success."""
-        return self._told("", "") if self.scores.size else "–"
+        """Mean, number of failures, and success."""
+        return self._format("", "") if self.scores.size else "–"
 
-    def _told(self, median: str, tests: str) -> str:
+    def _format(self, median: str, tests: str) -> str:
         failed, success = np.sum(self.scores < 1.0 - FAILED), np.mean(self.success)
         return f"{np.mean(self.scores):z.2f}{median}; {failed}{tests}; {100 * success:.0f} %"
 
 
-def found(collected: Collected, scores: Scores, trials: Iterable[Trial]) -> Found:
-    """Of every policy in every trial."""
-    both: list[tuple[float, float]] = []
+def summarize(collected: Collected, scores: Scores, trials: Iterable[Trial]) -> Summary:
+    """Summarize the results of every policy in every trial."""
+    pairs: list[tuple[float, float]] = []
     for trial in trials:
         success = collected.scores(trial, "success")
-        both += [(score, success.get(seed, np.nan)) for seed, score in scores.of(trial).items()]
-    values = np.reshape(both, (-1, 2))
-    return Found(values[:, 0], values[:, 1])
+        pairs += [(score, success.get(seed, np.nan)) for seed, score in scores.of(trial).items()]
+    values = np.reshape(pairs, (-1, 2))
+    return Summary(values[:, 0], values[:, 1])
 
 
 def write(collected: Collected, out: Path) -> list[Path]:
-    """Write page, figure and tables; whatever is missing is named on the page.
+    """Write page, figures and tables; missing results are named on the page.
 
     Returns:
-        The files that were written.
+            Files that were written.
     """
     folder, scores = (
         out / FOLDER,
         Scores(collected, FLOORS, [at_home(ideal(task)) for task in TASKS]),
     )
-    first = judge(scores, primary(), primary=True, least=PLANNED)
-    others = judge(scores, secondary(), least=PLANNED)
-    tables = write_tables(folder, collected, scores, first, others)
+    primary_verdicts = judge(scores, primary(), primary=True, least=PLANNED)
+    secondary_verdicts = judge(scores, secondary(), least=PLANNED)
+    tables = write_tables(folder, collected, scores, primary_verdicts, secondary_verdicts)
     spans = {task: ceiling - FLOORS[task] for task, ceiling in scores.ceilings.items()}
     learned = learning_rows(collected, folder / LEARNING)
     write_csv(folder / LEARNING, learned)
@@ -132,8 +132,8 @@ def write(collected: Collected, out: Path) -> list[Path]:
         _things(collected, scores),
         _kinds(collected, scores),
         f"![Scores by what policies were trained on]({FOLDER}/{FIGURE})\n",
-        _verdicts(first, scores),
-        _secondary(others),
+        _verdicts(primary_verdicts, scores),
+        _secondary(secondary_verdicts),
         _method(collected, *still_rising(learned, spans, MARGIN)),
     ]
     write_page(out / PAGE, parts)
@@ -141,7 +141,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
 
 
 def _things(collected: Collected, scores: Scores) -> str:
-    """A table a task, a row for every thing: what policies of the kinds that an owner chooses between come to there."""
+    """Return a table for each task: a row for each axis, results of the kinds to choose from."""
     tables = []
     for task in TASKS:
         rows = []
@@ -149,18 +149,25 @@ def _things(collected: Collected, scores: Scores) -> str:
             kinds = {
                 kind: KINDS[kind](task, axis) for kind in _SHOWN if axis in _AXES.get(kind, AXES)
             }
-            there = {
-                kind: found(collected, scores, [under(trained, axis)])
+            summaries = {
+                kind: summarize(collected, scores, [trial_at(trained, axis)])
                 for kind, trained in kinds.items()
             }
-            means = {kind: np.mean(one.scores) for kind, one in there.items() if one.scores.size}
-            far = {"lag": "", "delay": "", "weakness": "±"}  # what random actuators draw
+            means = {
+                kind: np.mean(summary.scores)
+                for kind, summary in summaries.items()
+                if summary.scores.size
+            }
+            # Random actuators draw these axes; the weakness may go both ways.
+            drawn_axes = {"lag": "", "delay": "", "weakness": "±"}
             drawn_to = (
-                f" ({far[axis]}{dose_text(task, axis, reach(task, axis))})" if axis in far else ""
+                f" ({drawn_axes[axis]}{severity_text(task, axis, reach(task, axis))})"
+                if axis in drawn_axes
+                else ""
             )
-            cells = [f"{thing} {dose_text(task, axis, DOSES[task][axis])}{drawn_to}"]
+            cells = [f"{thing} {severity_text(task, axis, SEVERITIES[task][axis])}{drawn_to}"]
             for kind in _SHOWN:
-                text = there[kind].short.replace(" ", "\u00a0") if kind in there else "–"
+                text = summaries[kind].short.replace(" ", "\u00a0") if kind in summaries else "–"
                 cells.append(
                     f"**{text}**" if kind in means and means[kind] == max(means.values()) else text
                 )
@@ -170,7 +177,7 @@ def _things(collected: Collected, scores: Scores) -> str:
     text = f"""Look for what is most like yours. Mean score, 1 being ideal-trained policies on ideal forces and 0 random
 actions; how many of {PLANNED} policies fail, by losing more than {FAILED:g}; how often episodes succeed. The highest
 mean is bold. *Random* actuators draw strength, lag and delay for every episode, and push; they reach as far as is said
-in brackets, or twice as far. *The very dose* is what it is tested on; *drawn* is that one thing alone, from none
+in brackets, or twice as far. *The same dose* is what it is tested on; *drawn* is that one thing alone, from none
 to twice as much, of forces and voltages at most 70 %. Forces are shares of the largest one, or N·m; voltages are shares
 of [what the task needs](plan.md#doses)."""
     return f"""## What each kind of training comes to
@@ -182,15 +189,17 @@ of [what the task needs](plan.md#doses)."""
 
 def _kinds(collected: Collected, scores: Scores) -> str:
     rows = []
-    for kind, says in SAYS.items():
-        cells = [says]
+    for kind, name in KIND_NAMES.items():
+        cells = [name]
         for task in TASKS:
             axes = list(_AXES.get(kind, AXES))
-            there = [under(KINDS[kind](task, axis), axis) for axis in axes]
-            at = {trial.name: trial for axis in axes for trial in [home(KINDS[kind](task, axis))]}
-            lost = found(collected, scores, at.values()).scores
-            cells.append(f"{np.mean(lost):z.2f}" if lost.size else "–")
-            cells.append(found(collected, scores, there).text)
+            tests = [trial_at(KINDS[kind](task, axis), axis) for axis in axes]
+            home_trials = {
+                trial.name: trial for axis in axes for trial in [home(KINDS[kind](task, axis))]
+            }
+            home_scores = summarize(collected, scores, home_trials.values()).scores
+            cells.append(f"{np.mean(home_scores):z.2f}" if home_scores.size else "–")
+            cells.append(summarize(collected, scores, tests).text)
         rows.append(cells)
     header = [
         "trained on",
@@ -205,11 +214,12 @@ failed, a policy's on a dose each; success. The six hide much: compare rows abov
 
 
 def draw(path: Path, scores: Scores) -> None:
-    """Draw what policies score at the trained doses, a panel a task, by what they were trained on; every one a dot."""
+    """Draw the scores at the trained severities, a panel for each task, a dot for each policy."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 8.4), layout="constrained")
     panels: Any = figure.subplots(len(TASKS), 1, sharey=True)
+    # Kind -> index of its color.
     shown = {
         "ideal": 0,
         "random": 1,
@@ -217,24 +227,25 @@ def draw(path: Path, scores: Scores) -> None:
         "matched": 3,
         "remembering": 4,
         "pushes": 5,
-    }  # colours of the kinds
+    }
     for panel, task in zip(panels, TASKS, strict=True):
-        for place, axis in enumerate(AXES):
-            for number, kind in enumerate(kind for kind in SAYS if kind in shown):
+        for axis_index, axis in enumerate(AXES):
+            for number, kind in enumerate(kind for kind in KIND_NAMES if kind in shown):
                 if axis in _AXES.get(kind, AXES):
-                    values = list(scores.of(under(KINDS[kind](task, axis), axis)).values())
+                    values = list(scores.of(trial_at(KINDS[kind](task, axis), axis)).values())
                     if values:
                         dots(
                             panel,
-                            place + 0.14 * (number - 2.5),
+                            axis_index + 0.14 * (number - 2.5),
                             values,
                             COLOURS[shown[kind]],
-                            SAYS[kind],
+                            KIND_NAMES[kind],
                         )
-        doses = [
-            f"{thing} {dose_text(task, name, DOSES[task][name])}" for name, thing in THINGS.items()
+        severities = [
+            f"{thing} {severity_text(task, name, SEVERITIES[task][name])}"
+            for name, thing in THINGS.items()
         ]
-        panel.set_xticks(range(len(AXES)), doses)
+        panel.set_xticks(range(len(AXES)), severities)
         panel.set(title=TITLES[task], ylabel="score [share of the span]")
         panel.grid(axis="y", color="0.9")
         panel.set_axisbelow(True)
@@ -245,17 +256,17 @@ def draw(path: Path, scores: Scores) -> None:
 def _verdicts(verdicts: Sequence[Verdict], scores: Scores) -> str:
     rows = []
     for verdict in verdicts:
-        says = verdict.question.statement
-        tested, wanted = verdict.strata
-        if tested < wanted:
-            says += f" ({tested} of {wanted} comparisons have runs)"
+        statement = verdict.question.statement
+        tested, planned = verdict.strata
+        if tested < planned:
+            statement += f" ({tested} of {planned} comparisons have runs)"
         judged = [
             verdict.outcome,
             effect_text(verdict),
             _by_task(verdict, scores),
             p_text(verdict.corrected),
         ]
-        rows.append([verdict.question.name, *judged, str(min(verdict.runs)), says])
+        rows.append([verdict.question.name, *judged, str(min(verdict.runs)), statement])
     header = ["", "holds", "effect [95 %]", "by task", "corrected p", "policies", "says"]
     return f"""## The ten hypotheses
 
@@ -268,7 +279,7 @@ _TASKS = ", ".join(TITLES[task] for task in TASKS)
 
 
 def _by_task(verdict: Verdict, scores: Scores) -> str:
-    """The mean effect on each task, of the contrasts that have runs."""
+    """Return the mean effect on each task, over the contrasts that have runs."""
     texts = []
     for task in TASKS:
         pairs = [
@@ -284,8 +295,8 @@ def _by_task(verdict: Verdict, scores: Scores) -> str:
 
 
 def _secondary(verdicts: Sequence[Verdict]) -> str:
-    titles = {one.question.section: one.question.section for one in verdicts}
-    if all(np.isnan(one.p) for one in verdicts):
+    titles = {verdict.question.section: verdict.question.section for verdict in verdicts}
+    if all(np.isnan(verdict.p) for verdict in verdicts):
         return f"The {len(verdicts)} others, each of one task, are not judged yet either.\n"
     return f"""Others, each of one task, with a false discovery rate of 5 %:
 
@@ -293,10 +304,14 @@ def _secondary(verdicts: Sequence[Verdict]) -> str:
 
 
 def _method(collected: Collected, rising: Sequence[str], count: int) -> str:
-    totals, wanted = collected.totals, len(collected.grid.cells)
-    done, tests = sum(map(len, collected.evaluations.values())), len(collected.grid.deployments)
-    text = f"""By [the plan](insurance_plan.md), scores and tests as in [what an actuator costs](actuators.md). {done}
-of {tests} tests of {wanted} policies are there ({totals.seconds / 3600:.1f} hours of one core at hand).
+    totals, num_planned = collected.totals, len(collected.grid.cells)
+    num_tested, num_tests = (
+        sum(map(len, collected.evaluations.values())),
+        len(collected.grid.deployments),
+    )
+    text = f"""By [the plan](insurance_plan.md), scores and tests as in [what an actuator costs](actuators.md).
+{num_tested} of {num_tests} tests of {num_planned} policies are there
+({totals.seconds / 3600:.1f} hours of one core at hand).
 `scripts/study_insurance.py` ([how](../studies.md)) writes this page, [every
 policy]({FOLDER}/{RUNS}), [trials]({FOLDER}/{TRIALS}) with medians and
 failures, [every comparison]({FOLDER}/{HYPOTHESES}), and [what was returned in tenths of the

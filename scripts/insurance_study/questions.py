@@ -1,11 +1,11 @@
-"""Who is trained on what, and the hypotheses as they were written down before: docs/results/insurance_plan.md."""
+"""Training arms of the study, and its preregistered hypotheses: docs/results/insurance_plan.md."""
 
 import functools
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from actuator_study.arms import DRAWN
-from actuator_study.arms import drawn as drawn_doses
+from actuator_study.arms import drawn as drawn_severities
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.study.doses import AXES, arm, at_home, ideal, posed, timestep
@@ -15,29 +15,30 @@ from codrl_mj.tasks import find_task
 from insurance_study.late import Late
 
 TASKS = ("pendulum", "furuta", "acrobot")
-DOSES: Mapping[str, Mapping[str, float]] = {
-    task: {axis: one.trained[task] for axis, one in AXES.items()} for task in TASKS
+SEVERITIES: Mapping[str, Mapping[str, float]] = {
+    task: {axis: description.trained[task] for axis, description in AXES.items()} for task in TASKS
 }
-"""Task -> axis -> the dose that is trained through and tested: on Acrobot the smallest that surely
-hurts ideal-trained policies, or, where none does, the largest.
+"""Task -> axis -> severity that is trained and tested.
+
+On Acrobot it is the smallest that surely hurts ideal-trained policies, or else the largest.
 """
 HARMLESS: Mapping[str, Mapping[str, float]] = {
     "pendulum": {"lag": 0.5, "weakness": 0.0, "delay": 0.5},
     "furuta": {"lag": 0.25, "weakness": 0.1, "delay": 0.0},
     "acrobot": {"lag": 1.0, "weakness": 0.1, "delay": 1.0},
 }
-"""Task -> axis -> the largest dose that the page of the first study reads as harmless."""
+"""Task -> axis -> largest severity that is harmless on the page of the first study."""
 REMEMBERED = ("lag", "delay")
-"""The axes that a policy which sees its last commands is trained on."""
+"""Axes with policies that see their last commands."""
 
 
 def reach(task: str, axis: str) -> float:
-    """The largest dose that random actuators have: twice the harmless one, or the smallest that was tested."""
+    """Return random actuators' largest severity: twice the harmless or the smallest tested one."""
     return max(2.0 * HARMLESS[task][axis], AXES[axis].doses[1])
 
 
 def late(task: str, **fields: float) -> Late:
-    """The actuator of the random and of the remembering arms; without fields it is ideal."""
+    """Return the actuator of arms with random actuators or visible commands; default: ideal."""
     definition = find_task(task)
     return Late(
         held=round(definition.step_duration / timestep(task)),
@@ -48,62 +49,66 @@ def late(task: str, **fields: float) -> Late:
 
 @functools.cache
 def generic(
-    task: str, share: float = 1.0, named: str = "random", pushed: bool = True, late_too: bool = True
+    task: str,
+    share: float = 1.0,
+    name: str = "random",
+    with_pushes: bool = True,
+    with_lag_and_delay: bool = True,
 ) -> Arm:
-    """Trained on random strength, lag and delay, and random pushes: on a share of what the rule says."""
+    """Return the arm trained on random gain, lag, delay and pushes, at a share of their reach."""
     step, force = find_task(task).step_duration, find_task(task).max_force
-    most = {axis: share * reach(task, axis) for axis in ("lag", "weakness", "delay")}
-    drawn = {"gain": f"uniform({1 - most['weakness']:g}, {1 + most['weakness']:g})"}
-    if late_too:
+    reaches = {axis: share * reach(task, axis) for axis in ("lag", "weakness", "delay")}
+    drawn = {"gain": f"uniform({1 - reaches['weakness']:g}, {1 + reaches['weakness']:g})"}
+    if with_lag_and_delay:
         drawn |= {
-            "time_constant": f"uniform(0, {most['lag'] * step:g})",
-            "delay": f"uniform(0, {most['delay'] * step:g})",
+            "time_constant": f"uniform(0, {reaches['lag'] * step:g})",
+            "delay": f"uniform(0, {reaches['delay'] * step:g})",
         }
     pushes = Disturbances(
         pulse_force=0.25 * share * force, pulse_duration=step, pulse_interval=10 * step
     )
-    fields: dict[str, Any] = {"disturbances": pushes} if pushed else {}
-    return arm(task, named, posed(task, late(task), randomize=drawn, **fields))
+    fields: dict[str, Any] = {"disturbances": pushes} if with_pushes else {}
+    return arm(task, name, posed(task, late(task), randomize=drawn, **fields))
 
 
 @functools.cache
 def pushes(task: str) -> Arm:
-    """Trained on random pushes and nothing else."""
+    """Return the arm trained on random pushes only."""
     step, force = find_task(task).step_duration, find_task(task).max_force
     pushed = Disturbances(pulse_force=0.25 * force, pulse_duration=step, pulse_interval=10 * step)
     return arm(task, "random pushes alone", posed(task, disturbances=pushed))
 
 
 def strength(task: str) -> Arm:
-    """Trained on random strength and nothing else."""
-    return generic(task, named="random strength alone", pushed=False, late_too=False)
+    """Return the arm trained on random gains only."""
+    return generic(task, name="random strength alone", with_pushes=False, with_lag_and_delay=False)
 
 
 def half(task: str) -> Arm:
-    """Random actuators of half the reach."""
+    """Return the arm with random actuators of half the reach."""
     return generic(task, 0.5, "random, half")
 
 
 def double(task: str) -> Arm:
-    """Random actuators of twice the reach."""
+    """Return the arm with random actuators of twice the reach."""
     return generic(task, 2.0, "random, double")
 
 
 @functools.cache
 def through(task: str, axis: str) -> Arm:
-    """Trained through the dose of one thing."""
-    return arm(task, axis, AXES[axis].at(task, DOSES[task][axis]))
+    """Return the arm trained at the severity of one axis."""
+    return arm(task, axis, AXES[axis].at(task, SEVERITIES[task][axis]))
 
 
 @functools.cache
 def drawn(task: str, axis: str) -> Arm:
-    """Trained on doses of one thing that are drawn for every episode, from none to twice the trained one."""
-    return drawn_doses(task, axis, DOSES[task][axis])
+    """Return the arm trained on one axis' severities, drawn per episode up to twice its own."""
+    return drawn_severities(task, axis, SEVERITIES[task][axis])
 
 
-def remembered(task: str, axis: str, dose: float) -> EnvConfig:
-    """A lag or a delay under a policy that sees its last four commands."""
-    seconds = dose * find_task(task).step_duration
+def remembering_env(task: str, axis: str, severity: float) -> EnvConfig:
+    """Return an environment with a lag or a delay, whose policy sees its last four commands."""
+    seconds = severity * find_task(task).step_duration
     return posed(
         task,
         late(task, **{{"lag": "time_constant"}.get(axis, axis): seconds}),
@@ -113,30 +118,35 @@ def remembered(task: str, axis: str, dose: float) -> EnvConfig:
 
 @functools.cache
 def remembering(task: str, axis: str) -> Arm:
-    """Trained through the dose of one thing, seeing its last four commands."""
-    return arm(task, f"{axis}, remembering", remembered(task, axis, DOSES[task][axis]))
+    """Return the arm trained at the severity of one axis, seeing its last four commands."""
+    return arm(task, f"{axis}, remembering", remembering_env(task, axis, SEVERITIES[task][axis]))
 
 
-def under(arm: Arm, axis: str, dose: float | None = None) -> Trial:
-    """Policies on a dose of one thing; the one that is trained through, unless another is given."""
-    dose = DOSES[arm.task][axis] if dose is None else dose
+def trial_at(arm: Arm, axis: str, severity: float | None = None) -> Trial:
+    """Return the test of an arm's policies at a severity; the default is the trained one."""
+    severity = SEVERITIES[arm.task][axis] if severity is None else severity
     if arm.config.env.observe_actuator:
-        return Trial(arm, f"{axis} {dose:g}, remembering", remembered(arm.task, axis, dose))
-    return Trial(arm, f"{axis} {dose:g}", AXES[axis].at(arm.task, dose))
+        return Trial(
+            arm, f"{axis} {severity:g}, remembering", remembering_env(arm.task, axis, severity)
+        )
+    return Trial(arm, f"{axis} {severity:g}", AXES[axis].at(arm.task, severity))
 
 
 def home(arm: Arm) -> Trial:
-    """Policies on ideal forces."""
+    """Return the test of an arm's policies on ideal forces."""
     if arm.config.env.observe_actuator:
-        return Trial(arm, "ideal, remembering", remembered(arm.task, "lag", 0.0))
+        return Trial(arm, "ideal, remembering", remembering_env(arm.task, "lag", 0.0))
     return at_home(arm)
 
 
-def neighbours(task: str, axis: str) -> dict[str, float]:
-    """The doses below and above the trained one, of those that the first study tested; none is no dose."""
-    doses, at = AXES[axis].doses, AXES[axis].doses.index(DOSES[task][axis])
-    found = {"less": doses[at - 1], "more": doses[at + 1] if at + 1 < len(doses) else 0.0}
-    return {which: dose for which, dose in found.items() if dose}
+def neighbors(task: str, axis: str) -> dict[str, float]:
+    """Return the tested severities next to the trained one, as "less" and "more", without 0."""
+    severities, index = AXES[axis].doses, AXES[axis].doses.index(SEVERITIES[task][axis])
+    neighboring = {
+        "less": severities[index - 1],
+        "more": severities[index + 1] if index + 1 < len(severities) else 0.0,
+    }
+    return {side: severity for side, severity in neighboring.items() if severity}
 
 
 Kind = Callable[[str, str], Arm]
@@ -151,24 +161,31 @@ KINDS: Mapping[str, Kind] = {
     "pushes": lambda task, axis: pushes(task),  # noqa: ARG005
     "strength": lambda task, axis: strength(task),  # noqa: ARG005
 }
-"""Name -> (task, axis) -> what was trained."""
+"""Name -> function (task, axis) that returns the arm."""
 
 
 def pairs(
-    one: str, other: str, axes: Iterable[str] = AXES, tasks: Iterable[str] = TASKS
+    kind: str, reference_kind: str, axes: Iterable[str] = AXES, tasks: Iterable[str] = TASKS
 ) -> tuple[Contrast, ...]:
-    """Two kinds at the trained doses."""
+    """Return the contrasts of two kinds at the trained severities."""
     return tuple(
-        Contrast(under(KINDS[one](task, axis), axis), under(KINDS[other](task, axis), axis))
+        Contrast(
+            trial_at(KINDS[kind](task, axis), axis),
+            trial_at(KINDS[reference_kind](task, axis), axis),
+        )
         for task in tasks
         for axis in axes
     )
 
 
-def at_homes(one: str, axes: Iterable[str], tasks: Iterable[str] = TASKS) -> tuple[Contrast, ...]:
-    """What a kind scores on ideal forces, over what ideal-trained policies do."""
+def home_contrasts(
+    kind: str, axes: Iterable[str], tasks: Iterable[str] = TASKS
+) -> tuple[Contrast, ...]:
+    """Return the contrasts of a kind with ideal-trained policies, both on ideal forces."""
     return tuple(
-        Contrast(home(KINDS[one](task, axis)), home(ideal(task))) for task in tasks for axis in axes
+        Contrast(home(KINDS[kind](task, axis)), home(ideal(task)))
+        for task in tasks
+        for axis in axes
     )
 
 
@@ -177,14 +194,14 @@ COMPARED: Mapping[str, tuple[str, str, tuple[str, ...], str]] = {
         "matched",
         "random",
         tuple(AXES),
-        "training through the very dose scores higher than random actuators",
+        "training through the same dose scores higher than random actuators",
     ),
     "I2": ("random", "ideal", tuple(AXES), "random actuators score higher than ideal forces"),
     "I5": (
         "drawn",
         "random",
         DRAWN,
-        "doses of the very thing, drawn, score higher than random actuators",
+        "doses of the same thing, drawn, score higher than random actuators",
     ),
     "I6": (
         "random",
@@ -212,81 +229,90 @@ COMPARED: Mapping[str, tuple[str, str, tuple[str, ...], str]] = {
     ),
     "I10": ("double", "random", tuple(AXES), "random actuators of twice the reach score higher"),
 }
-"""Hypothesis -> kind, other kind, axes, what it says: at the trained doses, pooled over axes and tasks."""
+"""Hypothesis -> kind, reference kind, axes, statement: at the trained severities, pooled."""
 AT_HOME: Mapping[str, tuple[str, tuple[str, ...], str]] = {
     "I3": ("random", ("lag",), "on ideal forces random actuators cost nothing"),
     "I4": ("matched", tuple(AXES), "on ideal forces training through one thing costs nothing"),
 }
-"""Hypothesis -> kind, axes, what it says: equivalence."""
+"""Hypothesis -> kind, axes, statement: equivalence."""
 
 
 @functools.cache
 def primary() -> list[Question]:
-    """The ten that are corrected together."""
+    """Return the ten primary questions, whose p-values are corrected together."""
     better = [
-        Question(name, "insured", says, pairs(one, other, axes))
-        for name, (one, other, axes, says) in COMPARED.items()
+        Question(name, "insured", statement, pairs(kind, reference, axes))
+        for name, (kind, reference, axes, statement) in COMPARED.items()
     ]
     equal = [
-        Question(name, "home", says, at_homes(kind, axes), "equivalent")
-        for name, (kind, axes, says) in AT_HOME.items()
+        Question(name, "home", statement, home_contrasts(kind, axes), "equivalent")
+        for name, (kind, axes, statement) in AT_HOME.items()
     ]
-    return sorted(better + equal, key=lambda one: int(one.name[1:]))
+    return sorted(better + equal, key=lambda kind: int(kind.name[1:]))
 
 
 @functools.cache
 def secondary() -> list[Question]:
-    """All others, each of one task: each axis by itself, other doses, and what each kind costs at home."""
-    found: list[tuple[str, str, tuple[Contrast, ...]]] = []
+    """Return all secondary questions, each on a single task, in sections."""
+    parts: list[tuple[str, str, tuple[Contrast, ...]]] = []
     every, at_home_too = (
         tuple(AXES),
         (("matched", tuple(AXES)), ("drawn", DRAWN), ("remembering", REMEMBERED)),
     )
     for task in TASKS:
-        found += [
-            ("insured", f"{task}, {axis}: {one} over {other}", pairs(one, other, [axis], [task]))
-            for one, other, axes, _ in COMPARED.values()
+        parts += [
+            (
+                "insured",
+                f"{task}, {axis}: {kind} over {reference}",
+                pairs(kind, reference, [axis], [task]),
+            )
+            for kind, reference, axes, _ in COMPARED.values()
             for axis in axes
         ]
-        found += [
-            ("home", f"{task}, ideal forces: {one} over ideal", at_homes(one, ["lag"], [task]))
-            for one in ("random", "half", "double", "pushes", "strength")
-        ]
-        found += [
+        parts += [
             (
                 "home",
-                f"{task}, ideal forces: {axis}, {one} over ideal",
-                at_homes(one, [axis], [task]),
+                f"{task}, ideal forces: {kind} over ideal",
+                home_contrasts(kind, ["lag"], [task]),
             )
-            for one, axes in at_home_too
+            for kind in ("random", "half", "double", "pushes", "strength")
+        ]
+        parts += [
+            (
+                "home",
+                f"{task}, ideal forces: {axis}, {kind} over ideal",
+                home_contrasts(kind, [axis], [task]),
+            )
+            for kind, axes in at_home_too
             for axis in axes
         ]
-        for one, axes in (("random", every), ("matched", every), ("drawn", DRAWN)):
+        for kind, axes in (("random", every), ("matched", every), ("drawn", DRAWN)):
             for axis in axes:
-                for which, dose in neighbours(task, axis).items():
+                for side, severity in neighbors(task, axis).items():
                     pair = Contrast(
-                        under(KINDS[one](task, axis), axis, dose), under(ideal(task), axis, dose)
+                        trial_at(KINDS[kind](task, axis), axis, severity),
+                        trial_at(ideal(task), axis, severity),
                     )
-                    found.append(
+                    parts.append(
                         (
                             "other doses",
-                            f"{task}, {axis} {dose:g} ({which}): {one} over ideal",
+                            f"{task}, {axis} {severity:g} ({side}): {kind} over ideal",
                             (pair,),
                         )
                     )
-    return [Question(f"S{number}", *one) for number, one in enumerate(found, start=1)]
+    return [Question(f"S{number}", *kind) for number, kind in enumerate(parts, start=1)]
 
 
 @functools.cache
 def trials() -> tuple[Trial, ...]:
-    """Every trial of the study once, those of the first study's arms among them."""
-    both = [pair for question in (*primary(), *secondary()) for pair in question.contrasts]
+    """Return every trial of the study once, including those of the first study's arms."""
+    contrasts = [pair for question in (*primary(), *secondary()) for pair in question.contrasts]
     homes = [Contrast(at_home(ideal(task)), at_home(ideal(task))) for task in TASKS]
-    return tuple({trial.name: trial for pair in (*both, *homes) for trial in pair}.values())
+    return tuple({trial.name: trial for pair in (*contrasts, *homes) for trial in pair}.values())
 
 
-def new(trial: Trial) -> bool:
-    """Whether its policies are none of the first study's."""
+def needs_new_policies(trial: Trial) -> bool:
+    """Return True if the first study did not train the trial's policies."""
     known = {"ideal", *AXES, *(f"{axis}, drawn" for axis in DRAWN)}
     kind = trial.arm.name.partition(": ")[2]
     return kind != "ideal" and (trial.arm.task == "acrobot" or kind not in known)

@@ -1,1 +1,1 @@
-"""The paper's experiments done again: every arm over seeds, every reported number judged, every figure redrawn."""
+"""Reproduction of the paper: arms over seeds, verdicts on reported numbers, redrawn figures."""

@@ -1,4 +1,4 @@
-"""The arms of the paper's experiments: who learns what on which motor, with the settings that the paper prints."""
+"""Training arms of the paper's experiments, with the motors and settings that the paper prints."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -12,31 +12,31 @@ from codrl_mj.tasks import find_task
 from codrl_mj.training import TrainConfig
 
 TEST, CENTRE = "test", "centre"
-"""Tests of a trained policy: the task as Gymnasium poses it; CartPole's with the reward that it was trained with."""
+"""Tests of a trained policy: Gymnasium's task; for CartPole also with its training reward."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PaperArm(Arm):
-    """One of the paper's experiments, or the same without a motor or on Gymnasium's own equations."""
+    """Experiment of the paper, or the same without a motor or with Gymnasium's own equations."""
 
     settings: str
-    """Of the agent: `paper` or `repaired`."""
+    """Settings of the agent: `paper` or `repaired`."""
     motor: str
-    """What the arm is called for its actuator, such as `ideal`."""
+    """Name of the actuator in the arm's name, such as `ideal`."""
 
     @property
     def actuator(self) -> Any:
-        """What it learns, and is tested, on."""
+        """Actuator of the arm's trainings and tests."""
         return self.config.actuator
 
     @property
     def physics(self) -> str:
-        """`mujoco`, or `analytic`: Gymnasium's own equations."""
+        """`mujoco`, or `analytic` for Gymnasium's own equations."""
         return self.config.env.physics
 
     @property
     def gains(self) -> str:
-        """The controller's gains as text."""
+        """Controller gains as text."""
         if self.actuator == IDEAL:
             return "no motor"
         loop = self.actuator.controller
@@ -45,14 +45,14 @@ class PaperArm(Arm):
 
     @property
     def trials(self) -> dict[str, Trial]:
-        """The tests of its policies, by name."""
+        """Tests of the arm's policies, by name."""
         envs = {TEST: EnvConfig(self.task, self.actuator, self.physics)}
         if self.task == "cartpole":
             envs[CENTRE] = dataclasses.replace(envs[TEST], options={"center_radius": CENTRE_RADIUS})
         return {test: Trial(self, test, env) for test, env in envs.items()}
 
     def cut_off(self, episodes: int) -> "PaperArm":
-        """The same, stopped after that many training episodes already: for trying things out."""
+        """Return the arm with trainings that stop after that many episodes, for quick trials."""
         return dataclasses.replace(
             self, config=dataclasses.replace(self.config, total_episodes=episodes)
         )
@@ -61,23 +61,23 @@ class PaperArm(Arm):
 FAST: DCMotorActuator = dataclasses.replace(
     find_task("mountain_car").paper[0], controller=CurrentLoop(kp=2.0, ki=10.0, kd=1e-6)
 )
-"""The mountain car's second set of gains (Solving the Mountain Car Environment)."""
+"""Mountain car's second set of gains (section Solving the Mountain Car Environment)."""
 
 
 def _arms(
     task: str, agent: str, settings: str, seconds: Mapping[str, float], physics: str = "mujoco"
 ) -> tuple[PaperArm, ...]:
-    """The arms of an experiment, by motor: how long a training takes, about the median of docs/results [s]."""
+    """Return an experiment's arms; `seconds` is the median duration of a training [s], by motor."""
     motors = {"paper gains": find_task(task).paper[0], "fast gains": FAST, "ideal": IDEAL}
     return tuple(
         PaperArm(
             f"{task}, {settings}, {motor}, {physics}",
             TrainConfig.preset(task, agent, settings, motors[motor], {"physics": physics}),
-            took,
+            duration,
             settings,
             motor,
         )
-        for motor, took in seconds.items()
+        for motor, duration in seconds.items()
     )
 
 
@@ -97,6 +97,6 @@ ARMS: tuple[PaperArm, ...] = (
     *_arms(*_POLE, _with_and_without(100)),
     *_arms(*_POLE, _with_and_without(110), "analytic"),
 )
-"""Every arm of every experiment."""
+"""All arms of all experiments."""
 TASKS: tuple[str, ...] = tuple(dict.fromkeys(arm.task for arm in ARMS))
-"""The tasks in the paper's order."""
+"""Tasks in the paper's order."""

@@ -1,9 +1,9 @@
-"""Whether what was reported is what is found: checks as pure functions of values over seeds.
+"""Checks of reported numbers against measured ones: pure functions of values over seeds.
 
-What was reported is one number, as a rule from one run or one episode. What is found is a sample
-over seeds. One rule judges bounds and comparisons: the 95 % interval lies inside (*confirmed*),
-outside (*not confirmed*), or across (*open*). What was said of one run or one episode, and could be
-one of ours, is only *compatible*.
+A reported number is usually from one run or one episode. The measured values are a sample over
+seeds. One rule judges bounds and comparisons: the 95 % interval lies inside (*confirmed*), outside
+(*not confirmed*), or across (*open*). If a statement is about a single run or episode that could be
+one of ours, it is only *compatible*.
 """
 
 import dataclasses
@@ -17,46 +17,46 @@ from codrl_mj.evaluation.measures import Interval
 from codrl_mj.study.inference import Stratum, effect
 
 OUTCOMES = ("confirmed", "compatible", "open", "not confirmed", "not testable")
-"""What a check may come to."""
+"""Possible outcomes of a check."""
 CONFIRMED, COMPATIBLE, OPEN, NOT_CONFIRMED, NOT_TESTABLE = OUTCOMES
 
 
 class Verdict(NamedTuple):
-    """What a check came to."""
+    """Result of a check."""
 
     outcome: str
     """One of `OUTCOMES`."""
     reason: str
-    """Why."""
+    """Reason for the outcome."""
     measured: Interval | None = None
-    """What was found, and its 95 % interval over seeds; None if nothing."""
+    """Measured value, with its 95 % interval over seeds; None if there is none."""
     samples: int = 0
-    """Number of seeds, of the arm that has the fewest."""
+    """Number of seeds of the arm that has the fewest."""
     p: float | None = None
-    """Of no difference, where two arms are compared: Welch's t test, two-sided, of this comparison alone."""
+    """p-value of no difference between two arms: two-sided t test, not corrected."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """How values over seeds are judged: one value for each seed of every arm; of a time in an episode, an array."""
+    """Rule that judges one value for each seed of every arm; an array if times are judged."""
 
     rule: str
     """`mean`, `difference`, `paired`, `one run`, `one episode` or `every seed`."""
     low: float
-    """Lower bound, or the number that was reported of one run or episode."""
+    """Lower bound, or the number that is reported for one run or episode."""
     high: float
     """Upper bound, or the same number."""
     criterion: str
-    """When it is passed, in words."""
+    """Condition in words."""
     judge: Callable[..., Verdict]
-    """Of each arm's values."""
-    least: int = 2
-    """Seeds that it takes."""
+    """Function that judges the values of each arm."""
+    min_seeds: int = 2
+    """Number of seeds that are needed."""
 
     def __call__(self, *values: Any) -> Verdict:
         """Judge one value for each seed of every arm, shape (n,)."""
         samples = min(map(len, values))
-        if samples < self.least:
+        if samples < self.min_seeds:
             reason = (
                 "one seed: it takes two to say how runs differ" if samples else "no published value"
             )
@@ -65,7 +65,7 @@ class Check:
 
 
 def mean_interval(values: np.ndarray) -> Interval:
-    """Mean over seeds and its 95 % interval by Student's t; of one value, or of equal ones, a point.
+    """Return the mean over seeds and its 95 % interval by Student's t; a point if all are equal.
 
     Args:
         values: shape (n,), n >= 1.
@@ -79,8 +79,8 @@ def mean_interval(values: np.ndarray) -> Interval:
     return Interval(mean, mean - half, mean + half)
 
 
-def place(measured: Interval, low: float, high: float) -> tuple[str, str]:
-    """The one rule: what a 95 % interval comes to, against bounds that are included, and why."""
+def judge_interval(measured: Interval, low: float, high: float) -> tuple[str, str]:
+    """Judge a 95 % interval against inclusive bounds; return the outcome and the reason."""
     if low <= measured.low and measured.high <= high:
         return CONFIRMED, "the whole interval is"
     if measured.high < low or measured.low > high:
@@ -89,11 +89,11 @@ def place(measured: Interval, low: float, high: float) -> tuple[str, str]:
 
 
 def within(low: float = -math.inf, high: float = math.inf) -> Check:
-    """The mean over seeds lies between bounds."""
+    """Return the check that the mean over seeds lies between bounds."""
 
     def judge(values: np.ndarray) -> Verdict:
         measured = mean_interval(values)
-        return Verdict(*place(measured, low, high), measured)
+        return Verdict(*judge_interval(measured, low, high), measured)
 
     bounds = f"from {number(low)} to {number(high)}"
     if math.isinf(low) or math.isinf(high):
@@ -102,12 +102,12 @@ def within(low: float = -math.inf, high: float = math.inf) -> Check:
 
 
 def same(margin: float, paired: bool = False) -> Check:
-    """Both arms have the same mean, up to a margin.
+    """Return the check that both arms have the same mean, up to a margin.
 
     Args:
-        margin: difference that does not matter.
-        paired: whether the n-th values of both belong together, as those of one seed on two kinds
-            of physics do.
+        margin: largest difference that does not matter.
+        paired: True if the n-th values of both belong together, such as those of one seed with both
+            kinds of physics.
     """
     kind = "paired t" if paired else "Welch"
     criterion = f"the 95 % interval of the difference ({kind}) is within ±{number(margin)}"
@@ -115,7 +115,7 @@ def same(margin: float, paired: bool = False) -> Check:
 
 
 def higher(margin: float) -> Check:
-    """The mean of the one arm is higher than the other's by more than what does not matter."""
+    """Return the check that the first arm's mean is higher than the second's by over a margin."""
     criterion = f"the 95 % interval of the difference (Welch) is above {number(margin)}"
     return _difference(margin, math.inf, criterion, paired=False)
 
@@ -125,8 +125,9 @@ def _difference(low: float, high: float, criterion: str, paired: bool) -> Check:
         from scipy.stats import ttest_ind, ttest_rel
 
         measured = effect([Stratum(values, others, paired)])
-        outcome, reason = place(measured, low, high)
-        if measured.low == measured.high:  # without any spread there is no statistic
+        outcome, reason = judge_interval(measured, low, high)
+        # Without any spread there is no test statistic.
+        if measured.low == measured.high:
             reason = "no two values differ" if measured.mean == 0 else reason
             return Verdict(outcome, reason, measured, p=float(measured.mean == 0))
         test = ttest_rel(values, others) if paired else ttest_ind(values, others, equal_var=False)
@@ -136,7 +137,7 @@ def _difference(low: float, high: float, criterion: str, paired: bool) -> Check:
 
 
 def one_run(figure: float) -> Check:
-    """A number that was read off one run could be one of our runs': by the prediction interval of one more."""
+    """Return the check that a number from one run is within the prediction interval of ours."""
 
     def judge(values: np.ndarray) -> Verdict:
         low, high = prediction_interval(values)
@@ -153,30 +154,30 @@ def one_run(figure: float) -> Check:
 
 
 def one_episode(figure: float) -> Check:
-    """A time [s] that was read off one episode could be one of our episodes'.
+    """Return the check that a time [s] from one episode is within the range of our episodes'.
 
-    It is judged by an array for each seed: times of test episodes [s], infinite where the goal was
-    not reached. What is measured is the mean over seeds of the median over episodes that arrive.
+    It judges an array for each seed: times of test episodes [s], infinite if the goal was not
+    reached. The measured value is the mean over seeds of the median over episodes that arrive.
     """
 
     def judge(times: list[np.ndarray]) -> Verdict:
-        every = np.concatenate(times)
-        arrived = every[np.isfinite(every)]
+        all_times = np.concatenate(times)
+        arrived = all_times[np.isfinite(all_times)]
         if not len(arrived):
-            return Verdict(NOT_CONFIRMED, f"none of {len(every)} episodes arrives")
+            return Verdict(NOT_CONFIRMED, f"none of {len(all_times)} episodes arrives")
         low, high = central_range(arrived)
         reason = f"95 % of those that arrive take {number(low)} to {number(high)} s"
-        if len(arrived) < len(every):
-            reason += f"; {len(every) - len(arrived)} of {len(every)} never arrive"
+        if len(arrived) < len(all_times):
+            reason += f"; {len(all_times) - len(arrived)} of {len(all_times)} never arrive"
         outcome = COMPATIBLE if low <= figure <= high else NOT_CONFIRMED
         return Verdict(outcome, reason, mean_interval(medians(times)))
 
     criterion = f"{number(figure)} s is within the range of 95 % of the test episodes that arrive"
-    return Check("one episode", figure, figure, criterion, judge, least=1)
+    return Check("one episode", figure, figure, criterion, judge, min_seeds=1)
 
 
 def every_seed(limit: float) -> Check:
-    """The value of every seed is at most a limit."""
+    """Return the check that the value of every seed is at most a limit."""
 
     def judge(values: np.ndarray) -> Verdict:
         beyond = int(np.sum(values > limit))
@@ -187,21 +188,21 @@ def every_seed(limit: float) -> Check:
         return Verdict(NOT_CONFIRMED if beyond else CONFIRMED, reason, mean_interval(values))
 
     return Check(
-        "every seed", -math.inf, limit, f"at most {number(limit)} in every seed", judge, least=1
+        "every seed", -math.inf, limit, f"at most {number(limit)} in every seed", judge, min_seeds=1
     )
 
 
 def medians(times: list[np.ndarray]) -> np.ndarray:
-    """The median time of each seed's episodes that arrive; seeds of which none does are left out."""
-    arriving = [of_seed[np.isfinite(of_seed)] for of_seed in times]
-    return np.array([np.median(of_seed) for of_seed in arriving if len(of_seed)])
+    """Return the median time of each seed's arriving episodes, without seeds where none arrive."""
+    arriving = [seed_times[np.isfinite(seed_times)] for seed_times in times]
+    return np.array([np.median(seed_times) for seed_times in arriving if len(seed_times)])
 
 
 def prediction_interval(values: np.ndarray) -> tuple[float, float]:
-    """Where one more value of the same normal distribution lies with a probability of 95 %.
+    """Return the interval that contains another value of the distribution with 95 % probability.
 
-    mean -+ t * s * sqrt(1 + 1/n), with Student's t of n - 1 degrees of freedom and the sample's
-    standard deviation s.
+    The interval is mean -+ t * s * sqrt(1 + 1/n), with Student's t of n - 1 degrees of freedom and
+    the sample's standard deviation s; the distribution is assumed to be normal.
 
     Args:
         values: shape (n,), n >= 2.
@@ -209,12 +210,12 @@ def prediction_interval(values: np.ndarray) -> tuple[float, float]:
     from scipy.special import stdtrit
 
     count = len(values)
-    reach = stdtrit(count - 1, 0.975) * np.std(values, ddof=1) * math.sqrt(1 + 1 / count)
-    return float(np.mean(values) - reach), float(np.mean(values) + reach)
+    half_width = stdtrit(count - 1, 0.975) * np.std(values, ddof=1) * math.sqrt(1 + 1 / count)
+    return float(np.mean(values) - half_width), float(np.mean(values) + half_width)
 
 
 def central_range(values: np.ndarray) -> tuple[float, float]:
-    """The values between which the central 95 % lie: the smallest that 2.5 % and 97.5 % do not exceed.
+    """Return the range of the central 95 %: 2.5 % and 97.5 % quantiles, which are sample values.
 
     Args:
         values: shape (n,), n >= 1.
@@ -224,7 +225,7 @@ def central_range(values: np.ndarray) -> tuple[float, float]:
 
 
 def number(value: float) -> str:
-    """A number as text: three digits, four from 100 on, or all before the point."""
+    """Format a number with three digits, four from 100 on, or all digits before the point."""
     return (
         f"{value:.3g}"
         if abs(value) < 100

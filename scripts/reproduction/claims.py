@@ -1,8 +1,7 @@
-"""What is reported about the paper's experiments: each number with its source, and the check that judges it.
+"""Reported results of the paper's experiments, with their sources and the checks that judge them.
 
-The paper (arXiv 2507.00268) shows one run of each experiment; its numbers are read off figures. A
-statement is judged by published rows alone (`reproduction.rows`), so whoever has them can judge it
-again.
+The paper (arXiv 2507.00268) shows one run of each experiment; its numbers are read off figures.
+Claims are judged by published rows only (`reproduction.rows`), so every reader can repeat that.
 """
 
 import dataclasses
@@ -26,83 +25,97 @@ from reproduction.rows import Row, times_of
 from reproduction.value_iteration import TASK as VALUE_TASK
 
 PAPER_SAYS, PORT = "paper", "this port"
-"""Who says it: the paper; or ourselves, since both kinds of physics are to be one."""
+"""Sources: the paper; or this port, since both kinds of physics should give the same results."""
 
-# what the paper's words are taken to mean, which have no number
-ALMOST_PERFECT = 5.0  # % of the desired torque's rms
-WELL = 20.0  # % of the desired torque's rms
-SIMILAR_RETURN = {"pendulum": 10.0, "mountain_car": 3.0, "cartpole": 200.0}  # does not matter
-ALWAYS = 0.95  # share of the test episodes, in which the paper's one episode is no accident
-NEAR_CENTRE = 0.9  # share of the steps of a test
+# These thresholds stand for words of the paper that have no number. The first two are shares [%] of
+# the desired torque's rms.
+ALMOST_PERFECT = 5.0
+WELL = 20.0
+# Differences of returns that do not matter.
+SIMILAR_RETURN = {"pendulum": 10.0, "mountain_car": 3.0, "cartpole": 200.0}
+# Share of the test episodes above which the paper's single episode is no accident.
+ALWAYS = 0.95
+# Share of the steps of a test episode.
+NEAR_CENTRE = 0.9
 
 
 class Measure(NamedTuple):
-    """What of the runs a claim is about."""
+    """Quantity of the runs that a claim is about."""
 
     text: str
-    """What it is, with the unit."""
+    """Description with the unit."""
     column: str
-    """Of the published rows."""
+    """Column of the published rows."""
     unit: str = ""
-    """What is written behind it; `share` for a share, which is written in %."""
+    """Unit that follows a value; `share` for shares, which are written in %."""
     parse: Callable[[str], Any] = float
-    """The value of a row by its text."""
+    """Function from a row's text to a value."""
 
     def values(self, rows: Sequence[Row]) -> Any:
-        """One for each row that has it, shape (n,); of `TIMES` an array for each."""
-        found = [self.parse(row[self.column]) for row in rows if row.get(self.column)]
-        return found if self.parse is times_of else np.array(found)
+        """Return the values of the rows that have one, shape (n,); a list of arrays for `TIMES`."""
+        values = [self.parse(row[self.column]) for row in rows if row.get(self.column)]
+        return values if self.parse is times_of else np.array(values)
 
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """A statement, and how it is judged."""
+    """Reported statement, and the check that judges it."""
 
     task: str
     """Task name."""
     source: str
-    """Who says it: `PAPER_SAYS` or `PORT`."""
+    """Source: `PAPER_SAYS` or `PORT`."""
     figure: str
-    """Where the paper shows it; empty if only its text says so."""
+    """Figure of the paper; empty if only the text has the statement."""
     statement: str
-    """What is said to be so."""
+    """Statement in a few words."""
     says: str
-    """How, with the number that is reported."""
+    """Reported number or word."""
     measure: Measure
-    """What is judged."""
+    """Quantity that is judged."""
     settings: str
-    """Of the agent."""
+    """Settings of the agent."""
     motors: tuple[str, ...]
-    """What the arm that it is about is called for its motor, or the two that it compares."""
+    """Names of the motor of the judged arm, or of the two compared arms."""
     check: Check
-    """How it is judged."""
+    """Check that judges it."""
     counted: bool = True
-    """Whether it is the statement's verdict, not that of settings as printed beside repaired ones, or a second look."""
+    """True for the statement's verdict.
+
+    False for a second look, and for settings as printed if repaired ones exist.
+    """
     physics: tuple[str, ...] = ("mujoco",)
-    """What it was trained in; of both kinds the first is compared with the second."""
+    """Physics of the trainings; the first of two is compared with the second."""
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """Names of the arm that it is about, or of the two that it compares."""
+        """Names of the judged arm, or of the two compared arms."""
         kinds = [(motor, physics) for physics in self.physics for motor in self.motors]
         return tuple(
             f"{self.task}, {self.settings}, {motor}, {physics}" for motor, physics in kinds
         )
 
     def judge(self, rows: Mapping[str, Sequence[Row]]) -> Verdict:
-        """The verdict by the published rows of every arm, by its name; of pairs by the first row of each seed."""
-        mine = [rows.get(name, ()) for name in self.arms]
+        """Judge the claim by the published rows of every arm, by its name.
+
+        Pairs are formed from the first row of each seed.
+        """
+        arm_rows = [rows.get(name, ()) for name in self.arms]
         if self.check.rule == "paired":
-            by_seed = [{row["seed"]: row for row in reversed(one)} for one in mine]
+            by_seed = [
+                {row["seed"]: row for row in reversed(rows_by_seed)} for rows_by_seed in arm_rows
+            ]
             shared = [row["seed"] for row in by_seed[0].values() if row["seed"] in by_seed[1]]
-            mine = [[one[seed] for seed in shared] for one in by_seed]
-        return self.check(*map(self.measure.values, mine))
+            arm_rows = [[rows_by_seed[seed] for seed in shared] for rows_by_seed in by_seed]
+        return self.check(*map(self.measure.values, arm_rows))
 
     def without_motor(self, rows: Mapping[str, Sequence[Row]]) -> float | None:
-        """The mean of what is judged where there is no motor; None if it is not known, compared, or of the motor."""
-        column = {TIMES: "time_to_goal"}.get(
-            self.measure, self.measure.column
-        )  # medians are known of more trainings
+        """Return the judged mean without a motor, if it is known and means something.
+
+        It is None for comparisons and for quantities of the motor.
+        """
+        # Times are only known of some trainings, their medians of more.
+        column = {TIMES: "time_to_goal"}.get(self.measure, self.measure.column)
         ideal = rows.get(f"{self.task}, {self.settings}, ideal, mujoco", ())
         values = [float(row[column]) for row in ideal if row[column]]
         if not values or len(self.arms) > 1 or self.measure in (TRACKING, LARGEST_ERROR):
@@ -122,23 +135,31 @@ LONG_EPOCH = Measure("first epoch of length 4000", "long_epoch")
 PAID_EPOCH = Measure("first epoch with a return of 3800", "paid_epoch")
 
 _Row = tuple[str, str, str, Measure, Sequence[str], Check]
-"""A claim's figure, statement and number, what is judged, its motors, and how."""
+"""Figure, statement and number of a claim, its quantity, its motors, and its check."""
 
 
 def _paper(
     task: str, *rows: _Row, settings: Sequence[str] = ("paper",), counted: bool = True
 ) -> list[Claim]:
-    """What the paper says of a task; where its settings do not learn, the repaired ones count."""
+    """Return the paper's claims about a task; the last of the settings counts."""
     return [
-        Claim(task, PAPER_SAYS, *row[:4], of, tuple(row[4]), row[5], counted and of == settings[-1])
+        Claim(
+            task,
+            PAPER_SAYS,
+            *row[:4],
+            name,
+            tuple(row[4]),
+            row[5],
+            counted and name == settings[-1],
+        )
         for row in rows
-        for of in settings
+        for name in settings
     ]
 
 
 def _same_physics(task: str, motors: Sequence[str]) -> list[Claim]:
-    """MuJoCo and Gymnasium's own equations give the same results, seed by seed."""
-    check, both = same(SIMILAR_RETURN[task], paired=True), ("mujoco", "analytic")
+    """Return the claims that MuJoCo and Gymnasium's equations give the same results per seed."""
+    check, engines = same(SIMILAR_RETURN[task], paired=True), ("mujoco", "analytic")
     return [
         Claim(
             task,
@@ -150,7 +171,7 @@ def _same_physics(task: str, motors: Sequence[str]) -> list[Claim]:
             "paper",
             (motor,),
             check,
-            physics=both,
+            physics=engines,
         )
         for motor in motors
     ]
@@ -162,10 +183,11 @@ _RIVALS = (("no motor", "75 s sooner", "ideal"), ("gains 2, 10, 1e-6", "15 s soo
 
 
 def _beats(measure: Measure) -> list[_Row]:
-    """The paper's gains against both rivals; a step is a second and costs 1."""
+    """Return the claims that the paper's gains beat both rivals; a step is 1 s and costs 1."""
     check = higher(SIMILAR_RETURN["mountain_car"])
     return [
-        ("", f"beats {rival}", by, measure, (*_MOTOR, other), check) for rival, by, other in _RIVALS
+        ("", f"beats {rival}", advantage, measure, (*_MOTOR, rival_motor), check)
+        for rival, advantage, rival_motor in _RIVALS
     ]
 
 
@@ -224,16 +246,16 @@ CLAIMS: tuple[Claim, ...] = (
     ),
     *_same_physics("cartpole", ("paper gains", "ideal")),
 )
-"""Everything that is reported, in the paper's order."""
+"""All reported claims, in the paper's order."""
 
 
 def needed(arm: str) -> set[str]:
-    """The columns by which an arm's claims are judged."""
+    """Return the columns that an arm's claims need."""
     return {claim.measure.column for claim in CLAIMS if arm in claim.arms}
 
 
 def as_text(measure: Measure, value: float) -> str:
-    """A measured value with its unit."""
+    """Format a measured value with its unit."""
     return (
         f"{number(100 * value)} %"
         if measure.unit == "share"

@@ -1,4 +1,4 @@
-"""What figures are drawn of: tables of curves and episodes, published, so that a figure needs no run folder."""
+"""Data of the figures: published tables of curves and episodes, so that no run folder is needed."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,54 +14,57 @@ from reproduction.arms import PaperArm
 from reproduction.rows import LAST, Trained, epochs_of, run_tests
 
 CURVES, STATES, TORQUES = "curves.csv", "states.csv", "torques.csv"
-"""The tables: learning curves; the states of a test episode; desired and actual torque at its beginning."""
-POINTS = 125  # of a learning curve, at most
-SHORT, FEW = (
-    1.0,
-    20,
-)  # s; policy steps: of an episode's torque as much is shown as the longer of both
+"""Files of learning curves, states of a test episode, and torques at its beginning."""
+# Maximum number of points of a learning curve.
+POINTS = 125
+# Beginning of an episode whose torques are shown: the longer of seconds and policy steps.
+SHORT, FEW = 1.0, 20
 
 ENTRIES = ("state_1", "state_2", "state_3", "state_4")
 """Columns of a state's entries, in the order of the task's `state_names`."""
 Table = list[Mapping[str, str]]
-"""Rows by the columns' names, as text."""
+"""Rows by column name, as text."""
 
 
 def about(arm: PaperArm) -> dict[str, str]:
-    """What a row of a table is of; all of them are of MuJoCo."""
+    """Return the columns that identify a row's arm; all rows are of MuJoCo."""
     return {"task": arm.task, "settings": arm.settings, "motor": arm.motor}
 
 
 def curve_rows(arm: PaperArm, runs: Mapping[int, Trained]) -> Table:
-    """Learning curves of an arm's runs, at least one: means over seeds and their 95 % bands.
+    """Return the learning curves of an arm's runs: means over seeds with 95 % bands.
 
-    Of returns the running mean over episodes; of PPO, whose rollouts are the paper's epochs, mean
-    return, mean length and number of episodes over epochs.
+    At least one run is needed. Returns are running means over episodes. PPO's rollouts are the
+    paper's epochs: its curves are mean return, mean length and number of episodes by epoch.
     """
     if arm.config.agent.name == "ppo":
-        every = [epochs_of(arm, run) for run in runs.values()]
+        epochs = [epochs_of(arm, run) for run in runs.values()]
         curves = {
-            name: np.array([_filled(getattr(one, name).astype(float)) for one in every])
+            name: np.array(
+                [_filled(getattr(run_epochs, name).astype(float)) for run_epochs in epochs]
+            )
             for name in ("lengths", "returns", "counts")
         }
     else:
         returns = [run.column("return") for run in runs.values()]
         shortest = min(map(len, returns))
-        curves = {"returns": running_mean(np.array([of_run[:shortest] for of_run in returns]))}
+        curves = {
+            "returns": running_mean(np.array([run_returns[:shortest] for run_returns in returns]))
+        }
     rows: Table = []
     for name, values in curves.items():
         step = max(1, math.ceil(values.shape[1] / POINTS))
-        kept = np.arange(step - 1, values.shape[1], step)
-        for place, *point in zip(kept + 1, *band(values[:, kept]), strict=True):
+        indices = np.arange(step - 1, values.shape[1], step)
+        for index, *point in zip(indices + 1, *band(values[:, indices]), strict=True):
             numbers = dict(zip(("mean", "low", "high"), map(_short, point), strict=True))
             rows.append(
-                about(arm) | {"curve": name, "seeds": str(len(runs)), "at": str(place)} | numbers
+                about(arm) | {"curve": name, "seeds": str(len(runs)), "at": str(index)} | numbers
             )
     return rows
 
 
 def state_rows(arm: PaperArm, episode: Episode) -> Table:
-    """The states of an episode, from before its first step on."""
+    """Return the states of an episode, including the initial one."""
     times = np.concatenate([[0.0], episode.time])
     return [
         about(arm)
@@ -73,7 +76,7 @@ def state_rows(arm: PaperArm, episode: Episode) -> Table:
 
 
 def torque_rows(arm: PaperArm, episode: Episode) -> Table:
-    """Desired and actual torque at the shaft in the integration steps at the beginning of an episode [N·m]."""
+    """Return an episode's first desired and actual shaft torques [N*m], by integration step."""
     radius, inner = arm.actuator.motor.arm_radius, episode.inner_steps
     desired = radius * np.repeat(episode.signals["desired_force"], inner)
     actual = radius * episode.trace["actual_force"]
@@ -82,36 +85,47 @@ def torque_rows(arm: PaperArm, episode: Episode) -> Table:
     return [
         about(arm)
         | {
-            "time": _short(n * episode.timestep),
-            "desired": _short(one),
-            "actual": _short(other),
+            "time": _short(step * episode.timestep),
+            "desired": _short(desired_torque),
+            "actual": _short(actual_torque),
         }
-        for n, (one, other) in enumerate(pairs)
+        for step, (desired_torque, actual_torque) in enumerate(pairs)
     ]
 
 
 def gather_tables(
     arms: Iterable[PaperArm], runs: Mapping[str, Mapping[int, Trained]], published: Path
 ) -> dict[str, Table]:
-    """The tables, of arms' runs by name: of what is at hand anew, but as published if that is of more seeds."""
-    before = {name: read_csv(published / name) for name in (CURVES, STATES, TORQUES)}
+    """Make the tables from runs, or take the published ones if they are of more seeds.
+
+    Args:
+        arms: arms of the tables.
+        runs: arm's name -> seed -> run.
+        published: folder of the published tables.
+    """
+    published_tables = {name: read_csv(published / name) for name in (CURVES, STATES, TORQUES)}
     tables: dict[str, Table] = {CURVES: [], STATES: [], TORQUES: []}
     for arm in arms:
         if arm.physics != "mujoco":
             continue
-        mine = runs.get(arm.name, {})
-        old = {
-            name: [row for row in rows if _of(row) == about(arm)] for name, rows in before.items()
+        arm_runs = runs.get(arm.name, {})
+        published_rows = {
+            name: [row for row in rows if _of(row) == about(arm)]
+            for name, rows in published_tables.items()
         }
-        seeds = max((int(row["seeds"]) for row in old[CURVES]), default=0)
-        tables[CURVES] += curve_rows(arm, mine) if mine and len(mine) >= seeds else old[CURVES]
-        if mine and (0 in mine or not old[STATES]):
-            (episode,) = run_tests(arm, next(iter(mine.values())).folder, 1)
+        seeds = max((int(row["seeds"]) for row in published_rows[CURVES]), default=0)
+        tables[CURVES] += (
+            curve_rows(arm, arm_runs)
+            if arm_runs and len(arm_runs) >= seeds
+            else published_rows[CURVES]
+        )
+        if arm_runs and (0 in arm_runs or not published_rows[STATES]):
+            (episode,) = run_tests(arm, next(iter(arm_runs.values())).folder, 1)
             tables[STATES] += state_rows(arm, episode)
             tables[TORQUES] += [] if arm.actuator == IDEAL else torque_rows(arm, episode)
         else:
-            tables[STATES] += old[STATES]
-            tables[TORQUES] += old[TORQUES]
+            tables[STATES] += published_rows[STATES]
+            tables[TORQUES] += published_rows[TORQUES]
     return tables
 
 
@@ -120,12 +134,12 @@ def _of(row: Mapping[str, str]) -> dict[str, str]:
 
 
 def column(rows: Iterable[Mapping[str, str]], name: str) -> np.ndarray:
-    """A column of a table as numbers, shape (n,)."""
+    """Return a column of a table as numbers, shape (n,)."""
     return np.array([float(row[name]) for row in rows])
 
 
 def running_mean(values: np.ndarray, count: int = LAST) -> np.ndarray:
-    """Mean of each value and those before it, at most `count` in all.
+    """Return the mean of each value and those before it, at most `count` in all.
 
     Args:
         values: shape (..., n).
@@ -140,7 +154,9 @@ def running_mean(values: np.ndarray, count: int = LAST) -> np.ndarray:
 
 
 def band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean over seeds with its 95 % percentile-bootstrap interval, at every place (scipy, 999 resamples, fixed seed).
+    """Return the mean over seeds and its 95 % interval at every index, by percentile bootstrap.
+
+    It uses scipy with 999 resamples and a fixed seed.
 
     Args:
         values: shape (seeds, n), seeds >= 1.
@@ -159,7 +175,7 @@ def band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _filled(values: np.ndarray) -> np.ndarray:
-    """NaN replaced by the value before it; 0 where there is none."""
+    """Replace every NaN by the value before it, or by 0 if there is none."""
     last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
     return np.where(last >= 0, values[last], 0.0)
 
@@ -169,9 +185,9 @@ def _short(value: float) -> str:
 
 
 def arms_of(table: Sequence[Mapping[str, str]], task: str) -> dict[tuple[str, str], Table]:
-    """A task's rows by settings and motor."""
-    found: dict[tuple[str, str], Table] = {}
+    """Return a task's rows by settings and motor."""
+    rows_by_arm: dict[tuple[str, str], Table] = {}
     for row in table:
         if row["task"] == task:
-            found.setdefault((row["settings"], row["motor"]), []).append(row)
-    return found
+            rows_by_arm.setdefault((row["settings"], row["motor"]), []).append(row)
+    return rows_by_arm

@@ -1,4 +1,4 @@
-"""The paper's figures, redrawn from published tables: learning, torque, states; and what value iteration finds."""
+"""The paper's figures redrawn from published tables, and results of value iteration."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -27,27 +27,28 @@ STYLES = {
     "paper gains": (COLOURS[2], "-"),
     "fast gains": (COLOURS[1], "-."),
 }
-"""Of an arm, by its motor: colour and dashes."""
+"""Motor of an arm -> color and dashes."""
 SETTINGS = {"paper": "as printed", "repaired": "repaired"}
-"""What settings are called."""
+"""Settings -> name in figures."""
 LEARNED = {
     "returns": "mean return",
     "lengths": "mean length\n[steps]",
     "counts": "number of\nepisodes",
 }
-"""What learning curves are called."""
+"""Learning curve -> label of its axis."""
 _ERROR = COLOURS[3]
-_WIDTH = 8.0  # in
+# Width of all figures [in].
+_WIDTH = 8.0
 
 
 @dataclasses.dataclass(frozen=True)
 class StateCurve:
-    """Something that is drawn over the time of an episode."""
+    """Quantity that is drawn over the time of an episode."""
 
     label: str
     """Name and unit."""
     values: Callable[[np.ndarray], np.ndarray]
-    """Of the state's entries, shape (k, T+1)."""
+    """Function of the state's entries, shape (k, T+1)."""
     marks: tuple[float, ...] = ()
     """Values to mark: goals and limits."""
 
@@ -57,7 +58,7 @@ def _entry(label: str, index: int, *marks: float) -> StateCurve:
 
 
 def _entries(task: str, marks: Mapping[int, tuple[float, ...]]) -> list[StateCurve]:
-    """Every entry of a task's state."""
+    """Return the curves of all entries of a task's state."""
     return [
         _entry(name, index, *marks.get(index, ()))
         for index, name in enumerate(find_task(task).state_names)
@@ -93,17 +94,20 @@ CURVES: dict[str, list[StateCurve]] = {
         {0: (-CENTRE_RADIUS, CENTRE_RADIUS), 2: (-cartpole.ANGLE_LIMIT, cartpole.ANGLE_LIMIT)},
     ),
 }
-"""What is drawn of each task's states: the paper's curves, and every entry of the state."""
+"""Task -> curves of its states: the paper's, and every entry of the state."""
 
 
 def _unbroken(angle: np.ndarray) -> np.ndarray:
-    """A wrapped angle without the lines from one end to the other."""
+    """Return a wrapped angle with NaN at its jumps, where no line is drawn."""
     jumps = np.abs(np.diff(angle, prepend=angle[:1])) > np.pi
     return np.where(jumps, np.nan, angle)
 
 
 def draw_learning(path: Path, task: str, curves: Table) -> bool:
-    """Draw how a task is learned, all on one scale: means and 95 % bands over seeds, faint with settings as printed.
+    """Draw the learning curves of a task: means and 95 % bands over seeds.
+
+    Settings as printed are faint if there are repaired ones.
+
 
     Args:
         path: SVG file.
@@ -111,7 +115,7 @@ def draw_learning(path: Path, task: str, curves: Table) -> bool:
         curves: rows of `drawn.CURVES`.
 
     Returns:
-        Whether there is anything to draw.
+            True if there is anything to draw.
     """
     arms = arms_of(curves, task)
     names = list(dict.fromkeys(row["curve"] for rows in arms.values() for row in rows))
@@ -122,24 +126,22 @@ def draw_learning(path: Path, task: str, curves: Table) -> bool:
     for axes, name in zip(all_axes[:, 0], names, strict=True):
         for (settings, motor), rows in arms.items():
             shown = [row for row in rows if row["curve"] == name]
-            places, mean, low, high = (
-                column(shown, part) for part in ("at", "mean", "low", "high")
-            )
-            colour, dashes = STYLES[motor]
+            x, mean, low, high = (column(shown, part) for part in ("at", "mean", "low", "high"))
+            color, dashes = STYLES[motor]
             label = (
                 f"{motor}{f', {SETTINGS[settings]}' if repaired else ''} ({shown[0]['seeds']}"
                 " seeds)"
             )
             faint = repaired and settings == "paper"
             axes.plot(
-                places,
+                x,
                 mean,
-                color=colour,
+                color=color,
                 linestyle=dashes,
                 linewidth=0.8 if faint else 1.6,
                 label=label,
             )
-            axes.fill_between(places, low, high, color=colour, alpha=0.2, linewidth=0)
+            axes.fill_between(x, low, high, color=color, alpha=0.2, linewidth=0)
         axes.set(ylabel=LEARNED[name], yscale="log" if name == "counts" else "linear")
         axes.yaxis.label.set_fontsize("small" if len(names) > 1 else "medium")
     all_axes[-1, 0].set_xlabel("training episode" if len(names) == 1 else "epoch of 4000 steps")
@@ -151,7 +153,7 @@ def draw_learning(path: Path, task: str, curves: Table) -> bool:
 
 
 def draw_torque(path: Path, task: str, torques: Table) -> bool:
-    """Draw the beginning of an episode: desired and actual torque at the shaft, and their difference, on one scale.
+    """Draw desired and actual shaft torque at an episode's beginning, and their difference.
 
     Args:
         path: SVG file.
@@ -159,7 +161,7 @@ def draw_torque(path: Path, task: str, torques: Table) -> bool:
         torques: rows of `drawn.TORQUES`.
 
     Returns:
-        Whether there is anything to draw.
+            True if there is anything to draw.
     """
     arms = _learned(arms_of(torques, task))
     if not arms:
@@ -189,7 +191,7 @@ def draw_torque(path: Path, task: str, torques: Table) -> bool:
 
 
 def draw_states(path: Path, task: str, states: Table) -> bool:
-    """Draw what there is to see of the states over an episode, a row for each curve, a line for each motor.
+    """Draw the states over an episode, a row for each curve, a line for each motor.
 
     Args:
         path: SVG file.
@@ -197,7 +199,7 @@ def draw_states(path: Path, task: str, states: Table) -> bool:
         states: rows of `drawn.STATES`.
 
     Returns:
-        Whether there is anything to draw.
+            True if there is anything to draw.
     """
     arms, curves = _learned(arms_of(states, task)), CURVES[task]
     if not arms:
@@ -208,12 +210,12 @@ def draw_states(path: Path, task: str, states: Table) -> bool:
         for mark in curve.marks:
             axes.axhline(mark, color="0.6", linewidth=0.8)
         for motor, rows in arms.items():
-            colour, dashes = STYLES[motor]
+            color, dashes = STYLES[motor]
             state = np.array([column(rows, entry) for entry in entries])
             axes.plot(
                 column(rows, "time"),
                 curve.values(state),
-                color=colour,
+                color=color,
                 linestyle=dashes,
                 label=motor,
             )
@@ -225,51 +227,56 @@ def draw_states(path: Path, task: str, states: Table) -> bool:
 
 
 def _learned(arms: Mapping[tuple[str, str], Table]) -> dict[str, Table]:
-    """An episode's rows by motor: with repaired settings where there are any, for others learn nothing there."""
+    """Return an episode's rows by motor, with repaired settings if there are any.
+
+    Where settings were repaired, policies with settings as printed learned nothing.
+    """
     shown = "repaired" if any(settings == "repaired" for settings, _ in arms) else "paper"
     return {motor: rows for (settings, motor), rows in arms.items() if settings == shown}
 
 
 def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[Optimum]) -> None:
-    """Draw what the continuous mountain car's start is worth over discount factors, and how the best policies drive.
+    """Draw the continuous mountain car's value by discount factor, and the best policies' paths.
 
     Args:
         path: SVG file.
         values: discount factor -> value.
-        optima: the best policies at some discount factors.
+        optima: best policies at some discount factors.
     """
-    figure, ((worth, drive),) = _panels(1, 2)
+    figure, ((value_axes, path_axes),) = _panels(1, 2)
     discounts = np.array(list(values))
-    worth.plot(1 - discounts, list(values.values()), color=COLOURS[0], marker=".")
-    worth.set_xscale("log")
-    worth.invert_xaxis()
-    marked = [one.discount for one in optima]
-    worth.set_xticks(
-        [1 - discount for discount in marked], [f"{discount:g}" for discount in marked], rotation=45
+    value_axes.plot(1 - discounts, list(values.values()), color=COLOURS[0], marker=".")
+    value_axes.set_xscale("log")
+    value_axes.invert_xaxis()
+    marked_discounts = [best.discount for best in optima]
+    value_axes.set_xticks(
+        [1 - discount for discount in marked_discounts],
+        [f"{discount:g}" for discount in marked_discounts],
+        rotation=45,
     )
-    worth.set_xticks([], minor=True)
-    worth.axvline(1 - marked[0], color=COLOURS[2], linestyle="--", linewidth=1)
-    worth.annotate(
+    value_axes.set_xticks([], minor=True)
+    value_axes.axvline(1 - marked_discounts[0], color=COLOURS[2], linestyle="--", linewidth=1)
+    value_axes.annotate(
         "the paper's",
-        (1 - marked[0], 0.5 * max(values.values())),
+        (1 - marked_discounts[0], 0.5 * max(values.values())),
         rotation=90,
         ha="right",
         va="center",
     )
-    worth.set(xlabel="discount factor", ylabel="value of the start")
+    value_axes.set(xlabel="discount factor", ylabel="value of the start")
     dashes = ("-", ":", "--", "-.", (0, (5, 1, 1, 1, 1, 1)))
-    for index, one in enumerate(optima):
-        times = np.concatenate([[0.0], one.episode.time])
+    for index, best in enumerate(optima):
+        times = np.concatenate([[0.0], best.episode.time])
         style = dashes[index % len(dashes)]
-        drive.plot(
+        path_axes.plot(
             times,
-            one.episode.state[:, 0],
+            best.episode.state[:, 0],
             color=COLOURS[index],
             linestyle=style,
-            label=f"{one.discount:g}",
+            label=f"{best.discount:g}",
         )
-    drive.axhline(mountain_car_continuous.GOAL, color="0.6", linewidth=0.8)
-    drive.set(
+    path_axes.axhline(mountain_car_continuous.GOAL, color="0.6", linewidth=0.8)
+    path_axes.set(
         xlabel="time [s]", ylabel="x [m]", xlim=(0, 120), title="best policy at discount factor"
     )
     legend(figure, 5)
@@ -277,14 +284,14 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
 
 
 def _panels(rows: int, columns: int, row_height: float = 2.6, sharey: bool = False) -> Any:
-    """A figure and its axes, shape (rows, columns); rows share their time or episode axis."""
+    """Return a figure and its axes, shape (rows, columns); axes of a column share the x axis."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(_WIDTH, 0.6 + rows * row_height), layout="constrained", dpi=110)
     axes = figure.subplots(rows, columns, squeeze=False, sharex="col", sharey=sharey)
-    for each in axes.flat:
-        each.grid(color="0.9")
-        each.set_axisbelow(True)
-        each.spines[["top", "right"]].set_visible(False)
+    for panel in axes.flat:
+        panel.grid(color="0.9")
+        panel.set_axisbelow(True)
+        panel.spines[["top", "right"]].set_visible(False)
     figure.align_ylabels()
     return figure, axes

@@ -1,4 +1,4 @@
-"""The reproduction's page: Markdown, with figures and tables beside it."""
+"""Page of the reproduction: Markdown, with figures and tables beside it."""
 
 import collections
 from collections.abc import Callable, Iterable, Sequence
@@ -17,18 +17,18 @@ from reproduction.value_iteration import TASK as VALUE_TASK
 PAGE, FOLDER = "reproduction.md", "reproduction"
 """The page, and the folder beside it with its figures and tables."""
 Judged = Sequence[tuple[Claim, Verdict]]
-"""Claims with what they came to."""
+"""Claims with their verdicts."""
 
 
 def write(findings: Findings, out: Path) -> list[Path]:
-    """Write the page, its figures and its tables, each whole or not at all.
+    """Write the page, its figures and its tables, each of them atomically.
 
     Args:
-        findings: what was found.
-        out: folder for the page.
+        findings: results of the reproduction.
+        out: folder of the page.
 
     Returns:
-        The files, the page first.
+            Files that were written, the page first.
     """
     folder = out / FOLDER
     written, drawn = write_files(findings, folder), _draw(findings, folder)
@@ -38,7 +38,7 @@ def write(findings: Findings, out: Path) -> list[Path]:
         verdicts_line(findings.verdicts),
         f"## Conclusions\n\n{conclusions(out / PAGE)}",
         f"## Figures\n\n{_pictures(drawn)}",
-        _how(findings),
+        _method(findings),
         _missing(findings),
     ]
     write_page(out / PAGE, parts)
@@ -60,27 +60,28 @@ trained over seeds, and every statement judged [by a rule](../reproduction.md#ho
 
 
 def statements_table(findings: Findings) -> str:
-    """The paper's statements, each once: its figure, its number, ours, and the verdict."""
+    """Return a table of the paper's statements: figure, its number, ours, and the verdict."""
     statements: dict[tuple[str, str, str], dict[str, tuple[Claim, Verdict]]] = {}
     for claim, verdict in findings.verdicts:
         if claim.source == PAPER_SAYS:
-            about = claim.task, claim.statement, claim.measure.text
-            statements.setdefault(about, {})[claim.settings] = claim, verdict
-    rows, before = [], ""
-    for (task, *_), judged in statements.items():
-        claim, verdict = list(judged.values())[-1]
+            key = claim.task, claim.statement, claim.measure.text
+            statements.setdefault(key, {})[claim.settings] = claim, verdict
+    rows, last_task = [], ""
+    for (task, *_), by_settings in statements.items():
+        claim, verdict = list(by_settings.values())[-1]
         if not claim.counted:
             continue
         cells = [
-            _ours(findings, *judged[of]) if of in judged else "" for of in ("paper", "repaired")
+            _ours(findings, *by_settings[settings]) if settings in by_settings else ""
+            for settings in ("paper", "repaired")
         ]
         cells += [_without(findings, claim)]
         if claim.motors == ("ideal",):
             cells = ["", "", cells[0]]
         outcome = verdict.outcome if verdict.outcome == NOT_TESTABLE else f"**{verdict.outcome}**"
-        title = f"*{TITLES[task]}*: " if task != before else ""
+        title = f"*{TITLES[task]}*: " if task != last_task else ""
         rows.append([title + claim.statement, claim.figure, _minus(claim.says), *cells, outcome])
-        before = task
+        last_task = task
     header = [
         "statement",
         "figure",
@@ -94,7 +95,7 @@ def statements_table(findings: Findings) -> str:
 
 
 def _ours(findings: Findings, claim: Claim, verdict: Verdict) -> str:
-    """What was found of a claim: the mean with its interval, of times in episodes the median."""
+    """Format the measured value of a claim, with its interval; for times the median."""
     if claim.measure is UPRIGHT and verdict.measured:
         return f"{as_text(UPRIGHT, verdict.measured.mean)}{_after(findings, claim.arms[0])}"
     if verdict.measured is None:
@@ -119,9 +120,9 @@ def _without(findings: Findings, claim: Claim) -> str:
 
 
 def _after(findings: Findings, arm: str) -> str:
-    """The mean over seeds of the median time from which an arm's pendulums are upright, if any is."""
-    found = medians([times_of(row["times"]) for row in findings.runs[arm] if row["times"]])
-    return f", after {number(float(found.mean()))} s" if len(found) else ""
+    """Format the mean over seeds of the median time after which an arm's pendulums are upright."""
+    times = medians([times_of(row["times"]) for row in findings.runs[arm] if row["times"]])
+    return f", after {number(float(times.mean()))} s" if len(times) else ""
 
 
 def _minus(text: str) -> str:
@@ -129,19 +130,19 @@ def _minus(text: str) -> str:
 
 
 def verdicts_line(verdicts: Judged) -> str:
-    """How many statements came to what."""
+    """Return a line with the number of statements by outcome."""
     paper = [(claim, verdict) for claim, verdict in verdicts if claim.source == PAPER_SAYS]
     counts = collections.Counter(verdict.outcome for claim, verdict in paper if claim.counted)
-    said = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
+    outcomes = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
     return f"""\
-**Of {counts.total()} statements: {said}.** *Confirmed*, *not confirmed*, *open*: the 95 % interval [in brackets] is
+**Of {counts.total()} statements: {outcomes}.** *Confirmed*, *not confirmed*, *open*: the 95 % interval [in brackets] is
 inside, outside, across what is said. *Compatible*: what one run or episode showed could be one of ours; the more these
 scatter, the easier.
 """
 
 
 def _draw(findings: Findings, folder: Path) -> dict[Path, str]:
-    """Draw what there is: the figures, and what they show."""
+    """Draw all figures that have data; return their captions."""
     shown: dict[Path, str] = {}
     for task in dict.fromkeys(claim.task for claim, _ in findings.verdicts):
         kinds: dict[str, tuple[Callable[[Path, str, Table], bool], str]] = {
@@ -160,7 +161,7 @@ def _draw(findings: Findings, folder: Path) -> dict[Path, str]:
 
 
 def _pictures(drawn: dict[Path, str]) -> str:
-    """Learning is shown, the rest linked."""
+    """Return Markdown that shows the learning curves and links the other figures."""
     lines: dict[str, list[str]] = {}
     for path, caption in drawn.items():
         title, _, kind = caption.partition(": ")
@@ -169,9 +170,9 @@ def _pictures(drawn: dict[Path, str]) -> str:
     return "\n\n".join(f"{title}: {', '.join(links)}" for title, links in lines.items()) + "\n"
 
 
-def _how(findings: Findings) -> str:
-    """How it was measured, and where the numbers are."""
-    rows = [row for of_arm in findings.runs.values() for row in of_arm]
+def _method(findings: Findings) -> str:
+    """Return the section on the method, with links to the numbers."""
+    rows = [row for arm_rows in findings.runs.values() for row in arm_rows]
     hours = sum(float(row["seconds"]) for row in rows) / 3600
     files = (
         (CLAIM_ROWS, "verdicts"),
@@ -192,7 +193,7 @@ actuator of its training. `scripts/reproduce.py` ([how](../reproduction.md)) wri
 
 
 def _missing(findings: Findings) -> str:
-    """What is not there, and what went wrong."""
+    """Return the section on missing and failed trainings."""
     lines: Iterable[str] = [
         f"- {name}: seeds {numbers_as_text(seeds)}" for name, seeds in findings.missing.items()
     ]

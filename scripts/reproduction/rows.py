@@ -1,4 +1,4 @@
-"""What is published of a training: a row of numbers as text, which alone is judged; and how run folders make one."""
+"""Published rows: the results of a training as text, by which claims are judged."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,37 +20,41 @@ from codrl_mj.training.history import EPISODE_COLUMNS, read_episodes
 from reproduction.arms import CENTRE, TEST, PaperArm
 
 Row = Mapping[str, str]
-"""A training and its test; empty where nothing is known."""
+"""Row of a training and its tests; unknown values are empty."""
 LAST = 50
-"""Training episodes that the paper takes its means over."""
-FULL_LENGTH = 4000.0  # steps of an epoch
-FULL_RETURN = 3800.0  # of an epoch, that "approaches 4000"
-# upright and still, by what full torque can do: it just holds the rod at 0.41 rad, of which this is
-# half, and changes its speed by so much within a step
-UPRIGHT_ANGLE = 0.2  # rad
-UPRIGHT_SPEED = 3 * MAX_TORQUE * 0.05  # rad/s: torque * step / (m l^2 / 3)
+"""Number of the last training episodes whose mean return the paper reports."""
+# Number of steps of an epoch.
+FULL_LENGTH = 4000.0
+# Return of an epoch that "approaches 4000" in the paper.
+FULL_RETURN = 3800.0
+# The limits of upright and still follow from full torque. It just holds the rod at 0.41 rad; the
+# angle [rad] is half of that. The speed [rad/s] is the change within a step,
+# torque * step / (m l^2 / 3).
+UPRIGHT_ANGLE = 0.2
+UPRIGHT_SPEED = 3 * MAX_TORQUE * 0.05
 RUNS = "runs.csv"
-"""The file of the rows."""
+"""File of the rows."""
 TESTED = (
     *("returns", "success", "time_to_goal", "tracking_rms", "tracking_percent", "tracking_max"),
     *("saturated_percent", "peak_voltage"),
 )
-"""Measures of the test in a row, as docs/evaluation.md has them: means, and the median time to the goal."""
+"""Measures of the test, as in docs/evaluation.md: means, and the median time to the goal."""
 FURTHER = ("centred", "long_epoch", "paid_epoch", "upright", "times")
-"""Those of single tasks: share of steps near the centre, first epochs, share of episodes that end
-upright; and the times of all test episodes to the goal, or upright [s], `-` where it was not
-reached.
+"""Measures of single tasks.
+
+They are the share of steps near the center, first epochs, the share of episodes that end upright,
+and the times of all test episodes to the goal, or upright [s], with `-` if it was not reached.
 """
 COLUMNS = (
     *("task", "settings", "motor", "gains", "physics", "seed", "run", "seconds", f"last_{LAST}"),
     *(*TESTED, *FURTHER),
 )
-"""All of a row."""
+"""All columns of a row."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
-    """A finished run and its tests."""
+    """Finished run with its tests."""
 
     folder: Path
     """Run folder."""
@@ -68,7 +72,7 @@ class Trained:
 
 @dataclasses.dataclass(frozen=True)
 class Epochs:
-    """A training by epochs: entry e is about the episodes that ended in epoch e + 1, and NaN if none did."""
+    """Training by epochs: means over the episodes that ended in each epoch, NaN if none did."""
 
     returns: np.ndarray
     """Mean return, shape (epochs,)."""
@@ -79,56 +83,63 @@ class Epochs:
 
 
 def identity(arm: PaperArm, seed: int) -> tuple[str, ...]:
-    """What a row is of, as `of_row` has it."""
+    """Return the identity of a training's row, in the order of `identity_of_row`."""
     return arm.task, arm.settings, arm.motor, arm.physics, str(seed)
 
 
-def of_row(row: Row) -> tuple[str, ...]:
-    """What a row is of."""
+def identity_of_row(row: Row) -> tuple[str, ...]:
+    """Return the identity of a row: task, settings, motor, physics and seed."""
     return row["task"], row["settings"], row["motor"], row["physics"], row["seed"]
 
 
 def read_rows(folder: Path) -> dict[tuple[str, ...], list[Row]]:
-    """Published rows by what they are of: several where a seed was trained with different packages."""
-    found: dict[tuple[str, ...], list[Row]] = {}
+    """Return published rows by identity; a seed with several versions of packages has several."""
+    rows_by_identity: dict[tuple[str, ...], list[Row]] = {}
     for row in read_csv(folder / RUNS):
-        found.setdefault(of_row(row), []).append({name: row.get(name, "") for name in COLUMNS})
-    return found
+        rows_by_identity.setdefault(identity_of_row(row), []).append(
+            {name: row.get(name, "") for name in COLUMNS}
+        )
+    return rows_by_identity
 
 
 def complete(rows: Iterable[Row], columns: set[str]) -> bool:
-    """Whether a training needs not be done again, since a row of it has what is judged by."""
+    """Return True if a row of a training has all columns that are needed, so it need not run."""
     return any(all(row[column] for column in columns) for row in rows)
 
 
 def joined(rows: Sequence[Row], new: Row) -> list[Row]:
-    """Rows of a seed with a new one, in place of one of the same training; with other packages it is another."""
+    """Add a row to those of its seed, in place of a row of the same training.
+
+    Trainings with other versions of packages have other results, and are kept.
+    """
 
     def training(row: Row) -> list[str]:
         return [row[name] for name in (f"last_{LAST}", *TESTED)]
 
-    others = [row for row in rows if row["run"] != new["run"] and training(row) != training(new)]
-    return [*others, new]
+    other_rows = [
+        row for row in rows if row["run"] != new["run"] and training(row) != training(new)
+    ]
+    return [*other_rows, new]
 
 
 def times_of(text: str) -> np.ndarray:
-    """Times [s] from a row's text, shape (episodes,); infinite where the goal was not reached."""
+    """Parse times [s] from a row's text, shape (episodes,); infinite if not at the goal."""
     return np.array([np.inf if time == "-" else float(time) for time in text.split()])
 
 
-def read_trained(arm: PaperArm, found: Collected) -> dict[int, Trained]:
-    """The runs of an arm that are at hand, finished and tested, by seed.
+def read_trained(arm: PaperArm, collected: Collected) -> dict[int, Trained]:
+    """Return the runs of an arm that are finished and tested, by seed.
 
     Raises:
         ValueError: a file of a run is damaged.
     """
     runs = {}
-    for seed in found.grid.seeds_of(arm):
-        folder, by_test = found.folders.get((arm.name, seed)), arm.trials.items()
+    for seed in collected.grid.seeds_of(arm):
+        folder, by_test = collected.folders.get((arm.name, seed)), arm.trials.items()
         if folder is not None and all(
-            seed in found.evaluations[trial.name] for _, trial in by_test
+            seed in collected.evaluations[trial.name] for _, trial in by_test
         ):
-            tests = {test: found.evaluations[trial.name][seed] for test, trial in by_test}
+            tests = {test: collected.evaluations[trial.name][seed] for test, trial in by_test}
             runs[seed] = Trained(
                 folder, read_episodes(folder / EPISODES), tests, training_seconds(folder)
             )
@@ -136,7 +147,7 @@ def read_trained(arm: PaperArm, found: Collected) -> dict[int, Trained]:
 
 
 def run_row(arm: PaperArm, seed: int, run: Trained) -> Row:
-    """The row of a finished run."""
+    """Return the row of a finished run."""
     row: dict[str, Any] = {
         name: getattr(arm, name) for name in ("task", "settings", "motor", "gains", "physics")
     }
@@ -148,8 +159,8 @@ def run_row(arm: PaperArm, seed: int, run: Trained) -> Row:
     if CENTRE in run.tests:
         row["centred"] = plain(run.tests[CENTRE]["returns"]) / TASKS[arm.task].max_episode_steps
         epochs = epochs_of(arm, run)
-        row["long_epoch"] = first(epochs.lengths >= FULL_LENGTH)
-        row["paid_epoch"] = first(epochs.returns >= FULL_RETURN)
+        row["long_epoch"] = first_epoch(epochs.lengths >= FULL_LENGTH)
+        row["paid_epoch"] = first_epoch(epochs.returns >= FULL_RETURN)
     else:
         times = run.tests[TEST]["episode_times_to_goal"]
         if arm.task == "pendulum":
@@ -160,27 +171,29 @@ def run_row(arm: PaperArm, seed: int, run: Trained) -> Row:
 
 
 def run_tests(arm: PaperArm, folder: Path, episodes: int) -> list[Episode]:
-    """The first test episodes of a run's policy."""
+    """Run the first test episodes of a run's policy."""
     return run_episodes(load_policy(folder), arm.trials[TEST].env.make, episodes, EVALUATION_SEED)
 
 
 def upright_since(episode: Episode) -> float | None:
-    """Time from which the pendulum is upright and still to the end [s]; None if not over the last second."""
+    """Return the time from which the pendulum stays upright and still [s].
+
+    It is None if that does not hold over the last second.
+    """
     angle, speed = np.abs(upright_angle(episode.state.T)), np.abs(episode.state[:, 1])
     step = float(episode.time[0])
     since = holds_since((angle <= UPRIGHT_ANGLE) & (speed <= UPRIGHT_SPEED)) * step
-    return (
-        since if since + GOAL_HOLD < episode.time[-1] + 0.5 * step else None
-    )  # half a step: rounding
+    # Half a step absorbs rounding.
+    return since if since + GOAL_HOLD < episode.time[-1] + 0.5 * step else None
 
 
-def first(reached: np.ndarray) -> int:
-    """The first epoch in which something holds; one more than there are if it never does."""
+def first_epoch(reached: np.ndarray) -> int:
+    """Return the first epoch in which a condition holds, or one more than there are."""
     return 1 + int(np.argmax(np.append(reached, True)))
 
 
 def epochs_of(arm: PaperArm, run: Trained) -> Epochs:
-    """A training by its epochs, which are the agent's rollouts."""
+    """Return a training by its epochs, which are the agent's rollouts."""
     steps = arm.config.agent.rollout_steps * arm.config.num_envs  # type: ignore[attr-defined]
     return by_epoch(run, steps, -(-(arm.config.total_steps or 0) // steps))
 
@@ -189,9 +202,9 @@ def by_epoch(run: Trained, steps: int, count: int) -> Epochs:
     """Sort a run's episodes into epochs.
 
     Args:
-        run: the run.
-        steps: of an epoch.
-        count: of epochs.
+        run: finished run.
+        steps: steps of an epoch.
+        count: number of epochs.
     """
     epoch = np.ceil(run.column("steps") / steps).astype(int) - 1
     numbers = np.bincount(epoch, minlength=count)[:count]

@@ -1,4 +1,4 @@
-"""The paper's experiments done again, as a program: their grid, and what it writes."""
+"""Command line of the reproduction: its grid of runs, and its outputs."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -27,31 +27,31 @@ _COLOURS = {CONFIRMED: "green", COMPATIBLE: "cyan", NOT_CONFIRMED: "red"}
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reproduction(Program):
-    """Do the paper's experiments again, judge what it reports, and write a page: docs/reproduction.md.
+    """Repeat the paper's experiments, judge its statements, and write a page: docs/reproduction.md.
 
-    What is published is not computed again: the same command resumes and adds seeds, whose rows are
-    published as they finish. Example: python scripts/reproduce.py --dry-run, or with pendulum
-    --settings repaired --seeds 20 --jobs 2
+    Published trainings are not computed again: the same command resumes a study and adds seeds,
+    whose rows are published as they finish. Example: python scripts/reproduce.py --dry-run, or with
+    pendulum --settings repaired --seeds 20 --jobs 2
     """
 
     tasks: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
         tyro.conf.arg(
-            metavar="{" + ",".join(TASKS) + "}", help="Whose experiments; all if none is named."
+            metavar="{" + ",".join(TASKS) + "}", help="Tasks of the experiments; default: all."
         ),
     ] = TASKS
     settings: tuple[str, ...] = ("paper", "repaired")
-    """Of the agents: those that the paper prints, and those that learn where these do not."""
+    """Settings of the agents: as printed in the paper, and repaired where these do not learn."""
     root: Path = Path("runs/paper")
     """Folder of the run folders."""
     sarsa_seeds: int = integer(30, least=1)
     """Training runs of each kind of SARSA (mountain_car), which take seconds."""
     episodes: int | None = integer(None, least=1)
-    """Cut every training off after so many episodes, for trying things out; the default is the paper's budgets."""
+    """Maximum number of training episodes, for quick trials; default: the paper's budgets."""
     test_episodes: int = integer(100, least=1)
     """Test episodes of each policy."""
     mesh: tyro.conf.Suppress[Mesh] = Mesh()
-    """Of value iteration."""
+    """Mesh of value iteration."""
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -66,7 +66,7 @@ class Reproduction(Program):
 
     @property
     def every(self) -> Grid:
-        """All chosen trainings and their tests, whether they are published or not."""
+        """Chosen trainings and their tests, whether they are published or not."""
         arms = [arm for arm in ARMS if arm.task in self.tasks and arm.settings in self.settings]
         if self.episodes is not None:
             arms = [arm.cut_off(self.episodes) for arm in arms]
@@ -75,43 +75,48 @@ class Reproduction(Program):
 
     @property
     def grid(self) -> Grid:
-        """Those that are not published: of each arm from the first seed on whose row lacks something."""
+        """Chosen trainings that are not published, from each arm's first incomplete seed on."""
         every, rows = self.every, published_rows(self.out / FOLDER, self.plan)
 
-        def left(arm: Any) -> range:
+        def remaining_seeds(arm: Any) -> range:
             columns, planned = needed(arm.name), self._seeds(arm)
-            lacking = (
+            incomplete = (
                 seed
                 for seed in range(planned)
                 if not complete(rows.get(identity(arm, seed), ()), columns)
             )
-            return range(next(lacking, planned), planned)
+            return range(next(incomplete, planned), planned)
 
-        seeds = {arm.name: left(arm) for arm in every.arms}
+        seeds = {arm.name: remaining_seeds(arm) for arm in every.arms}
         return dataclasses.replace(every, seeds_of=lambda arm: seeds[arm.name])
 
     def _seeds(self, arm: Arm) -> int:
         return self.sarsa_seeds if arm.config.agent.name == "sarsa" else self.seeds
 
     def publish(self) -> None:
-        """Write the rows of what is finished beside those that are published, and nothing else."""
+        """Write the rows of finished trainings beside the published ones, and nothing else."""
         folder = self.out / FOLDER
-        before, found = published_rows(folder, self.plan), self.every.collect()
-        chosen = [arm for arm in found.grid.arms if isinstance(arm, PaperArm)]
+        published_by_identity, collected = published_rows(folder, self.plan), self.every.collect()
+        chosen = [arm for arm in collected.grid.arms if isinstance(arm, PaperArm)]
         new = {
             identity(arm, seed): rows
             for arm in chosen
-            for seed, rows in arm_rows(arm, read_trained(arm, found), before).items()
+            for seed, rows in arm_rows(
+                arm, read_trained(arm, collected), published_by_identity
+            ).items()
         }
         if new:
-            write_csv(folder / RUNS, [row for rows in (before | new).values() for row in rows])
+            write_csv(
+                folder / RUNS,
+                [row for rows in (published_by_identity | new).values() for row in rows],
+            )
 
     def findings(self) -> Findings:
-        """What there is, and what it says."""
+        """Judge all results."""
         return gather(self.every, self.plan, self.out / FOLDER, self.mesh)
 
     def write(self) -> tuple[Iterable[Path], Mapping[str, str]]:
-        """The page of what there is; the verdicts are printed too."""
+        """Write the page of all results, print the verdicts; return files and failures."""
         findings = self.findings()
         files = write(findings, self.out)
         table = Table(
@@ -123,8 +128,8 @@ class Reproduction(Program):
                 if verdict.measured is None
                 else "{} [{}, {}]".format(*map(number, verdict.measured))
             )
-            says = f"{claim.statement}: {claim.says} ({claim.settings})"
+            reported = f"{claim.statement}: {claim.says} ({claim.settings})"
             outcome = f"[{_COLOURS.get(verdict.outcome, 'yellow')}]{verdict.outcome}[/]"
-            table.add_row(claim.task, claim.source, says, ours, str(verdict.samples), outcome)
+            table.add_row(claim.task, claim.source, reported, ours, str(verdict.samples), outcome)
         Console().print(table)
         return files, findings.failures

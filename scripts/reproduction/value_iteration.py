@@ -1,7 +1,7 @@
-"""Value iteration of the continuous mountain car: what the best policy is worth, and does, at a discount factor.
+"""Value iteration of the continuous mountain car: the best policy and its value by discount.
 
-The dynamics are the installed Gymnasium environment's, driven by `codrl_mj.physics.analytic`;
-reward and end are the task's. Nothing of them is written down here again.
+The dynamics are those of the installed Gymnasium environment, which `codrl_mj.physics.analytic`
+steps. Reward and termination are the task's. Nothing of them is repeated here.
 """
 
 import dataclasses
@@ -23,14 +23,14 @@ DISCOUNTS = (0.85, 0.9, 0.95, 0.99, 0.999)
 
 @dataclasses.dataclass(frozen=True)
 class Mesh(Checked):
-    """Where values are computed; between its points they are interpolated."""
+    """Grid of states at which values are computed, with interpolation between its points."""
 
     positions: int = integer(121, least=2)
-    """Points from wall to wall, >= 2."""
+    """Number of positions from wall to wall, >= 2."""
     speeds: int = integer(121, least=2)
-    """Points between the speed limits, >= 2."""
+    """Number of speeds between the limits, >= 2."""
     forces: int = integer(21, least=3)
-    """Forces to choose from, evenly from -1 N to 1 N, >= 3; an odd number, so that there is one of 0."""
+    """Number of forces, evenly from -1 N to 1 N, >= 3; odd, so that one of them is 0."""
 
     def __post_init__(self) -> None:
         """Validate.
@@ -44,14 +44,14 @@ class Mesh(Checked):
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """The points' positions [m] and speeds [m/s]."""
+        """Positions [m] and speeds [m/s] of the points."""
         space = TASKS[TASK].observation_space
         (x_low, v_low), (x_high, v_high) = space.low.astype(float), space.high.astype(float)
         return np.linspace(x_low, x_high, self.positions), np.linspace(v_low, v_high, self.speeds)
 
     @property
     def actions(self) -> np.ndarray:
-        """The forces [N]."""
+        """Forces [N]."""
         return np.linspace(-1.0, 1.0, self.forces)
 
 
@@ -59,7 +59,7 @@ class Model:
     """One step of the car from every point of a grid under every force."""
 
     def __init__(self, grid: Mesh = Mesh()) -> None:
-        """Step Gymnasium's environment from every point: some seconds."""
+        """Step Gymnasium's environment from every point, which takes some seconds."""
         from scipy import sparse
 
         task = TASKS[TASK]
@@ -86,23 +86,26 @@ class Model:
         self.transitions = sparse.diags_array((~ends).astype(float)) @ interpolation(
             grid, entries.T
         )
-        """Weights of the points' values in what comes after, shape (A*S, S); none where the episode ends."""
+        """Weights of the points' values in the next state, (A*S, S); 0 if the episode ends."""
 
 
 def interpolation(grid: Mesh, states: np.ndarray) -> Any:
-    """Weights with which values at the grid's points make values at states: bilinear, a sparse matrix (n, S).
+    """Return the weights of bilinear interpolation as a sparse matrix (n, S).
+
+    They give values at states from values at the grid's points.
 
     Args:
-        grid: the grid.
-        states: positions and speeds, shape (n, 2); beyond the grid those at its edge count.
+        grid: grid of the values.
+        states: positions and speeds, shape (n, 2); states beyond the grid are moved to its edge.
     """
     from scipy import sparse
 
     below, share = [], []
     for axis, values in zip(grid.axes, states.T, strict=True):
-        place = np.clip((values - axis[0]) / (axis[1] - axis[0]), 0, len(axis) - 1)
-        below.append(np.minimum(place.astype(int), len(axis) - 2))
-        share.append(place - below[-1])
+        position = np.clip((values - axis[0]) / (axis[1] - axis[0]), 0, len(axis) - 1)
+        # The last point belongs to the cell below it.
+        below.append(np.minimum(position.astype(int), len(axis) - 2))
+        share.append(position - below[-1])
     corners = [(i, j) for i in (0, 1) for j in (0, 1)]
     weights = [np.abs(1 - i - share[0]) * np.abs(1 - j - share[1]) for i, j in corners]
     columns = [(below[0] + i) * grid.speeds + below[1] + j for i, j in corners]
@@ -114,42 +117,42 @@ def interpolation(grid: Mesh, states: np.ndarray) -> Any:
 def iterate(
     rewards: np.ndarray, transitions: Any, discount: float, accuracy: float = 1e-4
 ) -> np.ndarray:
-    """Value iteration: the values of every action at every state, Q = r + discount * P max Q.
+    """Compute Q = r + discount * P max Q, the value of each action at each state, by iteration.
 
-    It ends when the last change times discount/(1 - discount), which bounds the error left, is
+    It ends when the last change times discount/(1 - discount), which bounds the remaining error, is
     below the accuracy.
 
     Args:
-        rewards: shape (A, S).
-        transitions: probabilities of the states that come next, shape (A*S, S); rows of 0 where the
-            episode ends.
-        discount: from 0 to below 1.
-        accuracy: of the values.
+        rewards: rewards, shape (A, S).
+        transitions: probabilities of the next states, shape (A*S, S); rows of 0 where the episode
+            ends.
+        discount: discount factor, from 0 to below 1.
+        accuracy: largest error of the values.
 
     Returns:
         Q, shape (A, S).
 
     Raises:
-        ValueError: the discount is out of bounds: the sum would not converge.
+            ValueError: the discount is out of bounds; the sum would not converge.
     """
     if not 0 <= discount < 1:
         raise ValueError(f"discount = {discount}: must be from 0 to below 1")
     values = np.zeros(rewards.shape[1])
     while True:
-        of_actions = rewards + discount * (transitions @ values).reshape(rewards.shape)
-        best = of_actions.max(axis=0)
+        action_values = rewards + discount * (transitions @ values).reshape(rewards.shape)
+        best = action_values.max(axis=0)
         change = np.abs(best - values).max()
         values = best
         if change * discount <= accuracy * (1 - discount):
-            return of_actions
+            return action_values
 
 
 class Greedy:
-    """The policy that takes the best action by interpolated values."""
+    """Policy that takes the best action by interpolated values."""
 
-    def __init__(self, grid: Mesh, of_actions: np.ndarray) -> None:
-        """Keep the values, shape (A, S)."""
-        self._grid, self._of_actions = grid, of_actions
+    def __init__(self, grid: Mesh, action_values: np.ndarray) -> None:
+        """Store the grid and the values, shape (A, S)."""
+        self._grid, self._action_values = grid, action_values
 
     def predict(
         self,
@@ -157,21 +160,21 @@ class Greedy:
         *,
         deterministic: bool = False,  # noqa: ARG002 - the protocol's
     ) -> tuple[np.ndarray, Any]:
-        """The best force for each observation (position and speed), shape (n, 1)."""
-        values = interpolation(self._grid, observation.astype(float)) @ self._of_actions.T
+        """Return the best force for each observation (position and speed), shape (n, 1)."""
+        values = interpolation(self._grid, observation.astype(float)) @ self._action_values.T
         return self._grid.actions[np.argmax(values, axis=1)][:, None], None
 
 
 @dataclasses.dataclass(frozen=True)
 class Optimum:
-    """The best policy at a discount factor, and what it does in Gymnasium's environment."""
+    """Best policy at a discount factor, and its results in Gymnasium's environment."""
 
     discount: float
-    """The discount factor."""
+    """Discount factor."""
     value: float
-    """The discounted return that it expects from x = -0.5 m at rest."""
+    """Expected discounted return from x = -0.5 m at rest."""
     stands_still: bool
-    """It applies no force at all in any episode."""
+    """True if no force is applied in any episode."""
     returns: Interval
     """Return (not discounted) of the episodes."""
     success: float
@@ -179,10 +182,10 @@ class Optimum:
     steps: Quartiles | None
     """Steps to the goal; None if no episode reaches it."""
     episode: Episode
-    """The first episode."""
+    """First episode."""
 
     def as_mapping(self) -> dict[str, Any]:
-        """JSON-serialisable values, without the episode."""
+        """Return JSON-serializable values, without the episode."""
         mapping = {name: value for name, value in vars(self).items() if name != "episode"}
         return mapping | {
             "returns": self.returns._asdict(),
@@ -194,35 +197,37 @@ def optimum(model: Model, discount: float, episodes: int = 20) -> Optimum:
     """Find the best policy and let it drive Gymnasium's own car, without a motor.
 
     Args:
-        model: the steps of the car.
-        discount: from 0 to below 1.
-        episodes: seeds from 0.
+        model: steps of the car.
+        discount: discount factor, from 0 to below 1.
+        episodes: number of episodes, with seeds from 0.
     """
-    of_actions = iterate(model.rewards, model.transitions, discount)
-    ran = run_episodes(
-        Greedy(model.grid, of_actions),
+    action_values = iterate(model.rewards, model.transitions, discount)
+    test_episodes = run_episodes(
+        Greedy(model.grid, action_values),
         EnvConfig(TASK, None, physics="analytic").make,
         episodes=episodes,
     )
-    lengths = np.array([len(episode.reward) for episode in ran if episode.terminated])
+    lengths = np.array([len(episode.reward) for episode in test_episodes if episode.terminated])
     return Optimum(
         discount=discount,
-        value=start_value(model, of_actions),
-        stands_still=all(not episode.action.any() for episode in ran),
-        returns=bootstrap_mean(np.array([episode.total for episode in ran])),
-        success=len(lengths) / len(ran),
+        value=start_value(model, action_values),
+        stands_still=all(not episode.action.any() for episode in test_episodes),
+        returns=bootstrap_mean(np.array([episode.total for episode in test_episodes])),
+        success=len(lengths) / len(test_episodes),
         steps=quartiles(lengths) if len(lengths) else None,
-        episode=ran[0],
+        episode=test_episodes[0],
     )
 
 
-def start_value(model: Model, of_actions: np.ndarray) -> float:
-    """Value of x = -0.5 m at rest, the middle of the starts, from Q of shape (A, S)."""
-    return float((interpolation(model.grid, np.array([[-0.5, 0.0]])) @ of_actions.max(axis=0))[0])
+def start_value(model: Model, action_values: np.ndarray) -> float:
+    """Return the value of x = -0.5 m at rest, the middle of the starts, from Q of shape (A, S)."""
+    return float(
+        (interpolation(model.grid, np.array([[-0.5, 0.0]])) @ action_values.max(axis=0))[0]
+    )
 
 
 def values_over(model: Model, discounts: Sequence[float]) -> dict[float, float]:
-    """Values of x = -0.5 m at rest by discount factor."""
+    """Return the values of x = -0.5 m at rest by discount factor."""
     return {
         discount: start_value(model, iterate(model.rewards, model.transitions, discount))
         for discount in discounts

@@ -17,15 +17,15 @@ from codrl_mj.tasks import find_task
 from insurance_study.learning import still_rising
 from insurance_study.page import PLANNED
 from insurance_study.questions import (
-    DOSES,
     HARMLESS,
     REMEMBERED,
+    SEVERITIES,
     TASKS,
     double,
     generic,
     half,
     late,
-    new,
+    needs_new_policies,
     primary,
     reach,
     secondary,
@@ -100,14 +100,14 @@ def test_doses_and_reaches_follow_from_the_first_study_by_the_rules_of_the_plan(
             spared = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].spared, known)]
             assert harmless == (spared[-1] if spared else 0.0)
             assert reach(task, axis) == (2 * harmless or AXES[axis].doses[1])
-    for axis, dose in DOSES["acrobot"].items():
+    for axis, dose in SEVERITIES["acrobot"].items():
         hurt = [d for d in AXES[axis].doses[1:] if evidence.loss("acrobot", axis, d).outcome.hurt]
         assert dose == (hurt[0] if hurt else AXES[axis].doses[-1])
 
 
 def test_the_plan_is_what_is_computed():
     plan = (RESULTS / "insurance_plan.md").read_text()
-    arms = {trial.arm.name for trial in trials() if new(trial)}
+    arms = {trial.arm.name for trial in trials() if needs_new_policies(trial)}
     assert f"{len(arms)} new arms" in plan
     assert f"p before {PLANNED} policies of every kind" in plan
     assert f"All others ({len(secondary())}, each of one task)" in " ".join(plan.split())
@@ -191,7 +191,7 @@ def test_what_is_so_stands_on_the_page(written):
     assert rows["I3"]["outcome"] == "yes"
     page = (out / "insurance.md").read_text()
     assert "| random actuators | 1.00 | 0.70, 0.70; 24 of 24;" in page  # 4 policies on 6 doses
-    assert "| the very dose | 1.00 | 0.90, 0.90;" in page
+    assert "| the same dose | 1.00 | 0.90, 0.90;" in page
     assert "| Acrobot, a step of 200 ms | ideal forces |" in page
     assert "| delay 600 ms (400 ms) | 0.50; 4; " in page.replace("\u00a0", " ")
     (row,) = (line for line in page.splitlines() if line.startswith("| friction 0.2 N·m | "))

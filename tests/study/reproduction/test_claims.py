@@ -28,7 +28,7 @@ from reproduction.rows import (
     times_of,
     upright_since,
 )
-from reproduction.rows import first as reached
+from reproduction.rows import first_epoch as reached
 from tests.study.reproduction.worlds import OTHERS, PAPERS, made_up, trained, world
 
 ARM = {arm.name: arm for arm in ARMS}
