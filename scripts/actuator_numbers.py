@@ -217,34 +217,34 @@ def page(tables: Mapping[str, list[dict[str, str]]]) -> str:
     loop = motors[0]
     return f"""# Actuators in numbers
 
-This page lists the response of every named [actuator](actuators.md). It is measured in simulation on
-one hinge that is either blocked or free to turn. The CSV files have more values:
+This page lists the response of every named [actuator](actuators.md). It is measured in simulation
+on one hinge that is either blocked or free to turn. The CSV files have more values:
 [tasks]({TABLES["tasks"]}), [motors]({TABLES["motors"]}).
 
 ![Share of the largest force that each of the paper's actuators delivers](pictures/actuators_in_numbers.png)
 
 ## The paper's actuators
 
-The desired force steps from zero to the task's largest force. Each entry is the range over the tasks.
-A settling time of 0 means that the force settles within the first integration step. All forces have
-settled after {LONG:g} s.
+The desired force steps from zero to the task's largest force. Each entry is the range over the
+tasks. A settling time of 0 means that the force settles within the first integration step. All
+forces have settled after {LONG:g} s.
 
 {_table(["", *actuator_names], [[words, *_ranges(tasks, column)] for words, column in paper.items()])}
 
 ## The catalogue
 
-Each motor has its own gear and its nominal voltage (24 V if the datasheet prints none). The winding is
-cold, and the current is not limited. With a current loop at 20 kHz (bandwidth
+Each motor has its own gear and its nominal voltage (24 V if the datasheet prints none). The
+winding is cold, and the current is not limited. With a current loop at 20 kHz (bandwidth
 {_number(loop["bandwidth_hz"], 4)} Hz) the current settles in {_number(loop["settled_2_ms"])} ms.
 
 {_table(heads, map(_motor_line, motors))}
 
-Torques are net torques at the output, after friction. The *continuous* torque belongs to the largest
-current that the winding can carry continuously. A "t" after the name marks motors with thermal values.
-A "–" marks values that the datasheet does not print. Stall torque and no-load speed are measured in
-simulation and agree with the printed values within 5 %.
+Torques are net torques at the output, after friction. The *continuous* torque belongs to the
+largest current that the winding can carry continuously. A "t" after the name marks motors with
+thermal values. A "–" marks values that the datasheet does not print. Stall torque and no-load
+speed are measured in simulation and agree with the printed values within 5 %.
 
-`codrl-mj motor show NAME` prints the source of every value, and contradictions within the datasheet.
+`codrl-mj motor show NAME` prints the source of every value and contradictions in the datasheet.
 """
 
 
