@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from codrl_mj import fields
-from codrl_mj.actuators.noise import LOAD_STREAM, philox, unit
+from codrl_mj.actuators.noise import LOAD_STREAM, philox, uniform
 from codrl_mj.fields import real
 
-__all__ = ["OFF", "PLAIN", "Disturbances", "Joint", "check_delay", "resolve"]
+__all__ = ["NO_DISTURBANCES", "UNMODIFIED_JOINT", "Disturbances", "Joint", "check_delay", "resolve"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,22 +34,22 @@ class Disturbances(fields.Checked):
             and bound.
     """
 
-    command_delay: float = real(0.0, least=0, unit="s")
+    command_delay: float = real(0.0, minimum=0, unit="s")
     """Delay of the command [s], >= 0; where it is no whole number of integration steps, the two
     neighbouring commands are interpolated linearly. Until the first command arrives, a position is
     held, and others are zero.
     """
-    command_quantum: float = real(0.0, least=0, unit="N")
+    command_quantum: float = real(0.0, minimum=0, unit="N")
     """Quantisation step of the command [N or N*m], >= 0; rounds half to even, and ends at the largest force."""
-    command_rate: float = real(0.0, least=0, unit="N/s")
+    command_rate: float = real(0.0, minimum=0, unit="N/s")
     """Largest change of the command per second [N/s or N*m/s], >= 0; 0: no limit. It starts from
     zero, or from the position at the reset.
     """
-    pulse_force: float = real(0.0, least=0, unit="N")
+    pulse_force: float = real(0.0, minimum=0, unit="N")
     """Size of random load pulses at the actuated joint [N or N*m], >= 0; either sign is as likely."""
-    pulse_duration: float = real(0.0, least=0, unit="s")
+    pulse_duration: float = real(0.0, minimum=0, unit="s")
     """Duration of a load pulse [s], > 0 where there are pulses."""
-    pulse_interval: float = real(0.0, least=0, unit="s")
+    pulse_interval: float = real(0.0, minimum=0, unit="s")
     """Mean time [s] from the start, and from the end of each pulse, to the next; exponentially
     distributed. > 0 where there are pulses.
     """
@@ -75,7 +75,7 @@ class Disturbances(fields.Checked):
         return bool(self.pulse_force)
 
 
-OFF = Disturbances()
+NO_DISTURBANCES = Disturbances()
 """No disturbances."""
 
 
@@ -88,15 +88,15 @@ class Joint(fields.Checked):
             and bound.
     """
 
-    damping: float = real(0.0, least=0, unit="N*s/m")
+    damping: float = real(0.0, minimum=0, unit="N*s/m")
     """Viscous friction [N*s/m or N*m*s/rad], >= 0."""
-    friction: float = real(0.0, least=0, unit="N")
+    friction: float = real(0.0, minimum=0, unit="N")
     """Coulomb friction [N or N*m], >= 0."""
-    armature: float = real(0.0, least=0, unit="kg")
+    armature: float = real(0.0, minimum=0, unit="kg")
     """Inertia [kg or kg*m^2], >= 0, such as a rotor's behind a gear."""
 
 
-PLAIN = Joint()
+UNMODIFIED_JOINT = Joint()
 """Nothing added."""
 
 
@@ -153,17 +153,17 @@ def whole_and_fraction(delay: float, timestep: float) -> tuple[int, float]:
     return math.floor(steps), steps - math.floor(steps)
 
 
-def delayed(newer: float, older: float, fraction: float) -> float:
+def interpolate_delayed(newer: float, older: float, fraction: float) -> float:
     """The command [N or N*m] between two that were given a step apart, `fraction` in [0, 1] of it towards the older."""
     return newer + fraction * (older - newer)
 
 
-def quantised(command: float, quantum: float, limit: float) -> float:
+def quantize(command: float, quantum: float, limit: float) -> float:
     """The nearest multiple of the quantum, half to even, within +-limit, all in [N or N*m]."""
     return np.minimum(np.maximum(quantum * np.rint(command / quantum), -limit), limit)
 
 
-def rate_limited(command: float, before: float, change: float) -> float:
+def limit_rate(command: float, before: float, change: float) -> float:
     """The command, at most `change` away from that of the integration step before, all in [N or N*m]."""
     return np.minimum(np.maximum(command, before - change), before + change)
 
@@ -188,7 +188,7 @@ def pulse_load(
     begin, end = step * timestep, (step + 1.0) * timestep
     w0, w1, sign, _ = philox(int(memory[INDEX]), 0, 0, LOAD_STREAM, key)
     if step == 0.0:
-        memory[START] = -interval * math.log(unit(w0, w1))
+        memory[START] = -interval * math.log(uniform(w0, w1))
     load = 0.0
     while memory[START] < end:
         last = memory[START] + duration
@@ -198,6 +198,6 @@ def pulse_load(
             break
         memory[INDEX] += 1.0
         w0, w1, sign, _ = philox(int(memory[INDEX]), 0, 0, LOAD_STREAM, key)
-        memory[START] = last - interval * math.log(unit(w0, w1))
+        memory[START] = last - interval * math.log(uniform(w0, w1))
     memory[STEP] = step + 1.0
     return load

@@ -21,9 +21,9 @@ from typing import Any
 def real(
     default: float | None,
     above: float | None = None,
-    least: float | None = None,
+    minimum: float | None = None,
     below: float | None = None,
-    most: float | None = None,
+    maximum: float | None = None,
     optional: bool = False,
     unit: str = "",
     infinite: bool = False,
@@ -33,14 +33,14 @@ def real(
     Args:
         default: its default.
         above: it must be greater than this.
-        least: it must be at least this.
+        minimum: it must be at least this.
         below: it must be less than this.
-        most: it must be at most this.
+        maximum: it must be at most this.
         optional: let it be None; so does a default of None.
         unit: for tables and documentation.
         infinite: let it be infinite.
     """
-    limits = [("> ", above), (">= ", least), ("< ", below), ("<= ", most)]
+    limits = [("> ", above), (">= ", minimum), ("< ", below), ("<= ", maximum)]
     kind = "a number" if infinite else "a finite number"
     text = " ".join(
         [kind, " and ".join(f"{sign}{limit:g}" for sign, limit in limits if limit is not None)]
@@ -50,30 +50,30 @@ def real(
         return (
             _is_real(value, infinite)
             and (above is None or value > above)
-            and (least is None or value >= least)
+            and (minimum is None or value >= minimum)
             and (below is None or value < below)
-            and (most is None or value <= most)
+            and (maximum is None or value <= maximum)
         )
 
     low, high = (
         next((limit for limit in pair if limit is not None), None)
-        for pair in ((above, least), (below, most))
+        for pair in ((above, minimum), (below, maximum))
     )
     return _bounded(default, holds, text, optional, unit, float, (low, high))
 
 
 def integer(
-    default: int | None, least: int, optional: bool = False, unit: str = "", most: float = math.inf
+    default: int | None, minimum: int, optional: bool = False, unit: str = "", maximum: float = math.inf
 ) -> Any:
-    """A field for an integer of at least `least`; `optional`, or a default of None, lets it be None."""
+    """A field for an integer of at least `minimum`; `optional`, or a default of None, lets it be None."""
     return _bounded(
         default,
-        lambda value: _is_integer(value) and least <= value <= most,
-        f"an integer >= {least}" if most == math.inf else f"an integer from {least} to {most}",
+        lambda value: _is_integer(value) and minimum <= value <= maximum,
+        f"an integer >= {minimum}" if maximum == math.inf else f"an integer from {minimum} to {maximum}",
         optional,
         unit,
         int,
-        (least, None),
+        (minimum, None),
     )
 
 
@@ -88,7 +88,7 @@ def choice(default: str, *options: str) -> Any:
     return dataclasses.field(default=default, metadata={**made.metadata, "options": options})
 
 
-def units(default: tuple[int, ...]) -> Any:
+def positive_integers(default: tuple[int, ...]) -> Any:
     """A field for the units of a network's hidden layers."""
 
     def holds(value: Any) -> bool:
@@ -99,7 +99,7 @@ def units(default: tuple[int, ...]) -> Any:
     return _bounded(default, holds, "a tuple of integers >= 1")
 
 
-def factors(default: tuple[float, ...] | None = None) -> Any:
+def positive_reals(default: tuple[float, ...] | None = None) -> Any:
     """An optional field for finite numbers > 0, one for each entry of something."""
 
     def holds(value: Any) -> bool:
@@ -170,9 +170,9 @@ def check_names(
     known: Iterable[str],
     what: str,
     prefix: str = "",
-    every: bool = False,
+    list_all: bool = False,
     listed_by: str = "",
-    inner: Iterable[str] = (),
+    nested: Iterable[str] = (),
 ) -> None:
     """Refuse names that are not known; the nearest known ones are suggested.
 
@@ -181,23 +181,23 @@ def check_names(
         known: what they may be.
         what: what to call them, such as `actuator field`.
         prefix: stands before each of them in the message.
-        every: list the known ones beside the nearest, too: for names that somebody else has for the
+        list_all: list the known ones beside the nearest, too: for names that somebody else has for the
             same.
         listed_by: the command that lists them, where they are many.
-        inner: dotted names of what is in their parts, to be suggested to whoever leaves the part
+        nested: dotted names of what is in their parts, to be suggested to whoever leaves the part
             out.
     """
-    known, inner = list(known), list(inner)
+    known, nested = list(known), list(nested)
     for name in given:
         if name not in known:
-            near = [one for one in inner if one.rpartition(".")[2] == name][:3] or _nearest(
+            near = [one for one in nested if one.rpartition(".")[2] == name][:3] or _nearest(
                 name, known
             )
-            near = near or _nearest(name, inner)
+            near = near or _nearest(name, nested)
             hints = (
                 [f"did you mean {' or '.join(f'{prefix}{one}' for one in near)}?"] if near else []
             )
-            if every or not near:
+            if list_all or not near:
                 hints.append(
                     f"`{listed_by}` lists the known ones"
                     if listed_by
@@ -206,21 +206,21 @@ def check_names(
             raise ValueError(f"unknown {what} {prefix}{name}; {' '.join(hints)}")
 
 
-def leaves(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """What nested mappings hold, by dotted names."""
     found: dict[str, Any] = {}
     for key, value in mapping.items():
         found |= (
-            leaves(value, f"{prefix}{key}.")
+            flatten(value, f"{prefix}{key}.")
             if isinstance(value, Mapping)
             else {f"{prefix}{key}": value}
         )
     return found
 
 
-def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """What two mappings have otherwise, by dotted names: both values, `absent` where one has none."""
-    mine, others = leaves(one), leaves(other)
+    mine, others = flatten(one), flatten(other)
     pairs = {
         name: (mine.get(name, "absent"), others.get(name, "absent")) for name in [*mine, *others]
     }
@@ -317,7 +317,7 @@ def build(cls: type, mapping: object, what: str, prefix: str = "") -> Any:
         for field in dataclasses.fields(kind)
     ]
     check_names(
-        mapping, (field.name for field in dataclasses.fields(cls)), what, prefix, inner=inner
+        mapping, (field.name for field in dataclasses.fields(cls)), what, prefix, nested=inner
     )
 
     def built(key: str, value: Any) -> Any:

@@ -97,7 +97,7 @@ def _on_a_slide(task: str) -> bool:
 
 def motor_row(name: str) -> dict[str, Any]:
     """What a motor of the catalogue does at its own gear, at the output, by its nominal voltage or 24 V, still cold."""
-    drive, numbers = find_drive(name), motor_entry(name).numbers
+    drive, numbers = find_drive(name), motor_entry(name).parameters
     loop = design(drive)
     cold = dataclasses.replace(drive.motor, **COLD)
     free = dataclasses.replace(
@@ -195,7 +195,7 @@ def _motor_line(row: dict[str, str]) -> list[str]:
     entry = motor_entry(row["motor"])
     measured = ("stall_torque", "no_load_speed", "continuous_torque")
     return [
-        f"`{row['motor']}`" + (" t" if entry.numbers.thermal_resistance else ""),
+        f"`{row['motor']}`" + (" t" if entry.parameters.thermal_resistance else ""),
         *(_number(row[name]) for name in ("voltage", "gear_ratio", *measured)),
     ]
 

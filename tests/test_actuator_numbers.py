@@ -83,7 +83,7 @@ def test_the_loop_of_the_cartpole_is_python_control_s():
 def test_a_motor_s_row_is_that_of_the_closed_forms():
     """The EC 45 flat, whose loop is P/(z - 1)."""
     row = next(row for row in written("motors") if row["motor"] == "maxon-ec45-flat-50w")
-    numbers, rate, share = motor_entry(row["motor"]).numbers, 20e3, -math.expm1(-0.349)
+    numbers, rate, share = motor_entry(row["motor"]).parameters, 20e3, -math.expm1(-0.349)
     left, constant, free = 1 - share, numbers.torque_constant, 0.238
     angle = math.acos((1 + left**2 - 2 * share**2) / (2 * left))
     expected = {
@@ -107,7 +107,7 @@ def test_every_motor_of_the_catalogue_does_in_the_engine_what_its_datasheet_prin
     """To 5 %; and what follows from its constants, whether that is printed or not."""
     entry, row = motor_entry(name), SCRIPT.motor_row(name)
     same(next(row for row in written("motors") if row["motor"] == name), row)
-    numbers, printed = entry.numbers, entry.datasheet.readings()
+    numbers, printed = entry.parameters, entry.datasheet.readings()
     ratio, passed = numbers.gear_ratio, (numbers.gear_efficiency or 1.0) * numbers.torque_constant
     coulomb, viscous = numbers.coulomb_friction or 0.0, numbers.viscous_friction or 0.0
     volts, ohms, emf = numbers.voltage or 24.0, numbers.resistance, numbers.back_emf_constant

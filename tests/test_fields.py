@@ -15,14 +15,14 @@ from codrl_mj.fields import (
     check_names,
     choice,
     did_you_mean,
-    factors,
+    positive_reals,
     flag,
     integer,
     part,
     parts,
     real,
     reals,
-    units,
+    positive_integers,
 )
 
 BOUNDS = {
@@ -63,7 +63,7 @@ def test_a_number_is_taken_exactly_within_its_bound(bound, value, limit):
 
 @given(value=st.floats() | st.integers(-5, 5).map(float))
 def test_two_bounds_hold_together(value):
-    kind = _settings(real(0.0, above=-2, most=3))
+    kind = _settings(real(0.0, above=-2, maximum=3))
     if -2 < value <= 3:
         assert kind(field=value).field == value
     else:
@@ -81,7 +81,7 @@ def test_where_infinity_is_taken_only_the_bound_counts(value):
 
 @given(value=st.integers(-50, 50), least=st.integers(-9, 9))
 def test_an_integer_is_taken_exactly_within_its_bound(value, least):
-    kind = _settings(integer(least, least=least))
+    kind = _settings(integer(least, minimum=least))
     for of_kind in (int, np.int32, np.int64):
         if value >= least:
             stored = kind(field=of_kind(value)).field
@@ -94,7 +94,7 @@ def test_an_integer_is_taken_exactly_within_its_bound(value, least):
 @given(value=st.floats() | NOT_REAL)
 def test_nothing_but_an_integer_is_one(value):
     assume(value is not None)
-    assert _refusal(_settings(integer(1, least=1)), value) == "an integer >= 1"
+    assert _refusal(_settings(integer(1, minimum=1)), value) == "an integer >= 1"
 
 
 @given(value=NOT_REAL)
@@ -109,7 +109,7 @@ def test_numbers_of_every_kind_are_stored_as_pythons_own(of_kind):
     assert stored == 2.0
 
 
-@pytest.mark.parametrize("field", [real(None), real(1.0, optional=True), integer(None, least=1)])
+@pytest.mark.parametrize("field", [real(None), real(1.0, optional=True), integer(None, minimum=1)])
 def test_none_is_taken_where_it_may_be_and_said_where_it_is_not_given(field):
     kind = _settings(field)
     assert kind(field=None).field is None
@@ -136,13 +136,13 @@ def test_a_choice_is_one_of_its_words():
     ("field", "good", "bad", "bound"),
     [
         (
-            units((64,)),
+            positive_integers((64,)),
             [(1,), (), (2, 3)],
             [(0,), (1.5,), [64], (True,), 64],
             "a tuple of integers >= 1",
         ),
         (
-            factors(),
+            positive_reals(),
             [(1.0, 2), None],
             [(0.0,), (-1,), [1.0], (math.inf,), (math.nan,)],
             "a tuple of finite numbers > 0 or none",
@@ -170,7 +170,7 @@ def test_tuples_hold_what_they_say(field, good, bad, bound):
 class Inner(Checked):
     """A part."""
 
-    gain: float = real(1.0, least=0.0)
+    gain: float = real(1.0, minimum=0.0)
     limit: float = real(2.0, above=0.0)
 
 
@@ -178,7 +178,7 @@ class Inner(Checked):
 class Outer(Checked):
     """With a part that is there and one that may be."""
 
-    size: int = integer(1, least=1)
+    size: int = integer(1, minimum=1)
     always: Inner = Inner()
     maybe: Inner | None = part(Inner())
 

@@ -71,7 +71,7 @@ def other(task=arm.TASK, **fields):
 def test_the_family_runs_in_the_engine_as_in_python():
     env = made(series_elastic.SOFT)
     parameters = codrl_mj.actuators.parameters_type(series_elastic.SeriesElastic)(
-        *series_elastic.SOFT.numbers
+        *series_elastic.SOFT.parameter_values
     )
     states = [series_elastic.State(0.0, 0.0)] * 2
     for action in actions(20, 1)[:, 0]:

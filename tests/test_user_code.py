@@ -35,16 +35,16 @@ def refused(act, begins=r"slips?\.py:\d+, in "):
     return str(caught.value)
 
 
-def name_of(case):
+def display_name(case):
     return str(case).partition(" at 0x")[0][:30]
 
 
-@pytest.mark.parametrize(("field", "value"), slips.TASKS, ids=name_of)
+@pytest.mark.parametrize(("field", "value"), slips.TASKS, ids=display_name)
 def test_a_task_with_a_slip_is_refused_when_it_is_made(field, value):
     refused(lambda: slips.task(**{field: value}), r"slips?\.py:\d+, in |Task\.|unknown integrator")
 
 
-@pytest.mark.parametrize(("part", "value"), slips.FAMILIES, ids=name_of)
+@pytest.mark.parametrize(("part", "value"), slips.FAMILIES, ids=display_name)
 def test_a_family_with_a_slip_is_refused_at_every_door_before_it_is_compiled(
     part, value, monkeypatch
 ):
@@ -72,7 +72,7 @@ def test_a_family_that_is_no_dataclass_or_has_no_advance_is_refused():
 NUMBA = (*slips.LATE[1:], *slips.LATE_FAMILIES)
 
 
-@pytest.mark.parametrize(("name", "body"), but(NUMBA[::4], NUMBA), ids=name_of)
+@pytest.mark.parametrize(("name", "body"), but(NUMBA[::4], NUMBA), ids=display_name)
 def test_what_only_numba_can_refuse_is_a_sentence_too(name, body):
     if name in slips.PARTS:
         family = slips.family(**{name: body})

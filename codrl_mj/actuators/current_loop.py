@@ -37,7 +37,7 @@ class Motor(Checked):
     """Winding inductance L [H], > 0. The paper: 0.1, all tasks."""
     torque_constant: float = real(1.0, above=0.0, unit="N*m/A")
     """Torque constant kT [N*m/A], > 0. The paper: 1, all tasks."""
-    back_emf_constant: float = real(1.0, least=0.0, unit="V*s/rad")
+    back_emf_constant: float = real(1.0, minimum=0.0, unit="V*s/rad")
     """Back-EMF constant kE [V*s/rad], >= 0; equal to kT in SI units for an ideal motor. The paper: 1."""
     arm_radius: float = real(1.0, above=0.0, unit="m")
     """Arm r [m] between shaft and load, > 0: torque = r*F and omega = v/r. On a hinge it is the
@@ -61,29 +61,29 @@ class CurrentLoop(Checked):
             and bound.
     """
 
-    kp: float = real(1.0, least=0.0, unit="V/A")
+    kp: float = real(1.0, minimum=0.0, unit="V/A")
     """Proportional gain [V/A], >= 0."""
-    ki: float = real(0.0, least=0.0, unit="V/(A*s)")
+    ki: float = real(0.0, minimum=0.0, unit="V/(A*s)")
     """Integral gain [V/(A*s)], >= 0."""
-    kd: float = real(0.0, least=0.0, unit="V*s/A")
+    kd: float = real(0.0, minimum=0.0, unit="V*s/A")
     """Derivative gain [V*s/A], >= 0."""
-    kff: float = real(0.0, least=0.0, unit="V/A")
+    kff: float = real(0.0, minimum=0.0, unit="V/A")
     """Feed-forward gain on the reference current [V/A], >= 0; kff = R holds the current without feedback."""
     max_voltage: float = real(24.0, above=0.0, unit="V", infinite=True)
     """Supply limit u_max [V], > 0; `inf` for none. The paper gives no value: 24 V never saturates at its settings."""
     bemf_compensation: bool = flag(True)
     """Add kE*omega to the voltage, which cancels the back-EMF unless the voltage saturates. The paper: yes."""
-    substeps: int = integer(1, least=1)
+    substeps: int = integer(1, minimum=1)
     """Electrical steps within one mechanical step, >= 1: for winding time constants below the mechanical step."""
-    integral_leak: float = real(0.0, least=0.0, unit="1/s")
+    integral_leak: float = real(0.0, minimum=0.0, unit="1/s")
     """Leak rate of the integral [1/s], >= 0: the paper appendix's low-pass form of the integral. 0: a plain sum."""
-    derivative_time_constant: float = real(0.0, least=0.0, unit="s")
+    derivative_time_constant: float = real(0.0, minimum=0.0, unit="s")
     """Time constant [s] of the low-pass on the derivative, >= 0: the appendix's high-pass form of
     the derivative. 0: the plain difference of two samples.
     """
     current_bias: float = real(0.0, unit="A")
     """Offset of the current sensor [A]: the controller measures the current plus this."""
-    current_noise: float = real(0.0, least=0.0, unit="A")
+    current_noise: float = real(0.0, minimum=0.0, unit="A")
     """Standard deviation [A] of the current sensor's white noise, >= 0: a new value for each electrical step."""
 
 
@@ -99,7 +99,7 @@ class Supply(Checked):
     """Open-circuit voltage [V], > 0; the terminal voltage is limited by the controller's
     `max_voltage` as well. `inf`: the controller's `max_voltage`.
     """
-    resistance: float = real(0.0, least=0.0, unit="ohm")
+    resistance: float = real(0.0, minimum=0.0, unit="ohm")
     """Resistance [ohm], >= 0: the voltage that is available sags by resistance*|current|."""
 
 
@@ -353,7 +353,7 @@ class DCMotorActuator(ActuatorModel):
     @classmethod
     def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
         """The spectral radius of the loop, or that of a saturated motor's current under its supply, if greater."""
-        columns = stability.columns(cls, numbers)
+        columns = stability.parameter_columns(cls, numbers)
         radii = stability.stability_radii(cls, numbers, timestep)
         # under a saturated voltage the current is fed back through the supply
         pole = (
@@ -399,6 +399,6 @@ class VoltageDriven(DCMotorActuator):
     """
 
     family: ClassVar[str] = ""
-    tracks: ClassVar[bool] = False
+    is_torque_controlled: ClassVar[bool] = False
     advance: ClassVar = staticmethod(_advance_driven)
     observe: ClassVar = staticmethod(_observe_driven)

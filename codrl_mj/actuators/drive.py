@@ -21,7 +21,7 @@ from codrl_mj.actuators.gear_motor import GearMotor
 from codrl_mj.actuators.model import ActuatorModel, Command, Inputs, JointAdditions, UnstableError
 from codrl_mj.actuators.parameters import parameters_type
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH, SampledLoop
-from codrl_mj.actuators.shaft import Heat, Means, Shaft, Winding
+from codrl_mj.actuators.shaft import TemperatureRises, StepAverages, Shaft, Winding
 from codrl_mj.fields import part
 
 
@@ -42,7 +42,7 @@ class State(NamedTuple):
     """What the torque delivered in the last step did to the rotor's speed [rad/s^2]."""
     speed: float
     """Speed [rad/s] of the rotor at its beginning."""
-    others: float
+    external_acceleration: float
     """Acceleration [rad/s^2] of the rotor by all but the motor, as it was taken to be."""
     due: float
     """When [s] the next step is to begin; 0 before the first."""
@@ -73,47 +73,47 @@ class Signals(NamedTuple):
     """Mean heat [W] in the winding, by the square of the current within the samples."""
 
 
-def limited(parameters: Any, timestep: float, heat: Heat, resistance: float, asked: float) -> float:
+def limit_current(parameters: Any, timestep: float, heat: TemperatureRises, resistance: float, asked: float) -> float:
     """The current [A] that the loop is given: what is asked for, within `max_current` and what the winding bears."""
     most = parameters.max_current
-    if parameters.max_temperature < math.inf and shaft.is_warming(parameters):
+    if parameters.max_temperature < math.inf and shaft.has_thermal_model(parameters):
         most = min(most, shaft.thermal_limit(parameters, timestep, heat, resistance))
     return min(max(asked, -most), most)
 
 
-def begin(
+def begin_step(
     parameters: Any, timestep: float, state: Any, inputs: Inputs
-) -> tuple[Winding, Heat, Shaft]:
+) -> tuple[Winding, TemperatureRises, Shaft]:
     """Winding, temperatures and shaft at the beginning of a step, from a state that has the entries of `State`."""
-    inertia, others = shaft.inertia_of(parameters, inputs.inertia), 0.0
+    inertia, external_acceleration = shaft.inertia_of(parameters, inputs.inertia), 0.0
     if state.due > 0.0 and abs(inputs.time - state.due) < 0.5 * timestep and inertia < math.inf:
-        others = shaft.others_after(
-            timestep, inputs.speed - state.speed, state.acceleration, state.others
+        external_acceleration = shaft.estimate_external_acceleration(
+            timestep, inputs.speed - state.speed, state.acceleration, state.external_acceleration
         )
-    moving = Shaft(inertia, others, inputs.speed)
+    moving = Shaft(inertia, external_acceleration, inputs.speed)
     winding = Winding(state.current, state.integral, state.pending)
-    return winding, Heat(state.winding_rise, state.housing_rise), moving
+    return winding, TemperatureRises(state.winding_rise, state.housing_rise), moving
 
 
-def end(
+def end_step(
     parameters: Any,
     timestep: float,
     time: float,
-    heat: Heat,
+    heat: TemperatureRises,
     resistance: float,
     winding: Winding,
     moving: Shaft,
-    means: Means,
+    means: StepAverages,
 ) -> tuple[tuple[float, float, float, float, float, float, float, float, float], float]:
     """The entries of `State` after a step, from temperatures and shaft at its beginning, and how warm the winding is.
 
     The mean current heats.
     """
-    if shaft.is_warming(parameters):
-        heat = shaft.heated(parameters, timestep, heat, resistance * means.current * means.current)
+    if shaft.has_thermal_model(parameters):
+        heat = shaft.rises_after(parameters, timestep, heat, resistance * means.current * means.current)
     own = means.torque / moving.inertia
     kept = winding.current, winding.integral, winding.pending, heat.winding, heat.housing
-    return (*kept, own, moving.speed, moving.others, time + timestep), shaft.temperature_of(
+    return (*kept, own, moving.speed, moving.external_acceleration, time + timestep), shaft.temperature_of(
         parameters, heat
     )
 
@@ -123,14 +123,14 @@ def _advance(
 ) -> tuple[State, float, Signals]:
     """A step of a drive that a torque is asked of or, where the loop is not `closed`, a voltage: kT for a volt."""
     asked = inputs.desired_torque / parameters.torque_constant
-    winding, heat, moving = begin(parameters, timestep, state, inputs)
+    winding, heat, moving = begin_step(parameters, timestep, state, inputs)
     resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))
-    reference = limited(parameters, timestep, heat, resistance, asked) if closed else asked
+    reference = limit_current(parameters, timestep, heat, resistance, asked) if closed else asked
     samples = max(int(timestep * parameters.sample_rate + 0.5), 1)
-    winding, _, means = shaft.turn(
+    winding, _, means = shaft.advance_motor(
         parameters, resistance, timestep, samples, winding, moving, closed, reference
     )
-    after, temperature = end(
+    after, temperature = end_step(
         parameters, timestep, inputs.time, heat, resistance, winding, moving, means
     )
     shown = reference if closed else means.current
@@ -201,11 +201,11 @@ class Drive(ActuatorModel):
     """What feeds the drive; None: 24 V without a resistance."""
 
     @classmethod
-    def of(cls, numbers: Any) -> "Drive":
-        """A drive for a motor of `codrl_mj.catalogue.MotorNumbers`: its voltage (or 24 V), its peak current."""
+    def from_motor_parameters(cls, numbers: Any) -> "Drive":
+        """A drive for a motor of `codrl_mj.catalogue.MotorParameters`: its voltage (or 24 V), its peak current."""
         most, voltage = numbers.max_current, numbers.voltage
         loop = SampledLoop() if most is None else SampledLoop(max_current=most)
-        return cls(GearMotor.of(numbers), loop, None if voltage is None else Supply(voltage))
+        return cls(GearMotor.from_motor_parameters(numbers), loop, None if voltage is None else Supply(voltage))
 
     @property
     def arm_radius(self) -> float:
@@ -240,7 +240,7 @@ class Drive(ActuatorModel):
         return 24.0 if self.supply is None else self.supply.voltage
 
     @property
-    def sag(self) -> float:
+    def supply_resistance(self) -> float:
         """The supply's resistance [ohm], by which its voltage sags under a current."""
         return 0.0 if self.supply is None else self.supply.resistance
 
@@ -268,10 +268,10 @@ class Drive(ActuatorModel):
         return f"assumed, for none is given: {told}" if told else ""
 
     @classmethod
-    def from_numbers(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
-        """As `ActuatorModel.from_numbers`: the arm is that between rotor and load, the gear among the numbers."""
+    def from_parameter_values(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
+        """As `ActuatorModel.from_parameter_values`: the arm is that between rotor and load, the gear among the numbers."""
         family: Any = cls
-        return super().from_numbers(
+        return super().from_parameter_values(
             numbers, arm_radius * parameters_type(family)(*numbers).gear_ratio
         )
 
@@ -308,7 +308,7 @@ class Drive(ActuatorModel):
                 f" {timestep:g} s holds {samples:g} samples, must be a whole number of them; the"
                 f" nearest rate is {nearest:.8g} Hz"
             )
-        radius = float(_radii(type(self), np.array([self.numbers]))[0])
+        radius = float(_radii(type(self), np.array([self.parameter_values]))[0])
         if not radius < 1.0:
             raise UnstableError(
                 f"actuator: the current loop is unstable: spectral radius {radius:.4g} over a"
@@ -366,7 +366,7 @@ class Drive(ActuatorModel):
 
         And where two fields are together what their class refuses.
         """
-        columns = stability.columns(cls, numbers)
+        columns = stability.parameter_columns(cls, numbers)
         samples = timestep * columns.sample_rate
         possible = (abs(samples - np.round(samples)) <= 1e-6 * samples) & (samples >= 0.5)
         # what `GearMotor` and `SampledLoop` refuse of fields together
@@ -399,14 +399,14 @@ class VoltageDrive(Drive):
     """A drive under commanded terminal voltage; a desired torque of kT stands for a volt."""
 
     family: ClassVar[str] = ""
-    tracks: ClassVar[bool] = False
+    is_torque_controlled: ClassVar[bool] = False
     CLOSED: ClassVar[bool] = False
     advance: ClassVar = staticmethod(_advance_driven)
 
 
 def _radii(cls: Any, numbers: np.ndarray) -> np.ndarray:
     """Spectral radii over one sample, unsaturated and saturated, shape (m,)."""
-    columns = stability.columns(cls, numbers)
+    columns = stability.parameter_columns(cls, numbers)
     sample_time, resistance = 1.0 / columns.sample_rate, columns.resistance
     x = resistance * sample_time / columns.inductance
     decay = np.exp(-x)

@@ -25,40 +25,40 @@ class GearMotor(Checked):
     """Terminal inductance L [H], > 0."""
     torque_constant: float = real(0.042, above=0.0, unit="N*m/A")
     """Torque constant kT [N*m/A] at the rotor, > 0."""
-    back_emf_constant: float = real(0.042, least=0.0, unit="V*s/rad")
+    back_emf_constant: float = real(0.042, minimum=0.0, unit="V*s/rad")
     """Back-EMF constant kE [V*s/rad] at the rotor, >= 0; equal to kT in SI units but for losses."""
-    rotor_inertia: float = real(4.0e-6, least=0.0, unit="kg*m^2")
+    rotor_inertia: float = real(4.0e-6, minimum=0.0, unit="kg*m^2")
     """Inertia J [kg*m^2] of the rotor, >= 0: the joint gets J*n^2."""
     gear_ratio: float = real(1.0, above=0.0, unit="")
     """Turns n of the rotor for a turn of the output shaft, > 0."""
-    gear_efficiency: float = real(1.0, above=0.0, most=1.0)
+    gear_efficiency: float = real(1.0, above=0.0, maximum=1.0)
     """Share of the torque that the gear passes on when it drives, in (0, 1]; driven, it brakes with
     1/efficiency - 1 of the torque: friction that depends on the load, part of what is delivered
     (`codrl_mj.actuators.shaft.friction`).
     """
-    coulomb_friction: float = real(0.0, least=0.0, unit="N*m")
+    coulomb_friction: float = real(0.0, minimum=0.0, unit="N*m")
     """Coulomb friction [N*m] at the rotor, >= 0: the joint's `frictionloss`."""
-    viscous_friction: float = real(0.0, least=0.0, unit="N*m*s/rad")
+    viscous_friction: float = real(0.0, minimum=0.0, unit="N*m*s/rad")
     """Viscous friction [N*m*s/rad] at the rotor, >= 0: the joint's `damping`."""
-    stribeck_friction: float = real(0.0, least=0.0, unit="N*m")
+    stribeck_friction: float = real(0.0, minimum=0.0, unit="N*m")
     """What friction has at standstill [N*m] at the rotor over the Coulomb friction, >= 0; with the
     speed w it falls as exp(-|w/`stribeck_speed`|^`stribeck_exponent`). Part of what is delivered
     (`codrl_mj.actuators.shaft.friction`).
     """
     stribeck_speed: float = real(1.0, above=0.0, unit="rad/s")
     """Speed [rad/s] of the rotor at which 1/e of it is left, > 0."""
-    stribeck_exponent: float = real(2.0, above=0.0, most=10.0, unit="")
+    stribeck_exponent: float = real(2.0, above=0.0, maximum=10.0, unit="")
     """How abruptly it falls, > 0 and <= 10: 2 is the usual, fits to servos give 1.3 and more."""
-    load_inertia: float = real(0.0, least=0.0, unit="kg*m^2", infinite=True)
+    load_inertia: float = real(0.0, minimum=0.0, unit="kg*m^2", infinite=True)
     """Inertia [kg*m^2] of what the output shaft moves, >= 0, by which its speed changes within a
     step; 0: what it is in the model at each moment; `inf`: the speed is held over a step. Nothing
     is added to the model by it.
     """
-    thermal_resistance_winding: float = real(0.0, least=0.0, unit="K/W")
+    thermal_resistance_winding: float = real(0.0, minimum=0.0, unit="K/W")
     """Thermal resistance [K/W] from the winding to the housing, >= 0; 0: the winding is as warm as the housing."""
     thermal_time_constant_winding: float = real(10.0, above=0.0, unit="s")
     """Time constant [s] of the winding's temperature, > 0."""
-    thermal_resistance_housing: float = real(0.0, least=0.0, unit="K/W")
+    thermal_resistance_housing: float = real(0.0, minimum=0.0, unit="K/W")
     """Thermal resistance [K/W] from the housing to the surroundings, >= 0; 0: it stays as cold as they are."""
     thermal_time_constant_housing: float = real(100.0, above=0.0, unit="s")
     """Time constant [s] of the housing's temperature, > 0."""
@@ -66,7 +66,7 @@ class GearMotor(Checked):
     """Temperature [degC] of the surroundings, and of the winding at the start of an episode."""
     max_temperature: float = real(math.inf, above=-273.15, unit="degC", infinite=True)
     """Temperature [degC] of the winding that the drive keeps by asking for less current, above ambient; `inf`: none."""
-    resistance_coefficient: float = real(0.00393, least=0.0, unit="1/K")
+    resistance_coefficient: float = real(0.00393, minimum=0.0, unit="1/K")
     """Growth [1/K] of the resistance with the winding's temperature, from 25 degC on, >= 0. The default is copper's."""
     arm_radius: float = real(1.0, above=0.0, unit="m")
     """Radius [m] of the wheel, drum or pinion on the output shaft that moves a slide, > 0; on a hinge 1."""
@@ -114,11 +114,11 @@ class GearMotor(Checked):
         """
         from codrl_mj.catalogue import from_datasheet
 
-        return cls.of(from_datasheet(**printed))
+        return cls.from_motor_parameters(from_datasheet(**printed))
 
     @classmethod
-    def of(cls, numbers: Any) -> "GearMotor":
-        """A motor of `codrl_mj.catalogue.MotorNumbers`; what they do not know is left at 0, an efficiency at 1."""
+    def from_motor_parameters(cls, numbers: Any) -> "GearMotor":
+        """A motor of `codrl_mj.catalogue.MotorParameters`; what they do not know is left at 0, an efficiency at 1."""
         known = {
             field.name: getattr(numbers, field.name, None) for field in dataclasses.fields(cls)
         }

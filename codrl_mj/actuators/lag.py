@@ -87,9 +87,9 @@ class Lag(ActuatorModel):
     State: ClassVar[type] = State
     advance: ClassVar = staticmethod(advance)
 
-    time_constant: float = real(0.05, least=0.0, unit="s")
+    time_constant: float = real(0.05, minimum=0.0, unit="s")
     """Time constant T [s], >= 0: 63 % of a step is delivered after it. 0: nothing but the delay."""
-    delay: float = real(0.0, least=0.0, unit="s")
+    delay: float = real(0.0, minimum=0.0, unit="s")
     """Delay of the command [s], >= 0, at most eight mechanical steps."""
     gain: float = real(1.0, above=0.0)
     """What of the desired torque is delivered in the end, > 0: 0.9 for a torque constant that is 10 % too small."""

@@ -119,7 +119,7 @@ class ActuatorModel(fields.Checked):
     """Names of what `observe` returns: what `observe_actuator=True` appends to an observation."""
     RANDOM: ClassVar[tuple[str, ...]] = ()
     """Dotted paths of the fields that need the episode's key of random numbers where they are not 0."""
-    tracks: ClassVar[bool] = True
+    is_torque_controlled: ClassVar[bool] = True
     """Whether a torque is asked for at all; otherwise what is delivered counts as desired."""
     INERTIA: ClassVar[bool] = False
     """Whether it is told the inertia at its shaft, which takes the engine some time to find."""
@@ -129,8 +129,8 @@ class ActuatorModel(fields.Checked):
     def __init_subclass__(cls, **named: Any) -> None:
         """Know a family of ours by its name, once; anybody else's is found as `module:Class`."""
         super().__init_subclass__(**named)
-        if cls.__module__.startswith("codrl_mj.actuators.") and reference(cls) not in map(
-            reference, BUILT_IN
+        if cls.__module__.startswith("codrl_mj.actuators.") and import_path(cls) not in map(
+            import_path, BUILT_IN
         ):
             BUILT_IN.append(cls)
             if name := vars(cls).get("family"):
@@ -287,14 +287,14 @@ class ActuatorModel(fields.Checked):
         return np.zeros(len(numbers))
 
     @property
-    def numbers(self) -> tuple[float, ...]:
+    def parameter_values(self) -> tuple[float, ...]:
         """The parameters, in the order of `parameters_type`: what a model's `user` data hold."""
         return tuple(
             float(value_at(self, path)) for path in parameter_paths(family_of(self)).values()
         )
 
     @classmethod
-    def from_numbers(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
+    def from_parameter_values(cls, numbers: Any, arm_radius: float = 1.0) -> Any:
         """The actuator that `numbers` describe.
 
         Args:
@@ -354,7 +354,7 @@ class ActuatorModel(fields.Checked):
         return {"family": family_name(family_of(self)), **dataclasses.asdict(self)}
 
 
-def advance_form(cls: Family) -> tuple[Form, str]:
+def advance_signature(cls: Family) -> tuple[Form, str]:
     """What `advance` is to return, and what says so."""
     return (
         cls.State._fields,
@@ -392,7 +392,7 @@ def check_family(cls: Family) -> None:
             raise ValueError(
                 f"{cls.__name__}.{path} = {value!r}: must be a number; see `codrl_mj.fields`"
             )
-    parameters, step = parameters_type(cls)(*actuator.numbers), np.float64(1e-3)
+    parameters, step = parameters_type(cls)(*actuator.parameter_values), np.float64(1e-3)
     inputs = Inputs(*map(np.float64, (0.1, 0.2, 0.3, 0.0, 0.0, 1.0)))
     state, signals = (
         kind(*map(np.float64, [0.0] * len(kind._fields))) for kind in (cls.State, cls.Signals)
@@ -400,7 +400,7 @@ def check_family(cls: Family) -> None:
     if cls.advance is ActuatorModel.advance:
         raise ValueError(f"{cls.__name__}: has no `advance`")
     result = call(f"{cls.__name__}.advance", cls.advance, parameters, step, state, inputs)
-    after, torque, _ = check_form(cls.advance, result, *advance_form(cls))
+    after, torque, _ = check_form(cls.advance, result, *advance_signature(cls))
     if not np.isfinite([*after, torque]).all():
         raise ValueError(
             f"{place(cls.advance)}: returns the state {(*map(float, after),)} and the torque"
@@ -411,18 +411,18 @@ def check_family(cls: Family) -> None:
         check_form(cls.observe, seen, cls.OBSERVED, f"{cls.__name__}.OBSERVED")
 
 
-def reference(cls: type) -> str:
+def import_path(cls: type) -> str:
     """Where a family is to be imported from: `module:Class`."""
     return f"{cls.__module__}:{cls.__qualname__}"
 
 
 @functools.cache
-def family_number(cls: type) -> int:
+def family_id(cls: type) -> int:
     """The family's number in a model's `user` data: six digits of a hash of `reference`, which survive as text."""
-    return int(hashlib.sha256(reference(cls).encode()).hexdigest(), 16) % 10**6
+    return int(hashlib.sha256(import_path(cls).encode()).hexdigest(), 16) % 10**6
 
 
 def family_name(cls: Family) -> str:
     """The name that `find_family` finds it by."""
     name: str = cls.family
-    return name if FAMILIES.get(name) is cls else reference(cls)
+    return name if FAMILIES.get(name) is cls else import_path(cls)

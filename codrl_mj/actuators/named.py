@@ -71,32 +71,32 @@ def mapping_of(actuator: ActuatorModel) -> dict[str, Any] | None:
     return None if actuator == IDEAL else actuator.as_mapping()
 
 
-def name_of(actuator: ActuatorModel, paper: DCMotorActuator | None = None) -> str:
+def display_name(actuator: ActuatorModel, paper: DCMotorActuator | None = None) -> str:
     """What to call an actuator wherever it is shown.
 
-    What it was asked for by (`label_of`), or the motor of the catalogue that has its numbers but
+    What it was asked for by (`display_label`), or the motor of the catalogue that has its numbers but
     for gear, loop and supply; of a current loop the variation of `paper` that it is, `custom` if
     none; else its family.
     """
     kind, known = type(actuator), {}
     if kind is DCMotorActuator:
         known = {name: vary(paper) for name, (_, vary) in NAMED.items()} if paper else {}
-    elif kind is Drive and not label_of(actuator):
+    elif kind is Drive and not display_label(actuator):
         known = _catalogue()
     family = "custom" if kind is DCMotorActuator else family_name(kind)
     same = (name for name, one in known.items() if one in (actuator, _own_numbers(actuator)))
-    return label_of(actuator) or next(same, family)
+    return display_label(actuator) or next(same, family)
 
 
-def names_together(
+def combined_name(
     actuators: Iterable[ActuatorModel], papers: Iterable[DCMotorActuator] | None = None
 ) -> str:
     """What to call several, each name once."""
     pairs = itertools.zip_longest(actuators, papers or ())
-    return ", ".join(dict.fromkeys(name_of(one, paper) for one, paper in pairs))
+    return ", ".join(dict.fromkeys(display_name(one, paper) for one, paper in pairs))
 
 
-def label_of(actuator: ActuatorModel) -> str:
+def display_label(actuator: ActuatorModel) -> str:
     """The motor, file or `module:NAME` that an actuator was asked for by; empty where it was none of these.
 
     It is no field: equality, mappings and hashes of configurations do not know of it.
@@ -124,7 +124,7 @@ def _unshared(actuator: ActuatorModel) -> ActuatorModel:
 def _catalogue() -> dict[str, Any]:
     from codrl_mj.catalogue import motor_entry, motor_names
 
-    return {name: _own_numbers(Drive.of(motor_entry(name).numbers)) for name in motor_names()}
+    return {name: _own_numbers(Drive.from_motor_parameters(motor_entry(name).parameters)) for name in motor_names()}
 
 
 def _own_numbers(actuator: Any) -> Any:
@@ -139,7 +139,7 @@ def _own_numbers(actuator: Any) -> Any:
 
 def named_mapping(actuator: ActuatorModel) -> Any:
     """A mapping for `resolve`: of a motor of the catalogue `name` and what is set over it; else `label` and fields."""
-    name, whole = label_of(actuator), mapping_of(actuator) or {}
+    name, whole = display_label(actuator), mapping_of(actuator) or {}
     if name in _catalogue() and isinstance(actuator, Drive):
         there = resolve(name, None, "a motor").as_mapping()
         short = {
@@ -179,7 +179,7 @@ def resolve(given: Any, paper: DCMotorActuator | None, whose: str) -> Any:
         return set_display_name(_unshared(resolve(rest, paper, whose)), given["label"])
     if isinstance(given, Mapping) and "name" in given:
         changes = {name: value for name, value in given.items() if name != "name"}
-        return actuator_over(resolve(given["name"], paper, whose), changes)
+        return override_actuator(resolve(given["name"], paper, whose), changes)
     if isinstance(given, Mapping):
         return actuator_from_mapping(given)
     if isinstance(given, Path):
@@ -203,7 +203,7 @@ def resolve(given: Any, paper: DCMotorActuator | None, whose: str) -> Any:
     from codrl_mj.catalogue import motor_entry, motor_names
 
     if given in motor_names() or Path(given).suffix == ".toml":
-        return set_display_name(Drive.of(motor_entry(given).numbers), Path(given).stem)
+        return set_display_name(Drive.from_motor_parameters(motor_entry(given).parameters), Path(given).stem)
     found = look_up(
         given,
         NAMED | FAMILIES,
@@ -259,7 +259,7 @@ def _from_file(path: Path, paper: DCMotorActuator | None, whose: str) -> Any:
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
     stem = path.stem if path.stem not in ("actuator", "actuators") else path.absolute().parent.name
-    return made if label_of(made) else set_display_name(_unshared(made), stem)
+    return made if display_label(made) else set_display_name(_unshared(made), stem)
 
 
 def identified_ranges(path: Path | str) -> dict[str, str]:
@@ -284,7 +284,7 @@ def identified_ranges(path: Path | str) -> dict[str, str]:
     }
 
 
-def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
+def override_actuator(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
     """An actuator with single fields set over another's.
 
     Args:
@@ -324,7 +324,7 @@ def actuator_over(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
         and isinstance(given.get("loop", {}), Mapping)
     ):
         made = made.with_default_gain(given.get("loop", {}))
-    label = label_of(base).removesuffix(_CHANGED)
+    label = display_label(base).removesuffix(_CHANGED)
     if kind is not type(base) and label:  # a motor's name alone stands for its drive
         label = label.removesuffix(f" {family_name(type(base))}") + (
             "" if kind is Drive else f" {family}"

@@ -18,7 +18,7 @@ _STEP_0, _STEP_1 = (
 SENSOR_STREAM, LOAD_STREAM = 0, 1
 """The last counter word: streams of one key that share no number."""
 
-LARGEST_KEY = 2**53
+MAX_KEY = 2**53
 """Keys are whole numbers from 0 up to, but not including, this: a float64 holds each of them exactly."""
 
 
@@ -36,12 +36,12 @@ def philox(c0: int, c1: int, c2: int, c3: int, key: int) -> tuple[int, int, int,
     return c0, c1, c2, c3
 
 
-def unit(high: int, low: int) -> float:
+def uniform(high: int, low: int) -> float:
     """A number uniform in (0, 1], of 53 bits, from two words of `philox`."""
     return ((high << 21) + (low >> 11) + 1) * 2.0**-53
 
 
 def standard_normal(key: float, step: int, index: int) -> float:
-    """A standard normal number (Box and Muller's) of a key < `LARGEST_KEY`, integration step and electrical substep."""
+    """A standard normal number (Box and Muller's) of a key < `MAX_KEY`, integration step and electrical substep."""
     w0, w1, w2, w3 = philox(step & _MASK, (step >> 32) & _MASK, index, SENSOR_STREAM, int(key))
-    return math.sqrt(-2.0 * math.log(unit(w0, w1))) * math.cos(2.0 * math.pi * unit(w2, w3))
+    return math.sqrt(-2.0 * math.log(uniform(w0, w1))) * math.cos(2.0 * math.pi * uniform(w2, w3))

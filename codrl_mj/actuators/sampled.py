@@ -46,7 +46,7 @@ def designed_gains(
     )  # exp(x) would overflow
 
 
-def jump(
+def solve_designed_loop(
     current: float,
     integral: float,
     reference: float,
@@ -74,9 +74,9 @@ def jump(
         held = left
         if low <= asked <= high:
             if reference > high:
-                held = until(reference - high, reference - asked, y, left)
+                held = samples_until(reference - high, reference - asked, y, left)
             elif reference < low:
-                held = until(low - reference, asked - reference, y, left)
+                held = samples_until(low - reference, asked - reference, y, left)
             before, lag = reference - current, current - integral
             slower, faster = math.exp(-held * y), math.exp(-held * x)
             if abs(apart) > 0.1 * lost or held * abs(x - y) > 50.0:
@@ -100,7 +100,7 @@ def jump(
             reached = high if asked > high else low
             final = gain * (reference - reached) + reached  # what is asked for in the end
             if (final < high) if asked > high else (final > low):
-                held = until(reached - final, asked - final, x, left)
+                held = samples_until(reached - final, asked - final, x, left)
             decay = math.exp(-held * x)
             after = reached + (current - reached) * decay
             total += held * reached + (current - after) / lost
@@ -111,7 +111,7 @@ def jump(
     return current, integral, total, drawn, saturated
 
 
-def until(bound: float, start: float, rate: float, most: int) -> int:
+def samples_until(bound: float, start: float, rate: float, most: int) -> int:
     """The first k >= 1 at which start*exp(-rate*k) is within bound, of the same sign; at most `most`."""
     ratio = bound / start
     if ratio <= 0.0:
@@ -134,7 +134,7 @@ def run_samples(
     kp: float,
     ki: float,
 ) -> tuple[float, float, float, float, float, int]:
-    """Any PI loop, sample by sample: i [A], the integral [V], the pending voltage, and then what `jump` finds.
+    """Any PI loop, sample by sample: i [A], the integral [V], the pending voltage, and then what `solve_designed_loop` finds.
 
     Its `parameters` are a `Drive`'s, but for the gains: `ki` is the integral gain per sample [V/A].
     `compensated` is the part of the back-EMF [V] that is added to the voltage, `decay` e, and

@@ -20,13 +20,13 @@ class SampledLoop(Checked):
 
     sample_rate: float = real(20e3, above=0.0, unit="Hz")
     """Samples a second [Hz], > 0; a mechanical step must hold a whole number of them."""
-    bandwidth: float = real(0.0, least=0.0, unit="Hz")
+    bandwidth: float = real(0.0, minimum=0.0, unit="Hz")
     """Bandwidth [Hz] that the gains are designed for by pole-zero cancellation, >= 0. 0: 0.0555 of
     the sample rate, 60 degrees of phase margin with `delayed`.
     """
-    kp: float = real(0.0, least=0.0, unit="V/A")
+    kp: float = real(0.0, minimum=0.0, unit="V/A")
     """Proportional gain [V/A], >= 0. It and `ki` replace the designed gains where one of them is not 0."""
-    ki: float = real(0.0, least=0.0, unit="V/(A*s)")
+    ki: float = real(0.0, minimum=0.0, unit="V/(A*s)")
     """Integral gain [V/(A*s)], >= 0."""
     anti_windup: str = choice("back_calculation", "back_calculation", "clamping", "none")
     """What the integrator does while the voltage saturates: it follows what was possible
@@ -37,7 +37,7 @@ class SampledLoop(Checked):
     """Whether the voltage that a sample computes is applied in the next one, as most digital drives do."""
     bemf_compensation: bool = flag(True)
     """Add the back-EMF kE*omega to the voltage."""
-    deadband: float = real(0.0, least=0.0, unit="V")
+    deadband: float = real(0.0, minimum=0.0, unit="V")
     """Voltage [V] that the bridge loses, >= 0: what is asked for comes short by it, and within it there is none."""
     max_current: float = real(math.inf, above=0.0, unit="A", infinite=True)
     """Largest current [A] that the drive asks for, > 0; `inf` for none."""

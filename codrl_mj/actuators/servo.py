@@ -16,7 +16,7 @@ import numpy as np
 from codrl_mj.actuators import drive, shaft, stability
 from codrl_mj.actuators.drive import ARM, Drive
 from codrl_mj.actuators.model import Command, Inputs
-from codrl_mj.actuators.shaft import Means, Shaft
+from codrl_mj.actuators.shaft import StepAverages, Shaft
 from codrl_mj.fields import Checked, choice, real
 
 
@@ -38,15 +38,15 @@ class ServoLoop(Checked):
     """Speed [rad/s] for an error of 1 rad, > 0."""
     velocity_gain: float = real(0.1, above=0.0, unit="N*m*s/rad")
     """Torque [N*m] for an error of 1 rad/s, > 0: for a bandwidth f, 2*pi*f times the inertia, the rotor's included."""
-    velocity_integral_gain: float = real(0.0, least=0.0, unit="1/s")
+    velocity_integral_gain: float = real(0.0, minimum=0.0, unit="1/s")
     """What an error of 1 rad/s adds to the torque in a second, as a share of `velocity_gain` [1/s],
     >= 0. It stands still while the current is at its limit.
     """
-    velocity_feed_forward: float = real(0.0, least=0.0, unit="")
+    velocity_feed_forward: float = real(0.0, minimum=0.0, unit="")
     """Share of the asked position's own speed that is added to the speed asked for, >= 0: for
     positions that are asked for anew at every mechanical step.
     """
-    inertia_feed_forward: float = real(0.0, least=0.0, unit="kg*m^2")
+    inertia_feed_forward: float = real(0.0, minimum=0.0, unit="kg*m^2")
     """Torque [N*m] for 1 rad/s^2 of the speed that is asked for from outside, >= 0, likewise."""
     max_velocity: float = real(math.inf, above=0.0, unit="rad/s", infinite=True)
     """Largest speed [rad/s] that is asked of the velocity loop, > 0."""
@@ -76,7 +76,7 @@ class State(NamedTuple):
     housing_rise: float
     acceleration: float
     speed: float
-    others: float
+    external_acceleration: float
     due: float
     velocity_integral: float
     """Torque [N*m] at the rotor."""
@@ -112,7 +112,7 @@ class Signals(NamedTuple):
     copper_loss: float
 
 
-def demand(
+def torque_demand(
     parameters: Any,
     period: float,
     target: float,
@@ -147,7 +147,7 @@ def advance(
 
     In place of a desired torque the inputs have a position [rad] or a speed [rad/s] of the rotor.
     """
-    winding, heat, moving = drive.begin(parameters, timestep, state, inputs)
+    winding, heat, moving = drive.begin_step(parameters, timestep, state, inputs)
     resistance = shaft.resistance_at(parameters, shaft.temperature_of(parameters, heat))
     target, constant = inputs.desired_torque, parameters.torque_constant
     rate = (target - state.target) / timestep if state.due > 0.0 else 0.0
@@ -163,22 +163,22 @@ def advance(
     for _ in range(count):
         # A servo that is faster than the mechanical step is sampled `count` times within it.
         if waiting <= 0.0 or count > 1:
-            asked, grown = demand(
+            asked, grown = torque_demand(
                 parameters, period * every, target, rate, position, speed, integral
             )
             waiting = float(every)
         else:
             grown = integral
         wanted = min(max(asked, -most), most) / constant
-        given = drive.limited(parameters, timestep, heat, resistance, wanted)
+        given = drive.limit_current(parameters, timestep, heat, resistance, wanted)
         if given == asked / constant or (grown - integral) * asked < 0.0:
             integral = grown  # it does not wind up
         if given != wanted and abs(given) < parameters.max_current:
             too_warm = 1.0
         elif given != asked / constant:
             at_amperes = 1.0
-        now = Shaft(moving.inertia, moving.others, speed)
-        winding, next_speed, means = shaft.turn(
+        now = Shaft(moving.inertia, moving.external_acceleration, speed)
+        winding, next_speed, means = shaft.advance_motor(
             parameters, resistance, period, samples, winding, now, True, given
         )
         position, speed = position + 0.5 * period * (speed + next_speed), next_speed
@@ -186,8 +186,8 @@ def advance(
         amperes, volts = amperes + means.current / count, volts + means.voltage / count
         torque += means.torque / count
         power, loss = power + means.power / count, loss + means.heat / count
-    mean = Means(amperes, volts, torque, at_volts, power, loss)
-    after, temperature = drive.end(
+    mean = StepAverages(amperes, volts, torque, at_volts, power, loss)
+    after, temperature = drive.end_step(
         parameters, timestep, inputs.time, heat, resistance, winding, moving, mean
     )
     error = (
@@ -211,7 +211,7 @@ class Servo(Drive):
     State: ClassVar[type] = State
     Signals: ClassVar[type] = Signals
     SIGNAL_UNITS: ClassVar[Mapping[str, str]] = {**Drive.SIGNAL_UNITS, "error": "rad or rad/s"}
-    tracks: ClassVar[bool] = False
+    is_torque_controlled: ClassVar[bool] = False
     MOTION: ClassVar[bool] = True
     advance: ClassVar = staticmethod(advance)
 
@@ -292,7 +292,7 @@ class Servo(Drive):
     @classmethod
     def instability(cls, numbers: np.ndarray, timestep: float) -> np.ndarray:
         """As `Drive.instability`; infinite too where rates do not fit. What it moves is not known here."""
-        columns = stability.columns(cls, numbers)
+        columns = stability.parameter_columns(cls, numbers)
         fitting = np.array(
             [
                 _fits(*each, timestep)

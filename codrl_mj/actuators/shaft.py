@@ -26,7 +26,7 @@ class Winding(NamedTuple):
     """Voltage [V] that a delayed loop applies in the next sample."""
 
 
-class Heat(NamedTuple):
+class TemperatureRises(NamedTuple):
     """How warm the motor is."""
 
     winding: float
@@ -40,13 +40,13 @@ class Shaft(NamedTuple):
 
     inertia: float
     """Inertia [kg*m^2] of all that the rotor moves, itself included; `inf` where its speed is held."""
-    others: float
+    external_acceleration: float
     """Acceleration [rad/s^2] by all but the motor's torque."""
     speed: float
     """[rad/s]"""
 
 
-class Means(NamedTuple):
+class StepAverages(NamedTuple):
     """What there was of a stretch of time, in the mean of it."""
 
     current: float
@@ -63,7 +63,7 @@ class Means(NamedTuple):
     """Lost in the winding [W]: of its resistance and the square of its current, within the samples too."""
 
 
-def temperature_of(parameters: Any, heat: Heat) -> float:
+def temperature_of(parameters: Any, heat: TemperatureRises) -> float:
     """Of the winding [degC]."""
     return parameters.ambient_temperature + heat.winding + heat.housing
 
@@ -75,23 +75,23 @@ def resistance_at(parameters: Any, temperature: float) -> float:
     )
 
 
-def warmer(resistance: float, constant: float, duration: float, rise: float, watts: float) -> float:
+def rise_after(resistance: float, constant: float, duration: float, rise: float, watts: float) -> float:
     """Rise [K] over a thermal resistance [K/W] with a time constant [s] after a duration [s] of a held loss [W]."""
     kept = math.exp(-duration / constant)
     return rise * kept + resistance * watts * (1.0 - kept)
 
 
-def heated(parameters: Any, duration: float, heat: Heat, watts: float) -> Heat:
+def rises_after(parameters: Any, duration: float, heat: TemperatureRises, watts: float) -> TemperatureRises:
     """The motor's temperatures after some time [s] of a held loss [W] in the winding: two bodies in a row."""
-    return Heat(
-        warmer(
+    return TemperatureRises(
+        rise_after(
             parameters.thermal_resistance_winding,
             parameters.thermal_time_constant_winding,
             duration,
             heat.winding,
             watts,
         ),
-        warmer(
+        rise_after(
             parameters.thermal_resistance_housing,
             parameters.thermal_time_constant_housing,
             duration,
@@ -101,15 +101,15 @@ def heated(parameters: Any, duration: float, heat: Heat, watts: float) -> Heat:
     )
 
 
-def thermal_limit(parameters: Any, duration: float, heat: Heat, resistance: float) -> float:
+def thermal_limit(parameters: Any, duration: float, heat: TemperatureRises, resistance: float) -> float:
     """The current [A] that takes the winding to `max_temperature` within some time [s], and no further.
 
     While the motor is cold that is more than it can bear for long; at the limit it falls to the
     continuous current.
     """
     cooled, by_a_watt = (
-        heated(parameters, duration, heat, 0.0),
-        heated(parameters, duration, Heat(0.0, 0.0), 1.0),
+        rises_after(parameters, duration, heat, 0.0),
+        rises_after(parameters, duration, TemperatureRises(0.0, 0.0), 1.0),
     )
     room = (
         parameters.max_temperature
@@ -129,7 +129,7 @@ def inertia_of(parameters: Any, inertia: float) -> float:
     return inertia if inertia > 0.0 else math.inf
 
 
-def others_after(timestep: float, change: float, own: float, others: float) -> float:
+def estimate_external_acceleration(timestep: float, change: float, own: float, external_acceleration: float) -> float:
     """Acceleration [rad/s^2] of the rotor by all but its motor, from what the last step showed.
 
     Half of it is what was taken then: two joints that move each other, each with a stiff motor,
@@ -137,7 +137,7 @@ def others_after(timestep: float, change: float, own: float, others: float) -> f
     in the step [rad/s] and, [rad/s^2], its acceleration by the motor's torque and what was taken
     for that by all else.
     """
-    return 0.5 * (change / timestep - own) + 0.5 * others
+    return 0.5 * (change / timestep - own) + 0.5 * external_acceleration
 
 
 def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> float:
@@ -150,7 +150,7 @@ def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> f
     the Physics Simulation of Servo Actuators* (2024), sec. III.
     """
     if shaft.inertia < math.inf:
-        free = shaft.speed + duration * (torque / shaft.inertia + shaft.others)
+        free = shaft.speed + duration * (torque / shaft.inertia + shaft.external_acceleration)
         most = shaft.inertia * abs(free) / duration
     else:
         free, rotor = shaft.speed, parameters.rotor_inertia
@@ -163,12 +163,12 @@ def friction(parameters: Any, duration: float, torque: float, shaft: Shaft) -> f
     return math.copysign(min(level, most), free) if free != 0.0 else 0.0
 
 
-def is_warming(parameters: Any) -> bool:
+def has_thermal_model(parameters: Any) -> bool:
     """Whether the motor's temperature changes at all."""
     return parameters.thermal_resistance_winding + parameters.thermal_resistance_housing > 0.0
 
 
-def run_over(
+def advance_winding(
     parameters: Any,
     resistance: float,
     samples: int,
@@ -208,7 +208,7 @@ def run_over(
     )
     if as_designed and stiff:
         offset = back_emf - compensated
-        current, integral, total, drawn, saturated = sampled.jump(
+        current, integral, total, drawn, saturated = sampled.solve_designed_loop(
             winding.current,
             (winding.integral - offset) / resistance,
             asked,
@@ -252,7 +252,7 @@ def run_over(
     return after, mean, back_emf + resistance * (total + change) / samples, saturated, power, heat
 
 
-def turn(
+def advance_motor(
     parameters: Any,
     resistance: float,
     duration: float,
@@ -261,7 +261,7 @@ def turn(
     shaft: Shaft,
     closed: bool,
     asked: float,
-) -> tuple[Winding, float, Means]:
+) -> tuple[Winding, float, StepAverages]:
     """Winding, loop and shaft over some time under a held command.
 
     Where a saturated voltage meets a light load, the speed cannot be held: c = h*kT*kE/(R*J) is the
@@ -279,13 +279,13 @@ def turn(
     saturated, left, speed = 0, samples, shaft.speed
     for piece in range(pieces):
         count = left // (pieces - piece) if piece < pieces - 1 else left
-        winding, mean, voltage, limited, drawn, lost = run_over(
+        winding, mean, voltage, limited, drawn, lost = advance_winding(
             parameters, resistance, count, winding, closed, asked, speed
         )
         left, saturated = left - count, saturated + limited
         share, delivered = count / samples, parameters.torque_constant * mean
         if lossy:
-            now = Shaft(shaft.inertia, shaft.others, speed)
+            now = Shaft(shaft.inertia, shaft.external_acceleration, speed)
             delivered -= friction(parameters, share * duration, delivered, now)
         amperes, volts, torque = (
             amperes + share * mean,
@@ -294,5 +294,5 @@ def turn(
         )
         power, heat = power + share * drawn, heat + share * lost
         changed = delivered - viscous * (speed - shaft.speed)
-        speed += share * duration * (changed / shaft.inertia + shaft.others)
-    return winding, speed, Means(amperes, volts, torque, float(saturated), power, heat)
+        speed += share * duration * (changed / shaft.inertia + shaft.external_acceleration)
+    return winding, speed, StepAverages(amperes, volts, torque, float(saturated), power, heat)

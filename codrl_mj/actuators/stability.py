@@ -11,7 +11,7 @@ from codrl_mj.actuators.model import Inputs, UnstableError
 from codrl_mj.actuators.parameters import parameters_type
 
 
-def columns(family: Any, numbers: np.ndarray) -> Any:
+def parameter_columns(family: Any, numbers: np.ndarray) -> Any:
     """Parameters of m actuators at once, each an array (m,), from rows of numbers (m, p)."""
     return parameters_type(family)(*numbers.T)
 
@@ -33,7 +33,7 @@ def _closed_loops(
     family: Any, numbers: np.ndarray, timestep: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """What an electrical step makes of (current, integral, error), (to, from, actuator), and how many are in a step."""
-    parameters = columns(family, numbers)
+    parameters = parameter_columns(family, numbers)
     dt = timestep / parameters.substeps
     current, integral, error = np.eye(3)[
         :, :, np.newaxis
@@ -104,7 +104,7 @@ def spectral_radius(actuator: Any, timestep: float) -> float:
         actuator: motor and gains.
         timestep: mechanical step [s].
     """
-    return float(spectral_radii(type(actuator), np.array([actuator.numbers]), timestep)[0])
+    return float(spectral_radii(type(actuator), np.array([actuator.parameter_values]), timestep)[0])
 
 
 def check_stable(actuator: Any, timestep: float) -> None:
@@ -177,9 +177,9 @@ class Joints(NamedTuple):
         return after[: positions.stop]
 
 
-CHANGE = -1e-6
+PERTURBATION = -1e-6
 """Added to each state in turn. It is negative so that counters and times stay on the side where a sample is due."""
-FREE = {"stribeck_friction": 0.0, "gear_efficiency": 1.0, "deadband": 0.0}
+WITHOUT_FRICTION = {"stribeck_friction": 0.0, "gear_efficiency": 1.0, "deadband": 0.0}
 """Parameters of families that have them -> values without friction and dead zone, which hide small motions."""
 
 
@@ -188,7 +188,7 @@ def linearize(
     advance: Callable[..., Any],
     timestep: float,
     inertia: float,
-    change: float = CHANGE,
+    change: float = PERTURBATION,
 ) -> np.ndarray:
     """Linearize an actuator's `advance` at rest, for each mechanical step until its samples repeat.
 
@@ -205,9 +205,9 @@ def linearize(
     """
     family: Any = type(actuator)
     period = actuator.steps_per_sample(timestep)
-    parameters, count = parameters_type(family)(*actuator.numbers), len(family.State._fields)
+    parameters, count = parameters_type(family)(*actuator.parameter_values), len(family.State._fields)
     parameters = parameters._replace(
-        **{name: FREE[name] for name in FREE.keys() & {*parameters._fields}}
+        **{name: WITHOUT_FRICTION[name] for name in WITHOUT_FRICTION.keys() & {*parameters._fields}}
     )
     maps, state = [], np.zeros(count)
 

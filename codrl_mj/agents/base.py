@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from gymnasium import spaces
 
-from codrl_mj.fields import Checked, check_memory, check_names, factors
+from codrl_mj.fields import Checked, check_memory, check_names, positive_reals
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +87,7 @@ def check_buffer(name: str, steps: int, env: Any, observations: int) -> None:
 class DeepAgentConfig(AgentConfig):
     """Settings of an agent with networks, on Stable-Baselines3."""
 
-    input_scale: tuple[float, ...] | None = factors()
+    input_scale: tuple[float, ...] | None = positive_reals()
     """Fixed factors > 0 on the observation's entries before they enter a network, in their order;
     entries without one stay as they are. Velocities of the mountain cars are below 0.07, too small
     for a network to notice.

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from gymnasium import spaces
 
 from codrl_mj.agents.base import AgentConfig
-from codrl_mj.fields import integer, real, reals, units
+from codrl_mj.fields import integer, real, reals, positive_integers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,19 +25,19 @@ class SARSAConfig(AgentConfig):
 
     step_size: float = real(0.0375, above=0)
     """alpha of each weight, > 0; 1/tilings would set an estimate to its target at once. The paper: 0.0375."""
-    gamma: float = real(1.0, above=0, most=1)
+    gamma: float = real(1.0, above=0, maximum=1)
     """Discount factor, in (0, 1]. The paper: 1."""
-    epsilon: float = real(0.001, least=0, most=1)
+    epsilon: float = real(0.001, minimum=0, maximum=1)
     """Probability of a random action in the first episode, in [0, 1]. The paper: 0.001."""
-    epsilon_decay: float = real(1.0, above=0, most=1)
+    epsilon_decay: float = real(1.0, above=0, maximum=1)
     """Factor on epsilon from one episode to the next, in (0, 1]. The paper: 1."""
-    trace_decay: float = real(0.0, least=0, most=1)
+    trace_decay: float = real(0.0, minimum=0, maximum=1)
     """lambda of replacing traces, in [0, 1]. The paper: 0, no traces."""
-    tilings: int = integer(8, least=1)
+    tilings: int = integer(8, minimum=1)
     """Grids of tiles, a power of 2. The paper: 8."""
-    intervals: tuple[int, ...] = units((8, 8))
+    intervals: tuple[int, ...] = positive_integers((8, 8))
     """Tiles from bound to bound, >= 1, of each angle and then of each further entry that is tiled. The paper: 8, 8."""
-    angles: int = integer(0, least=0)
+    angles: int = integer(0, minimum=0)
     """Pairs of cosine and sine with which the observation begins, each tiled as the angle that it is (Acrobot: 2)."""
     low: tuple[float, ...] | None = reals()
     """Lower bounds of the tiled entries that are no angles; none: the observation space's."""

@@ -29,7 +29,7 @@ from codrl_mj.compile_cache import njit
 from codrl_mj.envs import ActuatedVectorEnv
 from codrl_mj.envs.compiled import bound, compiled_kernels
 from codrl_mj.envs.sb3 import ActuatedVecEnv
-from codrl_mj.physics.streams import set_words, words_of
+from codrl_mj.physics.streams import set_generator_words, generator_words
 
 FORGOTTEN = 1e-3
 """Eligibility below which a trace is dropped."""
@@ -364,11 +364,11 @@ class SARSA(BaseAlgorithm):
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """What training depends on between episodes, besides the policy and Stable-Baselines3's own attributes."""
-        return {"generator": words_of(self._generator)}
+        return {"generator": generator_words(self._generator)}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Continue from what `snapshot` returned, bit for bit."""
-        set_words(self._generator, snapshot["generator"])
+        set_generator_words(self._generator, snapshot["generator"])
 
     def learn(  # type: ignore[override]
         self,

@@ -8,12 +8,12 @@ from codrl_mj.catalogue.datasheet import (
     motor_names,
     new_motor,
 )
-from codrl_mj.catalogue.derivation import Disagreement, MotorNumbers
+from codrl_mj.catalogue.derivation import Disagreement, MotorParameters
 
 __all__ = [
     "Datasheet",
     "from_datasheet",
-    "MotorNumbers",
+    "MotorParameters",
     "Disagreement",
     "MotorEntry",
     "motor_entry",

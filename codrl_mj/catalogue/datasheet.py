@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from codrl_mj.catalogue.derivation import MotorNumbers, derive
-from codrl_mj.catalogue.units import Kind, read
+from codrl_mj.catalogue.derivation import MotorParameters, derive
+from codrl_mj.catalogue.units import Kind, parse_value
 from codrl_mj.fields import check_names, command
 from codrl_mj.user_code import asset_folder, read_text
 
@@ -116,7 +116,7 @@ class Datasheet:
         """
         given = {name: getattr(self, name) for name in KINDS}
         found = {
-            name: read(name, printed, KINDS[name])
+            name: parse_value(name, printed, KINDS[name])
             for name, printed in given.items()
             if printed is not None
         }
@@ -162,7 +162,7 @@ class Datasheet:
             )
         return found
 
-    def numbers(self, strict: bool = True, tolerance: float = 0.2) -> MotorNumbers:
+    def parameters(self, strict: bool = True, tolerance: float = 0.2) -> MotorParameters:
         """The motor's numbers in SI; see `from_datasheet`."""
         return derive(self.readings(), KINDS, strict, tolerance)
 
@@ -187,7 +187,7 @@ _LEFT_OUT = {
 }
 
 
-def named(printed: Mapping[str, Any]) -> dict[str, Any]:
+def to_field_names(printed: Mapping[str, Any]) -> dict[str, Any]:
     """Printed values by the names of `Datasheet`'s fields, in whatever case, or by what others call them, such as kv.
 
     Raises:
@@ -202,7 +202,7 @@ def named(printed: Mapping[str, Any]) -> dict[str, Any]:
             [field if field in ("shaft", *KINDS) else name],
             ("shaft", *KINDS),
             "datasheet field",
-            every=True,
+            list_all=True,
         )
         if field in found:
             raise ValueError(
@@ -212,7 +212,7 @@ def named(printed: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def from_datasheet(*, strict: bool = True, tolerance: float = 0.2, **printed: Any) -> MotorNumbers:
+def from_datasheet(*, strict: bool = True, tolerance: float = 0.2, **printed: Any) -> MotorParameters:
     """A motor's numbers in SI, from what its datasheet prints.
 
         >>> cim = from_datasheet(
@@ -234,7 +234,7 @@ def from_datasheet(*, strict: bool = True, tolerance: float = 0.2, **printed: An
             the fields do not suffice; or two of them contradict each other. The message names
             field, value and remedy.
     """
-    return Datasheet(**named(printed)).numbers(strict, tolerance)
+    return Datasheet(**to_field_names(printed)).parameters(strict, tolerance)
 
 
 # -- in a file --------------------------------------------------------------------------------------------------------
@@ -271,9 +271,9 @@ class MotorEntry:
         return ", ".join(filter(None, (f"{self.manufacturer} {self.product}".strip(), self.kind)))
 
     @functools.cached_property
-    def numbers(self) -> MotorNumbers:
+    def parameters(self) -> MotorParameters:
         """What follows from the datasheet, in SI."""
-        return self.datasheet.numbers(tolerance=self.tolerance)
+        return self.datasheet.parameters(tolerance=self.tolerance)
 
 
 def motor_names() -> list[str]:
@@ -340,13 +340,13 @@ def _entry(name: str, content: dict[str, Any], own: bool) -> MotorEntry:
             raise ValueError(
                 f"{key} = {value!r}: must be {f'a table, [{key}]' if table else 'text'}"
             )
-    printed = {key: value for key, value in named(content["datasheet"]).items() if value != ""}
+    printed = {key: value for key, value in to_field_names(content["datasheet"]).items() if value != ""}
     content |= {
         "name": name,
         "datasheet": Datasheet(**printed),
-        "estimated": named(content["estimated"]),
+        "estimated": to_field_names(content["estimated"]),
     }
-    _ = MotorEntry(**content).numbers  # refused here, not at first use
+    _ = MotorEntry(**content).parameters  # refused here, not at first use
     check_names(content["estimated"], printed, "entry", "estimated.")
     sourced = [key for key in printed if key in KINDS and key not in content["estimated"]]
     if content["sources"] or not own:
@@ -365,7 +365,7 @@ def _sources(sources: Mapping[str, Any], printed: list[str]) -> dict[str, str]:
                 f'sources.{source!r} = {values!r}: must be a list of entries, or "{_THE_REST}"'
             )
         if values != _THE_REST:
-            values = named(dict.fromkeys(values, source))
+            values = to_field_names(dict.fromkeys(values, source))
             check_names(values, printed, "entry", f"sources.{source!r}: ")
             found |= values
     rest = [name for name in printed if name not in found]

@@ -20,7 +20,7 @@ NAME = r"[a-z]\w+"
 
 
 @functools.cache
-def compiled(formula: str) -> CodeType:
+def compile_formula(formula: str) -> CodeType:
     """A formula to be evaluated among known quantities; its `co_names` are those that it needs."""
     return compile(formula, "a rule of the catalogue", "eval")
 
@@ -180,7 +180,7 @@ class Disagreement(NamedTuple):
     """SI."""
     formula: str
     """How it follows."""
-    reading: str
+    explanation: str
     """What to make of it."""
 
     @property
@@ -194,12 +194,12 @@ class Disagreement(NamedTuple):
         by = f"{100.0 * share:+.3g}%" if abs(share) < 1.0 else f"{share + 1.0:.3g} times that"
         return (
             f"{self.quantity} = {self.printed:.4g} {self.unit}, but {self.formula} ="
-            f" {self.computed:.4g} {self.unit}, {by}: {self.reading}"
+            f" {self.computed:.4g} {self.unit}, {by}: {self.explanation}"
         )
 
 
 @dataclasses.dataclass(frozen=True)
-class MotorNumbers:
+class MotorParameters:
     """A motor's numbers in SI at the motor's shaft; None where they are unknown."""
 
     resistance: float
@@ -248,7 +248,7 @@ AT_OUTPUT = ("stall_torque_at_output", "continuous_torque_at_output", "torque_co
 """Torques, and torque per current, past a gear's losses, which tell the motor's only once its efficiency is known."""
 _LEAST_EFFICIENCY = 0.2
 """No off-the-shelf gear for a servo is worse: a derived efficiency below it is a slip of units."""
-OTHER_NAMES = {
+PRINTED_NAMES = {
     "max_current": "peak_current",
     "voltage": "nominal_voltage",
     "max_temperature": "max_winding_temperature",
@@ -273,7 +273,7 @@ _NEEDED = {
 
 def derive(
     readings: Mapping[str, Reading], kinds: Mapping[str, Kind], strict: bool, tolerance: float
-) -> MotorNumbers:
+) -> MotorParameters:
     """The numbers that follow from what is printed; the arguments and errors of `from_datasheet`."""
     if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance > 0.0:
         raise ValueError(f"tolerance = {tolerance!r}: must be a number > 0, such as 0.2")
@@ -309,7 +309,7 @@ def derive(
             f" {worst}. Check the values and units of {behind}; raise tolerance, or pass"
             " strict=False, if the maker does print them so"
         )
-    for name, field in OTHER_NAMES.items():
+    for name, field in PRINTED_NAMES.items():
         if field in printed:
             known[name], how[name] = (
                 known[field],
@@ -317,10 +317,10 @@ def derive(
             )
     fields = [
         f.name
-        for f in dataclasses.fields(MotorNumbers)
+        for f in dataclasses.fields(MotorParameters)
         if f.name not in ("derived", "disagreements")
     ]
-    return MotorNumbers(
+    return MotorParameters(
         **{name: known.get(name) for name in fields},  # type: ignore[arg-type]
         derived={name: how[name] for name in fields if name in known},
         disagreements=disagreements,
@@ -380,7 +380,7 @@ class _Derivation:
 
     def _tells(self, formula: str) -> bool:
         """Whether all is known that a formula needs."""
-        return self.known.keys() >= {*compiled(formula).co_names}
+        return self.known.keys() >= {*compile_formula(formula).co_names}
 
     def _filled(self, formula: str) -> str:
         """A formula with numbers and their units for names."""
@@ -420,7 +420,7 @@ class _Derivation:
         ):
             quantity, formula = new
             try:
-                self._follow(quantity, formula, eval(compiled(formula), {}, known))
+                self._follow(quantity, formula, eval(compile_formula(formula), {}, known))
             except ZeroDivisionError as error:
                 raise ValueError(
                     f"datasheet.{quantity}: {formula} = {self._filled(formula)} divides by 0; check"
@@ -478,14 +478,14 @@ class _Derivation:
     def disagreements(self, printed: set[str]) -> tuple[Disagreement, ...]:
         """What is printed and also follows, otherwise; the worst first."""
         found = []
-        for quantity, formula, reading in CHECKS:
+        for quantity, formula, explanation in CHECKS:
             if quantity in printed and self._tells(formula):
-                value, computed = self.known[quantity], eval(compiled(formula), {}, self.known)
+                value, computed = self.known[quantity], eval(compile_formula(formula), {}, self.known)
                 if abs(computed - value) > 1e-9 * abs(value):
                     text = f"{formula} = {self._filled(formula)}"
                     found.append(
                         Disagreement(
-                            quantity, value, computed, self._units[quantity], text, reading
+                            quantity, value, computed, self._units[quantity], text, explanation
                         )
                     )
         return tuple(sorted(found, key=lambda one: -abs(one.difference)))

@@ -86,7 +86,7 @@ class Reading(NamedTuple):
     """`motor`, `output`, or None where it does not say."""
 
 
-def read(name: str, printed: Any, kind: Kind) -> Reading:
+def parse_value(name: str, printed: Any, kind: Kind) -> Reading:
     """A printed value in SI, such as `25.1 mN*m/A`, `2 * 0.3 ohm`, `2.42 N*m at output`; without a unit, a number too.
 
     Raises:
@@ -129,7 +129,7 @@ def read(name: str, printed: Any, kind: Kind) -> Reading:
         raise ValueError(f"datasheet.{name} = {printed!r}: has no unit; {remedy}")
     try:
         value = float(
-            in_si(math.prod(map(float, factors.split("*"))), unit, kind.unit, weights=True)
+            to_si(math.prod(map(float, factors.split("*"))), unit, kind.unit, weights=True)
         )
     except ValueError as error:
         raise ValueError(f"datasheet.{name} = {printed!r}: {error}; {remedy}") from error
@@ -142,7 +142,7 @@ def read(name: str, printed: Any, kind: Kind) -> Reading:
     return Reading(value, f"{factors} {unit}".strip(), shaft)
 
 
-def in_si(
+def to_si(
     number: Any, unit: str, kind: str | None, of: str = "this quantity", weights: bool = False
 ) -> Any:
     """A number of a unit, as datasheets and loggers spell it, in the SI unit of its kind; of kind None in any.

@@ -12,7 +12,7 @@ from codrl_mj.cli.environments import AS_TRAINED, ActuatorName, environment, wit
 from codrl_mj.cli.parsing import AsJson, Trust, named_numbers
 from codrl_mj.cli.subject import Source, Subject
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.fields import command, differing
+from codrl_mj.fields import command, differences
 
 Exported = Annotated[
     tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER", help="What export wrote.")
@@ -111,7 +111,7 @@ class Export:
         env = environment(self, subject.env.task, self.actuator_name, known)
         if subject.run is None:
             return env
-        if other := differing(known.as_mapping(), env.as_mapping()):
+        if other := differences(known.as_mapping(), env.as_mapping()):
             raise ValueError(
                 f"{', '.join(other)}: {subject.run} says what it was trained in, and that is"
                 " exported: leave the flags of the environment out; evaluate and board test take"

@@ -17,7 +17,7 @@ from codrl_mj.actuators import (
     DCMotorActuator,
     Ideal,
     Supply,
-    actuator_over,
+    override_actuator,
     find_family,
     identified_ranges,
 )
@@ -207,7 +207,7 @@ def environment(verb: Any, task: str, name: str, known: EnvConfig) -> EnvConfig:
     if patterns:
         config = EnvConfig(task, world.overlaid(config, patterns), options=options)
     over = _given(verb.actuator_fields)
-    changed = {pattern: actuator_over(one, over) for pattern, one in config.driven.items()}
+    changed = {pattern: override_actuator(one, over) for pattern, one in config.driven.items()}
     return EnvConfig(task, changed, options=options, **fields)
 
 

@@ -290,7 +290,7 @@ class PlanExperiment:
         from codrl_mj.sizing import find_drive, find_entry
 
         sensing, entry = Sensing(**vars(self.sensing)), find_entry(self.name)
-        bears = None if entry is None else entry.numbers.continuous_current
+        bears = None if entry is None else entry.parameters.continuous_current
         limits = self.max_current, math.inf if bears is None else bears
         found = plan(
             find_drive(self.name), Load(**vars(self.load)), sensing, self.duration, *limits

@@ -78,7 +78,7 @@ class Feasible:
             self.name, self.gear_ratio, voltage=self.voltage, max_current=self.max_current
         )
         entry = find_entry(self.name)
-        continuous, unknown = entry.numbers.continuous_current if entry else None, uncounted(entry)
+        continuous, unknown = entry.parameters.continuous_current if entry else None, uncounted(entry)
         demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
         found = feasibility(drive, demand, continuous)
         title = f"{self.name}, {_gear(drive, demand)}, {drive.voltage_limit:g} V: {demand.source}"
@@ -378,4 +378,4 @@ def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
     radius, entry = drive.motor.arm_radius, find_entry(name)
     torque = radius * (demand.torque + drive.additions.armature * demand.acceleration)
     points = np.column_stack([demand.speed / radius, torque])
-    save_plot(torque_speed_diagram(drive, None if entry is None else entry.numbers, points), path)
+    save_plot(torque_speed_diagram(drive, None if entry is None else entry.parameters, points), path)

@@ -78,19 +78,19 @@ class Link(Checked):
         ValueError: a field is out of bounds.
     """
 
-    lost: float = real(0.0, least=0.0, most=1.0)
+    lost: float = real(0.0, minimum=0.0, maximum=1.0)
     """Share of the frames that never arrive at the board."""
-    damaged: float = real(0.0, least=0.0, most=1.0)
+    damaged: float = real(0.0, minimum=0.0, maximum=1.0)
     """Share of the frames in which a bit flips on the way."""
-    late: float = real(0.0, least=0.0, most=1.0)
+    late: float = real(0.0, minimum=0.0, maximum=1.0)
     """Share of the answers that come a period late: the command before holds."""
-    counts: int = integer(0, least=0)
+    counts: int = integer(0, minimum=0)
     """Steps of the encoders in a turn, in which observed angles come; speeds [rad/s] come as
     differences of them over a period. 0: exact.
     """
-    current_bits: int = integer(0, least=0)
+    current_bits: int = integer(0, minimum=0)
     """Bits of the converter that measures the current, over the drive's range both ways. 0: exact."""
-    pwm_bits: int = integer(0, least=0)
+    pwm_bits: int = integer(0, minimum=0)
     """Bits of the bridge's voltages, which a current loop or the policy itself commands, over the
     supply both ways. 0: exact.
     """

@@ -22,7 +22,7 @@ from codrl_mj.deploy.loops import current_loop
 from codrl_mj.deploy.network import network_of
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
-from codrl_mj.fields import check_names, did_you_mean, differing
+from codrl_mj.fields import check_names, did_you_mean, differences
 from codrl_mj.runs.files import read_json, sealed, write_json
 from codrl_mj.runs.policies import Policy
 
@@ -288,7 +288,7 @@ class Contract(Interface):
                 )
             theirs = _told(mapping_of(actuators[name]))
             if theirs["sha256"] != mine["sha256"]:
-                found = differing(mine["fields"] or {}, theirs["fields"] or {})
+                found = differences(mine["fields"] or {}, theirs["fields"] or {})
                 where, (wanted, given) = next(iter(found.items()), ("family", (None, None)))
                 raise ValueError(
                     f"actuator {name!r}: {where} = {given}, must be {wanted}, through which the"

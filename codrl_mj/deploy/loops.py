@@ -50,7 +50,7 @@ def current_loop(env: EnvConfig) -> dict[str, Any] | None:
         )
     return shared | {
         "kind": "sampled",
-        "sag": first.sag,
+        "sag": first.supply_resistance,
         "rate": loop.sample_rate,
         "most": loop.max_current if np.isfinite(loop.max_current) else None,
         "kp": kp,

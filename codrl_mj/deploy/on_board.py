@@ -68,7 +68,7 @@ def asked_of_board(
     return rounded(table[16], table[_VOLTAGE]), table[17], table[18]
 
 
-def run_over(
+def advance_winding(
     parameters: Any,
     resistance: float,
     samples: int,
@@ -77,7 +77,7 @@ def run_over(
     asked: float,
     speed: float,
 ) -> tuple[Winding, float, float, int, float, float]:
-    """`codrl_mj.actuators.shaft.run_over` of a loop that is closed on the board, sample by sample."""
+    """`codrl_mj.actuators.shaft.advance_winding` of a loop that is closed on the board, sample by sample."""
     x = resistance / (parameters.sample_rate * parameters.inductance)
     lost = -math.expm1(-x)
     back_emf = parameters.back_emf_constant * speed
@@ -145,7 +145,7 @@ def _with(function: Any, **others: Any) -> Any:
 
 
 _shaft = ModuleType("codrl_mj.actuators.shaft")
-vars(_shaft).update(vars(shaft), turn=_with(shaft.turn, run_over=run_over))
+vars(_shaft).update(vars(shaft), advance_motor=_with(shaft.advance_motor, advance_winding=advance_winding))
 _ADVANCE = {
     Drive: _with(drive.advance, _advance=_with(drive._advance, shaft=_shaft)),
     Servo: _with(servo.advance, shaft=_shaft),

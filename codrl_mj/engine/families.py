@@ -16,8 +16,8 @@ import numpy as np
 from numba import types
 from numba.extending import register_jitable
 
-from codrl_mj.actuators import Family, Inputs, family_number, parameters_type, reference
-from codrl_mj.actuators.model import advance_form, check_family
+from codrl_mj.actuators import Family, Inputs, family_id, parameters_type, import_path
+from codrl_mj.actuators.model import advance_signature, check_family
 from codrl_mj.compile_cache import Note, cfunc
 from codrl_mj.engine.doors import load_inertia
 from codrl_mj.engine.memory import call, f64, i32, internal, read, symbol, tuple_of, u8, u64, write
@@ -88,7 +88,7 @@ def signals_at(family: Family) -> int:
 
 def user_head(family: Family) -> tuple[float, float, float]:
     """What the `user` data of a family's actuators begin with, at either door; its parameters follow."""
-    return *SIGNATURE, float(family_number(family))
+    return *SIGNATURE, float(family_id(family))
 
 
 def load_family(family: Family) -> None:
@@ -102,24 +102,24 @@ def load_family(family: Family) -> None:
             `advance` is not what numba compiles, or does not return what the family declares.
     """
     check_family(family)
-    number, sizes = family_number(family), family_sizes(family)
+    number, sizes = family_id(family), family_sizes(family)
     other, _ = _COMPILED.get(number, (None, None))
     if other is family:
         return
-    if other is not None and reference(other) != reference(family):
+    if other is not None and import_path(other) != import_path(family):
         raise ValueError(
-            f"families {reference(family)} and {reference(other)} have the same number {number}:"
+            f"families {import_path(family)} and {import_path(other)} have the same number {number}:"
             " rename one"
         )
     if other is not None and family_sizes(other) != sizes:
         raise ValueError(
-            f"family {reference(family)} has {sizes[:3]} states, signals and parameters, and"
+            f"family {import_path(family)} has {sizes[:3]} states, signals and parameters, and"
             f" {family_sizes(other)[:3]} when it was loaded before: give it another name, or start"
             " Python anew"
         )
     if family.INERTIA:
         load_inertia()
-    function, text = _compile(family), ctypes.create_string_buffer(reference(family).encode())
+    function, text = _compile(family), ctypes.create_string_buffer(import_path(family).encode())
     _SIZES[number], _REFERENCES[number] = (*sizes, slot_size(family)), ctypes.addressof(text)
     _ADDRESSES[number] = function.address
     _COMPILED[number] = family, (function, text, _COMPILED.get(number))
@@ -135,7 +135,7 @@ def family_sizes(family: Family) -> tuple[int, ...]:
 def replaced(family: Family, other: Family) -> Iterator[None]:
     """Run another's `advance` in place of a family's in a `with` block; both have the same states and signals."""
     load_family(family)
-    number, function = family_number(family), _compile(other)
+    number, function = family_id(family), _compile(other)
     right = _ADDRESSES[number]
     _ADDRESSES[number] = function.address
     try:
@@ -201,7 +201,7 @@ def _example(kind: Any) -> Any:
 def _compile(family: Any) -> Any:
     parameters_of, state_of = parameters_type(family), family.State
     kinds = tuple_of(parameters_of), _F64, tuple_of(state_of), tuple_of(Inputs)
-    advance = compiled_function(family.advance, *advance_form(family), *kinds)
+    advance = compiled_function(family.advance, *advance_signature(family), *kinds)
 
     @cfunc(_FUNCTION, nogil=True, error_model="numpy")
     def step(

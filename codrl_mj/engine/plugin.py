@@ -16,7 +16,7 @@ from typing import Any
 import mujoco
 from numba import types
 
-from codrl_mj.actuators import BUILT_IN, Ideal, family_number, reference
+from codrl_mj.actuators import BUILT_IN, Ideal, family_id, import_path
 from codrl_mj.compile_cache import cfunc, external, njit
 from codrl_mj.engine.doors import clip, command, inertia_at, is_disabled, user_of
 from codrl_mj.engine.families import (
@@ -61,7 +61,7 @@ _GAINS, _BIASES, _DYNAMICS = mujoco.mjNGAIN, mujoco.mjNBIAS, mujoco.mjNDYN
 _AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
 _EXACT_FILTER, _LEAST = int(mujoco.mjtDyn.mjDYN_FILTEREXACT), mujoco.mjMINVAL
 _RK4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-_IDEAL = family_number(Ideal)
+_IDEAL = family_id(Ideal)
 _FIRST, _SECOND = SIGNATURE
 
 
@@ -264,7 +264,7 @@ def _family(model: int, instance: int) -> Any:
     text = _configuration_of(model, instance, ctypes.addressof(_ATTRIBUTE))
     name = ctypes.string_at(text).decode() if text else ""
     for family in (*loaded_families(), *BUILT_IN):
-        if reference(family) == name:
+        if import_path(family) == name:
             return family
     raise ValueError(
         f"its family {name!r} is not loaded, and is not imported because a model says so: import"

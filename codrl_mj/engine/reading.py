@@ -11,12 +11,12 @@ from codrl_mj.actuators import (
     ActuatorModel,
     Family,
     UnstableError,
-    family_number,
+    family_id,
     parameters_type,
-    reference,
+    import_path,
     stability,
 )
-from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.actuators.noise import MAX_KEY
 from codrl_mj.engine.doors import shaft_inertia
 from codrl_mj.engine.families import (
     HEAD,
@@ -90,7 +90,7 @@ def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
     if behind_plugin and (len(user) < PLUGIN_HEAD or tuple(user[:2]) != SIGNATURE):
         raise ValueError(REASONS[1])
     known: dict[float, Family] = {
-        family_number(family): family for family in (*BUILT_IN, *loaded_families())
+        family_id(family): family for family in (*BUILT_IN, *loaded_families())
     }
     family = known.get(user[2])
     if family is None:
@@ -103,9 +103,9 @@ def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
         name = (
             bytes(model.plugin_attr[model.plugin_attradr[instance] :]).partition(b"\0")[0].decode()
         )
-        if name != reference(family):
+        if name != import_path(family):
             raise ValueError(
-                f"{FAMILY} = {name!r} of its plugin: its user data are those of {reference(family)}"
+                f"{FAMILY} = {name!r} of its plugin: its user data are those of {import_path(family)}"
             )
         if model.plugin_statenum[instance] != size + EXTRA_STATES:
             raise ValueError(REASONS[5])
@@ -141,7 +141,7 @@ def _motor_at(model: mujoco.MjModel, index: int, slot: int) -> ActuatorModel:
         raise ValueError(
             f"user = {list(user)}: a {family.__name__} needs {head} numbers and {', '.join(names)}"
         )
-    return family.from_numbers(user[head : head + len(names)], arm)
+    return family.from_parameter_values(user[head : head + len(names)], arm)
 
 
 def slots(data: mujoco.MjData, actuators: Mapping[int, ActuatorModel]) -> dict[int, np.ndarray]:
@@ -182,7 +182,7 @@ def clear_motors(data: mujoco.MjData, noise_keys: Sequence[int] | None = None) -
             " model"
         )
     for index, key in enumerate(keys):
-        if not (isinstance(key, numbers.Real) and 0 <= key < LARGEST_KEY and key % 1 == 0):  # type: ignore[operator]
+        if not (isinstance(key, numbers.Real) and 0 <= key < MAX_KEY and key % 1 == 0):  # type: ignore[operator]
             raise ValueError(
                 f"noise_keys[{index}] = {key!r}: must be a whole number from 0 to 2**53 - 1, which"
                 " a float64 holds"
@@ -276,7 +276,7 @@ def _loop_radius(
     ]
 
     def linearized(number: int, timestep: float, size: float = 1.0) -> np.ndarray:
-        change = size * stability.CHANGE
+        change = size * stability.PERTURBATION
         return stability.linearize(
             motors[number], advances[number], timestep, known[number], change
         )
@@ -368,7 +368,7 @@ class Readout:
         out, instances = model.actuator_outadr[indices], model.actuator_plugin[indices]
         behind_plugin, tracks = (
             instances >= 0,
-            np.array([family.tracks for family in families], dtype=bool),
+            np.array([family.is_torque_controlled for family in families], dtype=bool),
         )
         self._behind = behind_plugin.all(), behind_plugin.any()
         # places in plugins' states, after activations where there are motors at both doors

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, JointAdditions, reference, resolve
+from codrl_mj.actuators import ActuatorModel, JointAdditions, import_path, resolve
 from codrl_mj.engine.families import load_family, user_head
 from codrl_mj.engine.reading import check_shafts
 from codrl_mj.fields import check_joint_dynamics, check_pattern, did_you_mean
@@ -346,11 +346,11 @@ def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel, mounted: AddedMotor) -> N
     """
     actuator, index, instance = mounted.actuator, mounted.indices[0], f"{NAME}.{mounted.indices[0]}"
     spec.activate_plugin(NAME)
-    spec.add_plugin(name=instance, plugin_name=NAME).config = {FAMILY: reference(type(actuator))}
+    spec.add_plugin(name=instance, plugin_name=NAME).config = {FAMILY: import_path(type(actuator))}
     for each in mounted.indices:
         _connect(spec, model, each, instance, actuator.MOTION)
     target, added = spec.actuators[index], actuator.additions
-    target.userdata = [*user_head(type(actuator)), actuator.arm_radius, *actuator.numbers]
+    target.userdata = [*user_head(type(actuator)), actuator.arm_radius, *actuator.parameter_values]
     target.armature += added.armature
     target.damping[0] += added.damping
     if added.friction:

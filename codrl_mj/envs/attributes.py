@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from codrl_mj.disturbances import OFF
+from codrl_mj.disturbances import NO_DISTURBANCES
 from codrl_mj.envs.setup import ResolvedEnv
 from codrl_mj.physics.analytic import AnalyticPhysics
 from codrl_mj.physics.variation import Variation, field_of, write_fields
@@ -145,7 +145,7 @@ def _write_number(
 def _write_forces(value: Any, setup: ResolvedEnv, model: Any, each: bool) -> ResolvedEnv:
     """The forces of the actions, each or the largest of them."""
     task = setup.task
-    if setup.config.action != "force" or setup.config.disturbances != OFF or len(task.motors) > 1:
+    if setup.config.action != "force" or setup.config.disturbances != NO_DISTURBANCES or len(task.motors) > 1:
         raise AttributeError(
             "the forces are known to the current loop's table, to the drive's disturbances or to"
             " several motors: make an environment of one motor with action='force' and no"
@@ -169,7 +169,7 @@ def _write_forces(value: Any, setup: ResolvedEnv, model: Any, each: bool) -> Res
 
 def _write_step(value: Any, setup: ResolvedEnv, model: Any) -> ResolvedEnv:
     duration = _number(value, positive=True)
-    if setup.plant.motors_added or setup.config.disturbances != OFF:
+    if setup.plant.motors_added or setup.config.disturbances != NO_DISTURBANCES:
         raise AttributeError(
             "motor and disturbances were checked for this step: make an environment without them"
         )

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Drive, Ideal, Servo
-from codrl_mj.disturbances import OFF, Disturbances, check_delay
+from codrl_mj.disturbances import NO_DISTURBANCES, Disturbances, check_delay
 from codrl_mj.engine.reading import motors as motors_of
 from codrl_mj.engine.reading import sharing
 from codrl_mj.engine.specs import ON_JOINT
@@ -84,7 +84,7 @@ class TaskCommands:
             )
         self.simulated = tuple(command.actuator for command in chosen)
         """What is simulated, one for each motor: the actuator, or what a command leaves of it."""
-        self.tracks = self.simulated[0].tracks
+        self.tracks = self.simulated[0].is_torque_controlled
         """Whether a force is asked for; otherwise what is delivered counts as desired."""
         self.fixed = chosen[0].fixed
         """Fields of the actuator that cannot be drawn -> why."""
@@ -95,7 +95,7 @@ class TaskCommands:
         if not all(limit is None or np.isfinite(limit) for limit in limits):
             raise ValueError(f"action = {name!r}: needs a finite controller.max_voltage, it is inf")
         self.holds = np.where([command.unit in POSITIONS for command in chosen], scales, 0.0)
-        """As `codrl_mj.physics.SimulationConfig.holds`."""
+        """As `codrl_mj.physics.SimulationConfig.force_per_position`."""
         each = zip(limits, scales, task.max_forces, strict=True)
         self.max_forces = np.array(
             [most if limit is None else limit * scale for limit, scale, most in each]
@@ -225,11 +225,11 @@ class ControlCommands:
         """
         self.action_space, model, indices = actions, data.model, list(motors)
         self._scales: np.ndarray | None = None
-        self._disturber, self._dofs = Disturber(OFF, 1.0, np.zeros(0), 1), list[int]()
+        self._disturber, self._dofs = Disturber(NO_DISTURBANCES, 1.0, np.zeros(0), 1), list[int]()
         meant = {index: command for index, command in motors.items() if command is not None}
         remedies = {"action": "use action='force', its own"} if meant else {}
         remedies |= (
-            {} if disturbances == OFF else {"disturbances": "they are what can be disturbed"}
+            {} if disturbances == NO_DISTURBANCES else {"disturbances": "they are what can be disturbed"}
         )
         for name, remedy in remedies.items():
             if not isinstance(actions, spaces.Box) or actions.shape != (model.nu,):
@@ -239,7 +239,7 @@ class ControlCommands:
                 )
         if meant:
             self._command(model, meant)
-        if disturbances == OFF:
+        if disturbances == NO_DISTURBANCES:
             return
         if step_duration is None:
             raise ValueError(
@@ -343,7 +343,7 @@ class ControlCommands:
             return action
         arrived = np.array(action, dtype=np.float64)
         wanted = arrived[self._controls] * self._gains
-        commands, loads = (each[0] for each in self._disturber.disturbed(wanted[np.newaxis]))
+        commands, loads = (each[0] for each in self._disturber.disturb_commands(wanted[np.newaxis]))
         arrived[self._controls] = commands / self._gains
         if self._pulses:
             self._data.qfrc_applied[self._dofs] = 0.0

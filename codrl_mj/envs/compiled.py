@@ -31,14 +31,14 @@ import numba
 import numpy as np
 from numba import types
 
-from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.actuators.noise import MAX_KEY
 from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import f32, f64, floats, i64, internal, on_stack
 from codrl_mj.envs.setup import FIRST_OPTION, NEEDS_KEY, ResolvedEnv
 from codrl_mj.physics.compiled_task import Compiled, Outcomes, compiled_outcomes
 from codrl_mj.physics.rows import Lane, Rows, load, store
-from codrl_mj.physics.sharing import shared
+from codrl_mj.physics.sharing import make_shared_kernel
 from codrl_mj.physics.stepping import OBSERVATION, OPTIONS, Stepping, simulation_at
 
 
@@ -126,10 +126,10 @@ def compiled_env(env: Any) -> CompiledEnv | None:
 
 def bound(setup: ResolvedEnv, physics: Any) -> tuple[int, np.ndarray]:
     """The address of a simulation whose steps are compiled, and the observation that they fill."""
-    _, seen = physics.bound or (None, np.empty(setup.observation_space.shape or (), np.float32))
-    physics.bound = options, seen = setup.options, seen
-    physics.places[OPTIONS], physics.places[OBSERVATION] = options.ctypes.data, seen.ctypes.data
-    return physics.where, seen
+    _, seen = physics.bound_arrays or (None, np.empty(setup.observation_space.shape or (), np.float32))
+    physics.bound_arrays = options, seen = setup.options, seen
+    physics.pointer_table[OPTIONS], physics.pointer_table[OBSERVATION] = options.ctypes.data, seen.ctypes.data
+    return physics.pointers, seen
 
 
 def compiled_kernels(setup: ResolvedEnv, physics: Any) -> Kernels:
@@ -196,7 +196,7 @@ def _kernels(
         for entry in range(size):
             state[entry] = entries[entry]
         key = (
-            generator.random() * LARGEST_KEY if f64(i64(where)[OPTIONS])[NEEDS_KEY] != 0.0 else 0.0
+            generator.random() * MAX_KEY if f64(i64(where)[OPTIONS])[NEEDS_KEY] != 0.0 else 0.0
         )
         start(state, key, where)
         look(np.zeros(simulation_at(where)[4].shape[1:]), state, where)
@@ -236,4 +236,4 @@ def _kernels(
             lane.places[OBSERVATION] = observations[row].ctypes.data
             look(nothing, state, lane.places.ctypes.data)
 
-    return Kernels(step, reset, shared(step_some), observe_rows)
+    return Kernels(step, reset, make_shared_kernel(step_some), observe_rows)

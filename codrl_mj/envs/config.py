@@ -11,8 +11,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from codrl_mj.actuators import ActuatorModel, mapping_of, names_together
-from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve
+from codrl_mj.actuators import ActuatorModel, mapping_of, combined_name
+from codrl_mj.disturbances import NO_DISTURBANCES, UNMODIFIED_JOINT, Disturbances, Joint, resolve
 from codrl_mj.envs.distributions import Distribution, paths_of
 from codrl_mj.envs.worlds import EnvSource, find_world, options_mapping
 from codrl_mj.fields import check_joint_dynamics, check_names
@@ -64,9 +64,9 @@ class EnvConfig:
     """Time limit [environment steps], >= 1; the default is the environment's own."""
     allow_unstable: bool = False
     """Build the environment even if the current loop is unstable."""
-    disturbances: Disturbances = OFF
+    disturbances: Disturbances = NO_DISTURBANCES
     """Imperfections of the commands' way, and load pulses; each is off at 0."""
-    joint: Joint = PLAIN
+    joint: Joint = UNMODIFIED_JOINT
     """What is added to the actuated joints."""
     joint_dynamics: str | None = None
     """In an environment of others, damping, armature and frictionloss that its model has where
@@ -91,8 +91,8 @@ class EnvConfig:
         """Validate, and turn what files and users write into what it stands for, and numpy's values into Python's."""
         kept = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)}
         world = find_world(kept["task"])
-        kept |= {"task": world.reference, "joint": resolve(kept["joint"], PLAIN)}
-        kept["disturbances"] = resolve(kept["disturbances"], OFF)
+        kept |= {"task": world.reference, "joint": resolve(kept["joint"], UNMODIFIED_JOINT)}
+        kept["disturbances"] = resolve(kept["disturbances"], NO_DISTURBANCES)
         for field in dataclasses.fields(self):
             if field.name not in world.fields and kept[field.name] != field.default:
                 raise ValueError(
@@ -176,7 +176,7 @@ class EnvConfig:
     @property
     def through(self) -> str:
         """What to call the actuators."""
-        return names_together(self.actuators, self.world.paper)
+        return combined_name(self.actuators, self.world.paper)
 
     @property
     def distributions(self) -> dict[str, Distribution]:
@@ -212,7 +212,7 @@ class EnvConfig:
         given = {
             name: value
             for name, value in arguments.items()
-            if value is not None and value not in (OFF, PLAIN)
+            if value is not None and value not in (NO_DISTURBANCES, UNMODIFIED_JOINT)
         }
         return given | self.world.changed(self.options)
 

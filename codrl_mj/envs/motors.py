@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium import spaces
 
 from codrl_mj.actuators import ActuatorModel, Command, Family, Inputs, parameters_type
-from codrl_mj.actuators.noise import LARGEST_KEY
-from codrl_mj.disturbances import OFF, Disturbances
+from codrl_mj.actuators.noise import MAX_KEY
+from codrl_mj.disturbances import NO_DISTURBANCES, Disturbances
 from codrl_mj.engine.families import HEAD, signals_at
 from codrl_mj.engine.reading import Readout, bring_to_rest, sharing, slots
 from codrl_mj.engine.specs import matched_by, names_of
@@ -23,7 +23,7 @@ from codrl_mj.envs.randomization import (
     apply_to_simulation,
     check_extremes,
 )
-from codrl_mj.physics.base import diverged, make_info_reader
+from codrl_mj.physics.base import divergence_error, make_info_reader
 from codrl_mj.physics.variation import without_motors, write_fields
 
 _POSITION = int(
@@ -43,7 +43,7 @@ class MotorSettings:
     """Whether observations end with what the motors' sensors say."""
     randomize: Any = None
     """What is drawn at every reset."""
-    disturbances: Disturbances = OFF
+    disturbances: Disturbances = NO_DISTURBANCES
     """Of commands, and load pulses."""
     allow_unstable: bool = False
     """As for `codrl_mj.add_motors`."""
@@ -123,7 +123,7 @@ class ActuatorBank:
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the motors for others of their families; to be followed by a reset."""
         for index, one in zip(self.present, actuators, strict=True):
-            numbers = (one.arm_radius, *one.numbers)
+            numbers = (one.arm_radius, *one.parameter_values)
             self.data.model.actuator_user[index, HEAD : HEAD + len(numbers)] = numbers
             self.present[index] = one
         self._parameters = list(map(_parameters, actuators))
@@ -136,7 +136,7 @@ class ActuatorBank:
     def begin(self, generator: np.random.Generator) -> None:
         """Bring all to rest after a reset: motors, with keys of their own for noise, and commands on their way."""
         self.data.warning.number[:] = 0  # not all environments reset all data
-        key = generator.random() * LARGEST_KEY if self._random else 0.0  # a whole number, exactly
+        key = generator.random() * MAX_KEY if self._random else 0.0  # a whole number, exactly
         for at, (slot, motor) in enumerate(zip(self._slots, self.present.values(), strict=True)):
             bring_to_rest(slot, self.data.time, key + at if motor.random else 0.0)
         self._commands.begin(key)
@@ -176,7 +176,7 @@ class ActuatorBank:
             )
             of = {_POSITION: "position", _POSITION + 1: "speed"}.get(kind, "acceleration")
             what = f"the {of} of {model.joint(joint).name or f'joint {joint}'}"
-        raise diverged(
+        raise divergence_error(
             who, time, f"{what} is no number, or too large", f"the model's {model.opt.timestep:g} s"
         )
 
@@ -232,4 +232,4 @@ def longer(space: spaces.Space, count: int) -> spaces.Box:
 
 def _parameters(motor: ActuatorModel) -> Any:
     family: Family = type(motor)
-    return parameters_type(family)(*motor.numbers)
+    return parameters_type(family)(*motor.parameter_values)

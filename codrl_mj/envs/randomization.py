@@ -26,7 +26,7 @@ from codrl_mj.engine.reading import check_shafts, sharing
 from codrl_mj.engine.specs import matched_by, names_of
 from codrl_mj.envs.distributions import MODEL, Choice, Distribution, split_path
 from codrl_mj.fields import did_you_mean
-from codrl_mj.physics.variation import Variation, mounting_of, mounts_of, variable, write_fields
+from codrl_mj.physics.variation import Variation, arms_and_additions, joint_addresses, variable_names, write_fields
 
 MAX_CORNERS = 32
 """Combinations of bounds that are checked: all of five drawn values, and of more so many at random."""
@@ -129,7 +129,7 @@ class RandomizationState:
             np.array(list(map(field_values, each))) for each in zip(*motors, strict=True)
         ]
         """Fields of each motor, shape (N, f), columns as in `field_paths`."""
-        self._mounting = mounting_of(motors)
+        self._mounting = arms_and_additions(motors)
         self._values = np.full((len(motors), len(randomization.distributions)), np.nan)
         self._rejected = np.zeros(len(motors), dtype=np.int64)
 
@@ -183,7 +183,7 @@ class RandomizationState:
         last = str(dict(zip(drawn.distributions, values[0].tolist(), strict=True)))
         for family, each in zip(drawn.families, self._fields(row, values), strict=True):
             try:
-                family.from_numbers(numbers_of(family, each)[0]).check(drawn.timestep)
+                family.from_parameter_values(numbers_of(family, each)[0]).check(drawn.timestep)
             except ValueError as error:
                 return f"{last}: {error}"
         return last
@@ -216,7 +216,7 @@ class RandomizationState:
         arms, additions = (each[rows] for each in self._mounting)
         if self.randomization.mounting:
             each = zip(*(one.tolist() for one in fields), strict=True)
-            arms, additions = mounting_of(
+            arms, additions = arms_and_additions(
                 [list(map(from_array, families, values)) for values in each]
             )
         return list(map(numbers_of, families, fields)), arms, additions
@@ -369,9 +369,9 @@ def _matched(
     indices, simulated, varied = (
         list(motors),
         list(motors.values()),
-        variable(model) if distributions else (),
+        variable_names(model) if distributions else (),
     )
-    names, rubbing = names_of(model), [mounts_of(model, index)[2] is not None for index in motors]
+    names, rubbing = names_of(model), [joint_addresses(model, index)[2] is not None for index in motors]
     called = [[name for one in sharing(model, index) for name in names[one]] for index in indices]
     matched: dict[str, list[int]] = {}
     for path, distribution in distributions.items():

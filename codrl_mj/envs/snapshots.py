@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from mujoco.introspect.structs import STRUCTS
 
-from codrl_mj.physics.streams import set_words
+from codrl_mj.physics.streams import set_generator_words
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
@@ -43,9 +43,9 @@ def encode_name(name: str) -> np.ndarray:
 
 
 def generator_of(words: np.ndarray) -> np.random.Generator:
-    """A generator that goes on from what `codrl_mj.physics.streams.words_of` returned."""
+    """A generator that goes on from what `codrl_mj.physics.streams.generator_words` returned."""
     generator, _ = seeding.np_random(0)
-    set_words(generator, words)
+    set_generator_words(generator, words)
     return generator
 
 

@@ -184,10 +184,10 @@ class Column:
         kind, unit = KINDS[self.signal], self.unit
         if unit is None or (not kind and unit in ("", "1")):
             return value
-        from codrl_mj.catalogue.units import in_si
+        from codrl_mj.catalogue.units import to_si
 
         try:
-            return in_si(value, unit, kind, self.signal)
+            return to_si(value, unit, kind, self.signal)
         except ValueError as error:
             raise self._wrong(f"{error}; write {kind or '1'}, or another unit of that") from error
 

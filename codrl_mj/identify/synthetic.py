@@ -88,9 +88,9 @@ EXCITATIONS: dict[str, Callable[[Excitation, np.ndarray], np.ndarray]] = {
 class Load(Checked):
     """What the output shaft moves."""
 
-    inertia: float = real(0.0, least=0.0, unit="kg*m^2")
+    inertia: float = real(0.0, minimum=0.0, unit="kg*m^2")
     """Inertia [kg*m^2] at the output, >= 0, besides the rotor's."""
-    gravity: float = real(0.0, least=0.0, unit="N*m")
+    gravity: float = real(0.0, minimum=0.0, unit="N*m")
     """m*g*l [N*m] of a pendulum, >= 0, that hangs at position 0."""
     against: float = real(0.0, unit="N*m")
     """Constant torque [N*m] against the motor, as of a lifted weight."""
@@ -118,17 +118,17 @@ _SAMPLE_SIZE, _ROW_SIZE = (
 class Sensor(Checked):
     """How a signal is read: value -> gain * value(time - delay) + bias + noise, then rounded."""
 
-    noise: float = real(0.0, least=0.0, unit="")
+    noise: float = real(0.0, minimum=0.0, unit="")
     """Standard deviation of white noise, >= 0, in the signal's unit."""
-    resolution: float = real(0.0, least=0.0, unit="")
+    resolution: float = real(0.0, minimum=0.0, unit="")
     """Step of the rounding, >= 0, in the signal's unit; 0: none."""
-    delay: float = real(0.0, least=0.0, unit="s")
+    delay: float = real(0.0, minimum=0.0, unit="s")
     """How old [s] the values are, >= 0."""
     gain: float = real(1.0, unit="")
     """What the sensor shows of one; -1 is a wrong sign."""
     bias: float = real(0.0, unit="")
     """What it shows of nothing, in the signal's unit."""
-    outliers: float = real(0.0, least=0.0, most=1.0)
+    outliers: float = real(0.0, minimum=0.0, maximum=1.0)
     """Share of values, in [0, 1], that are off by 3 to 10 of the signal's standard deviations."""
 
     def seen(self, values: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -148,9 +148,9 @@ class Sampler(Checked):
 
     rate: float = real(5000.0, above=0.0, unit="Hz")
     """Rows a second [Hz], > 0."""
-    jitter: float = real(0.0, least=0.0, most=0.3)
+    jitter: float = real(0.0, minimum=0.0, maximum=0.3)
     """Standard deviation of the times as a share of the period, in [0, 0.3]; the stamps are right."""
-    dropped: float = real(0.0, least=0.0, most=0.9)
+    dropped: float = real(0.0, minimum=0.0, maximum=0.9)
     """Share of rows that are lost, in [0, 0.9]."""
     mean_voltage: bool = False
     """Whether the voltage is the mean from a row to the next, and not what it is at the row."""
@@ -190,7 +190,7 @@ def run(
         "constant_torque": load.against,
     }
     parts = winding, moved(numbers, motor.torque_constant * motor.gear_ratio)
-    states = driven(period, shares, float(limit), float(drive.sag), parts, locked, float(position))
+    states = driven(period, shares, float(limit), float(drive.supply_resistance), parts, locked, float(position))
     names = "voltage", "current", "velocity", "position", "bus"
     signals = dict(zip(names, states.T, strict=True))
     return Log("course", period * np.arange(len(shares)), {**signals, "command": commanded})

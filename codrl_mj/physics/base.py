@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from codrl_mj.actuators import ActuatorModel, Family, Ideal, check_same_family
-from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint
+from codrl_mj.disturbances import NO_DISTURBANCES, UNMODIFIED_JOINT, Disturbances, Joint
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.tasks import Task
 
@@ -51,7 +51,7 @@ def make_info_reader(names: tuple[str, ...]) -> Callable[[Any], Signals]:
     return eval(f"lambda columns: {{{', '.join(entries)}, 'saturated': {flag}}}")
 
 
-LARGEST = 1e10
+MAX_STATE = 1e10
 """Largest magnitude of a state entry: MuJoCo's `mjMAXVAL`, beyond which it warns and discards
 forces. A diverging motor need not reach infinity there.
 """
@@ -75,11 +75,11 @@ class SimulationConfig:
     """One of the task's integrators, the first of them unless told otherwise."""
     max_forces: np.ndarray = None  # type: ignore[assignment]
     """Limits of the desired forces [N] or torques [N*m], shape (n,); the task's unless told otherwise."""
-    disturbances: Disturbances = OFF
+    disturbances: Disturbances = NO_DISTURBANCES
     """Imperfections of the commands' way, and load pulses."""
-    joint: Joint = PLAIN
+    joint: Joint = UNMODIFIED_JOINT
     """What is added to the actuated joints."""
-    holds: np.ndarray = None  # type: ignore[assignment]
+    force_per_position: np.ndarray = None  # type: ignore[assignment]
     """Desired force [N or N*m] that stands for a position of 1 m or rad, shape (n,); 0 where commands are none."""
 
     def __post_init__(self) -> None:
@@ -89,8 +89,8 @@ class SimulationConfig:
             object.__setattr__(self, "integrator", self.task.integrators[0])
         if self.max_forces is None:
             object.__setattr__(self, "max_forces", self.task.max_forces)
-        if self.holds is None:
-            object.__setattr__(self, "holds", np.zeros(len(self.max_forces)))
+        if self.force_per_position is None:
+            object.__setattr__(self, "force_per_position", np.zeros(len(self.max_forces)))
 
     @functools.cached_property
     def family(self) -> Family:
@@ -107,11 +107,11 @@ class SimulationConfig:
         """Integration step [s]."""
         return self.task.step_duration / self.inner_steps
 
-    def held(self, states: np.ndarray) -> np.ndarray:
+    def holding_forces(self, states: np.ndarray) -> np.ndarray:
         """Return the desired forces that hold states (m, s) there, shape (m, n): 0 unless commands are positions."""
         task = self.task
         positions = states[:, [task.qpos[task.qvel.index(speed)] for speed in task.speeds]]
-        return np.where(self.holds != 0.0, self.holds * positions, 0.0)
+        return np.where(self.force_per_position != 0.0, self.force_per_position * positions, 0.0)
 
 
 class Physics(abc.ABC):
@@ -123,9 +123,9 @@ class Physics(abc.ABC):
 
     stepping: Any = None
     """The compiled functions of a loop (see `codrl_mj.physics.stepping.Stepping`); None where a step is Python."""
-    where: int = 0
+    pointers: int = 0
     """Their last argument, an address; 0 where there are none."""
-    bound: tuple[Any, ...] = ()
+    bound_arrays: tuple[Any, ...] = ()
     """An environment's options and observation, which its compiled steps read and fill, where these were asked for."""
     scene: tuple[Any, Any] | None = None
     """The `mujoco.MjModel` and `mujoco.MjData` that it runs on; None where there are none."""
@@ -137,19 +137,19 @@ class Physics(abc.ABC):
     time: float
     """Since the start of the episode [s]."""
 
-    def __init__(self, plant: SimulationConfig) -> None:
+    def __init__(self, simulation: SimulationConfig) -> None:
         """Take what is simulated, and make what one of it needs on any physics."""
-        self.plant = plant
+        self.simulation = simulation
         """What is simulated."""
         self.trace = np.zeros(
-            (plant.inner_steps, len(plant.actuators), len(trace_names(plant.family)))
+            (simulation.inner_steps, len(simulation.actuators), len(trace_names(simulation.family)))
         )
         """What each actuator did in each integration step of the last environment step, shape
         (inner_steps, actuators, columns), float64; columns as in `trace_names`. A live array: the
         next step overwrites it.
         """
         self._disturber = Disturber(
-            plant.disturbances, plant.timestep, plant.max_forces, 1, plant.holds
+            simulation.disturbances, simulation.timestep, simulation.max_forces, 1, simulation.force_per_position
         )
 
     @abc.abstractmethod
@@ -185,7 +185,7 @@ class Physics(abc.ABC):
         """
 
     @abc.abstractmethod
-    def observed(self, row: np.ndarray) -> np.ndarray:
+    def read_sensors(self, row: np.ndarray) -> np.ndarray:
         """What the sensors say at present, shape (actuators, k), with k as the family's `OBSERVED`.
 
         Args:
@@ -217,21 +217,21 @@ class Physics(abc.ABC):
         """
 
     def check_finite(self) -> None:
-        """Raise if the state left the finite numbers or is beyond `LARGEST`, saying which entry and when.
+        """Raise if the state left the finite numbers or is beyond `MAX_STATE`, saying which entry and when.
 
         Raises:
             SimulationDivergedError: it did.
         """
-        state, task = self.state, self.plant.task
-        if state @ state <= LARGEST:  # the quick answer: all are below 1e5; false for NaN too
+        state, task = self.state, self.simulation.task
+        if state @ state <= MAX_STATE:  # the quick answer: all are below 1e5; false for NaN too
             return
-        fine = np.abs(state) <= LARGEST
+        fine = np.abs(state) <= MAX_STATE
         if fine.all():
             return
         broken = ", ".join(
             f"{n} = {v:g}" for n, v, ok in zip(task.state_names, state, fine, strict=True) if not ok
         )
-        raise diverged(task.name, self.time, broken)
+        raise divergence_error(task.name, self.time, broken)
 
     def show(self, state: np.ndarray) -> None:
         """Bring the bodies of `scene` to a state, for drawing; the simulation is left alone otherwise."""
@@ -246,7 +246,7 @@ class SimulationDivergedError(ArithmeticError):
     """A simulation left the finite numbers, or the range in which MuJoCo trusts its own."""
 
 
-def diverged(
+def divergence_error(
     who: str, time: float, broken: str, step: str = "inner_steps"
 ) -> SimulationDivergedError:
     """The error of an environment whose simulation broke down at a time [s], with what sets its integration step."""

@@ -16,7 +16,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from codrl_mj.compile_cache import njit
 from codrl_mj.engine.families import compiled_function
 from codrl_mj.engine.memory import entries_type, floats, internal, row_as, tuple_of
-from codrl_mj.physics.base import LARGEST
+from codrl_mj.physics.base import MAX_STATE
 from codrl_mj.tasks import Task
 
 Compiled = Callable[..., Any]
@@ -45,7 +45,7 @@ def compiled_constrain(
 ) -> Compiled | None:
     """(qpos, qvel, scratch (n,), integration step [s]) -> nothing: a task's `constrain`, applied in place.
 
-    None for a task without bounds. A state beyond `LARGEST` becomes NaN in all its entries, to be
+    None for a task without bounds. A state beyond `MAX_STATE` becomes NaN in all its entries, to be
     noticed: within its bounds it would look like any other.
     """
     if constrain is None:
@@ -58,7 +58,7 @@ def compiled_constrain(
     @njit(nogil=True, error_model="numpy")
     def keep(qpos: Any, qvel: Any, state: np.ndarray, timestep: float) -> None:
         fill(qpos, qvel, state)
-        if not is_fine(state):
+        if not is_finite_state(state):
             state[:] = np.nan
         kept = floats(bounded(row_as(state, entries), timestep))
         for entry in range(len(positions)):
@@ -70,11 +70,11 @@ def compiled_constrain(
 
 
 @internal
-def is_fine(state: np.ndarray) -> bool:
-    """Whether every entry of a state (n,) is a number, and at most `LARGEST`."""
+def is_finite_state(state: np.ndarray) -> bool:
+    """Whether every entry of a state (n,) is a number, and at most `MAX_STATE`."""
     fine = True
     for entry in range(len(state)):
-        fine &= abs(state[entry]) <= LARGEST
+        fine &= abs(state[entry]) <= MAX_STATE
     return fine
 
 

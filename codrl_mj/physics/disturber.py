@@ -5,26 +5,26 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from codrl_mj.actuators.noise import philox, unit
+from codrl_mj.actuators.noise import philox, uniform
 from codrl_mj.compile_cache import njit
 from codrl_mj.disturbances import (
     KEY,
-    OFF,
+    NO_DISTURBANCES,
     PULSE_NAMES,
     Disturbances,
-    delayed,
+    interpolate_delayed,
     pulse_load,
-    quantised,
-    rate_limited,
+    quantize,
+    limit_rate,
     whole_and_fraction,
 )
 from codrl_mj.engine.memory import internal, row_as
 
-for _function in (delayed, quantised, rate_limited, philox, unit):
+for _function in (interpolate_delayed, quantize, limit_rate, philox, uniform):
     register_jitable(_function)
 
 
-class Numbers(NamedTuple):
+class DisturberParameters(NamedTuple):
     """What a disturber does; zero is off."""
 
     timestep: float
@@ -45,7 +45,7 @@ class Numbers(NamedTuple):
     """[s]."""
     pulse_interval: float
     """Mean time between them [s]."""
-    hold: float
+    force_per_position: float
     """Command [N or N*m] that holds the joint at a position of 1 m or rad; 0 where commands are no positions."""
 
 
@@ -57,7 +57,7 @@ class Disturber:
 
     All it remembers is the array `memory`, a row for each actuator of each simulation: commands on
     their way (newest first), the last command that arrived, and the pulses'. What it does is
-    `numbers`, a row as in `Numbers` for each actuator of a simulation.
+    `numbers`, a row as in `DisturberParameters` for each actuator of a simulation.
     """
 
     def __init__(
@@ -66,18 +66,18 @@ class Disturber:
         timestep: float,
         limits: np.ndarray,
         simulations: int,
-        holds: np.ndarray | None = None,
+        force_per_position: np.ndarray | None = None,
     ) -> None:
         """Start with nothing remembered, for a number of simulations at a timestep [s].
 
         `limits`, shape (n,), are the largest forces [N or N*m] of the actuators of one, `holds`,
-        likewise, as in `Numbers`. Where all is off, commands arrive as they are, there are no
+        likewise, as in `DisturberParameters`. Where all is off, commands arrive as they are, there are no
         loads, and rows are empty.
         """
-        self.on = disturbances != OFF
+        self.on = disturbances != NO_DISTURBANCES
         whole, fraction = whole_and_fraction(disturbances.command_delay, timestep)
         rows = [
-            Numbers(
+            DisturberParameters(
                 timestep,
                 whole,
                 fraction,
@@ -87,10 +87,12 @@ class Disturber:
                 disturbances.pulse_force,
                 disturbances.pulse_duration,
                 disturbances.pulse_interval,
-                hold,
+                ratio,
             )
-            for limit, hold in zip(
-                limits.tolist(), np.zeros(len(limits)) if holds is None else holds, strict=True
+            for limit, ratio in zip(
+                limits.tolist(),
+                np.zeros(len(limits)) if force_per_position is None else force_per_position,
+                strict=True,
             )
         ]
         self.numbers = np.array(rows) if self.on else np.empty((len(rows), 0))
@@ -109,7 +111,7 @@ class Disturber:
             self.memory[rows * count + actuator, :KEY_COLUMN] = held[:, actuator, np.newaxis]
             self.memory[rows * count + actuator, KEY_COLUMN] = np.asarray(keys) + actuator
 
-    def disturbed(self, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def disturb_commands(self, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The commands that arrive in the next step, and mean loads on the joints, [N or N*m], each of shape (N, n)."""
         arrived, loads = desired, np.zeros(desired.shape)
         if self.on:
@@ -128,17 +130,17 @@ _pulses = internal(pulse_load)
 
 
 @internal
-def disturb(numbers: Numbers, memory: np.ndarray, force: float) -> tuple[float, float]:
+def disturb(numbers: DisturberParameters, memory: np.ndarray, force: float) -> tuple[float, float]:
     """The command that arrives in the next integration step, and the mean load over it; `memory` is an actuator's."""
     length = len(memory) - _AFTER_HISTORY
     for entry in range(length - 1, 0, -1):
         memory[entry] = memory[entry - 1]
     memory[0] = force
-    arrived = delayed(memory[int(numbers.delay_steps)], memory[length - 1], numbers.delay_fraction)
+    arrived = interpolate_delayed(memory[int(numbers.delay_steps)], memory[length - 1], numbers.delay_fraction)
     if numbers.quantum != 0.0:
-        arrived = quantised(arrived, numbers.quantum, numbers.limit)
+        arrived = quantize(arrived, numbers.quantum, numbers.limit)
     if numbers.change != 0.0:
-        arrived = rate_limited(arrived, memory[length], numbers.change)
+        arrived = limit_rate(arrived, memory[length], numbers.change)
         memory[length] = arrived
     if numbers.pulse_force == 0.0:
         return arrived, 0.0
@@ -158,5 +160,5 @@ def _disturb_each(
     loads: np.ndarray,
 ) -> None:
     for row in range(len(memory)):
-        own = row_as(numbers[row % len(numbers)], Numbers)
+        own = row_as(numbers[row % len(numbers)], DisturberParameters)
         commands[row], loads[row] = disturb(own, memory[row], forces[row])

@@ -12,7 +12,7 @@ from codrl_mj.tasks.base import INTEGRATORS
 from codrl_mj.user_code import asset_path
 
 
-def drive(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float | None) -> None:
+def configure_actuator(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float | None) -> None:
     """Make an actuator of an `MjSpec` one of ours, at the control callback's door; an ideal one is a plain `<motor>`.
 
     Its gear, control, dynamics, gain and bias are overwritten. `max_force` limits the desired force
@@ -27,7 +27,7 @@ def drive(target: mujoco.MjsActuator, actuator: ActuatorModel, max_force: float 
     target.gaintype = mujoco.mjtGain.mjGAIN_FIXED
     target.gainprm = [float(ideal)] + [0.0] * (mujoco.mjNGAIN - 1)
     target.biastype = mujoco.mjtBias.mjBIAS_NONE if ideal else mujoco.mjtBias.mjBIAS_USER
-    target.userdata = [] if ideal else [*user_head(family), *actuator.numbers]
+    target.userdata = [] if ideal else [*user_head(family), *actuator.parameter_values]
 
 
 def hills(model: mujoco.MjModel) -> list[int]:
@@ -85,13 +85,13 @@ def install_callbacks(model: mujoco.MjModel) -> None:
         engine.install(*parts)
 
 
-def task_model(plant: SimulationConfig) -> mujoco.MjModel:
+def task_model(simulation: SimulationConfig) -> mujoco.MjModel:
     """Compile a plant's model.
 
     A diverging simulation is left to diverge, so that it can be reported, instead of being reset by
     the engine. Where the Euler integrator is made explicit, joint damping is explicit too.
     """
-    task = plant.task
+    task = simulation.task
     try:
         spec = mujoco.MjSpec.from_file(str(asset_path(task.asset)))
     except ValueError as error:
@@ -102,13 +102,13 @@ def task_model(plant: SimulationConfig) -> mujoco.MjModel:
             f"{task.asset}: its <option> has integrator {kind}, so Task.integrators cannot have"
             f" {', '.join(other)}"
         )
-    spec.option.timestep = plant.timestep
+    spec.option.timestep = simulation.timestep
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    if plant.integrator == "euler":
+    if simulation.integrator == "euler":
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    joint = JointAdditions(plant.joint.armature, plant.joint.damping, plant.joint.friction)
+    joint = JointAdditions(simulation.joint.armature, simulation.joint.damping, simulation.joint.friction)
     for name, actuator, limit in zip(
-        task.motors, plant.actuators, plant.max_forces.tolist(), strict=True
+        task.motors, simulation.actuators, simulation.max_forces.tolist(), strict=True
     ):
         motor = spec.actuator(name)
         if motor is None:
@@ -123,7 +123,7 @@ def task_model(plant: SimulationConfig) -> mujoco.MjModel:
         if joint_driven is None or joint_driven.type not in _ALONG:
             raise ValueError(f"{task.asset}: actuator {name!r} must drive a hinge or a slide joint")
         _check_plain(task.asset, spec.option, motor, joint_driven)
-        drive(motor, actuator, limit)
+        configure_actuator(motor, actuator, limit)
         for added in (joint, actuator.additions):
             joint_driven.armature += added.armature
             joint_driven.damping[0] += added.damping

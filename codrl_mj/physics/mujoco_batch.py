@@ -9,14 +9,14 @@ import numpy as np
 
 from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import HEAD
-from codrl_mj.physics.base import LARGEST, SimulationConfig, SimulationDivergedError
+from codrl_mj.physics.base import MAX_STATE, SimulationConfig, SimulationDivergedError
 from codrl_mj.physics.disturber import Disturber
 from codrl_mj.physics.mjcf import flags_with_friction
 from codrl_mj.physics.mujoco_single import MujocoPhysics
-from codrl_mj.physics.rows import Rows, derive_fields, lane, part
-from codrl_mj.physics.sharing import cpus, new_board, share
+from codrl_mj.physics.rows import Rows, derive_fields, make_lane, state_slice
+from codrl_mj.physics.sharing import num_cpus, new_board, run_shared
 from codrl_mj.physics.stepping import NOISE_KEY
-from codrl_mj.physics.variation import Variation, bare_model, field_of, mounting_of, write_fields
+from codrl_mj.physics.variation import Variation, bare_model, field_of, arms_and_additions, write_fields
 
 DERIVED = (
     *("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "dof_length"),
@@ -33,7 +33,7 @@ class MujocoBatchPhysics:
 
     def __init__(
         self,
-        plant: SimulationConfig,
+        simulation: SimulationConfig,
         actuators: Sequence[Sequence[ActuatorModel]],
         num_threads: int = 0,
     ) -> None:
@@ -41,11 +41,11 @@ class MujocoBatchPhysics:
 
         They are of its family; `num_threads` may be 0, for every CPU.
         """
-        self.plant, task = plant, plant.task
+        self.simulation, task = simulation, simulation.task
         self.num_envs, self._num_threads = len(actuators), num_threads
-        self._nominal = MujocoPhysics(plant)
+        self._nominal = MujocoPhysics(simulation)
         self._disturber = Disturber(
-            plant.disturbances, plant.timestep, plant.max_forces, self.num_envs, plant.holds
+            simulation.disturbances, simulation.timestep, simulation.max_forces, self.num_envs, simulation.force_per_position
         )
         self._wiring = self._nominal.wiring
         self._positions, self._velocities = np.array(task.qpos), np.array(task.qvel)
@@ -54,27 +54,27 @@ class MujocoBatchPhysics:
         self._states = np.repeat(self._rest[np.newaxis], self.num_envs, axis=0)
         self._arms = np.ones((self.num_envs, len(task.motors)))
         self._bind()
-        every, (arms, additions) = np.arange(self.num_envs), mounting_of(actuators)
+        every, (arms, additions) = np.arange(self.num_envs), arms_and_additions(actuators)
         self._arms[:] = arms
         if any(
-            tuple(each) != plant.actuators for each in actuators
+            tuple(each) != simulation.actuators for each in actuators
         ):  # else the model has them, and no row needs to
             self.set_parameters(
-                every, np.array([[one.numbers for one in each] for each in actuators]), arms
+                every, np.array([[one.parameter_values for one in each] for each in actuators]), arms
             )
         if (additions != additions[0]).any():
             indices = [int(one.actuator) for one in self._wiring]
-            mounting = Variation(bare_model(task.name, plant.joint), motors=indices, mounting=True)
+            mounting = Variation(bare_model(task.name, simulation.joint), motors=indices, mounting=True)
             self.set_model(every, mounting.fields(np.empty((self.num_envs, 0)), additions))
 
     def _bind(self) -> None:
         """Make data for each thread, and the views that a step uses."""
-        threads = min(self._num_threads or cpus(), self.num_envs)
+        threads = min(self._num_threads or num_cpus(), self.num_envs)
         self._data = [mujoco.MjData(copy.copy(self._nominal.model)) for _ in range(threads)]
         self.model, self.data = self._nominal.model, self._nominal.data
         self.stepping = self._nominal.stepping
         self._lanes: list[tuple[Any, ...]] = []
-        parts = {name: part(self.model, name) for name in ("time", "qpos", "qvel", "act")}
+        parts = {name: state_slice(self.model, name) for name in ("time", "qpos", "qvel", "act")}
         self._time, self._qpos, self._qvel, self._act = (
             self._states[:, one] for one in parts.values()
         )
@@ -86,7 +86,7 @@ class MujocoBatchPhysics:
     def _lane(self) -> tuple[Any, ...]:
         """The first thread's lane, when all are made for the fields of the models that differ at present."""
         if not self._lanes:
-            self._lanes = [tuple(lane(self._nominal, data, self._fields)) for data in self._data]
+            self._lanes = [tuple(make_lane(self._nominal, data, self._fields)) for data in self._data]
             self._steps: Any = None
         return self._lanes[0]
 
@@ -113,12 +113,12 @@ class MujocoBatchPhysics:
 
         What they add to their joints is the models': see `set_model`.
         """
-        if not self.plant.motors_added:
+        if not self.simulation.motors_added:
             return
         user, gear, limits = map(
             self.field, ("actuator_user", "actuator_gear", "actuator_ctrlrange")
         )
-        for at, (one, limit) in enumerate(zip(self._wiring, self.plant.max_forces, strict=True)):
+        for at, (one, limit) in enumerate(zip(self._wiring, self.simulation.max_forces, strict=True)):
             index, arm = int(one.actuator), arms[:, at]
             user[rows, index, HEAD : HEAD + numbers.shape[2]] = numbers[:, at]
             gear[rows, self.model.actuator_outadr[index], 0] = 1.0 / arm
@@ -140,7 +140,7 @@ class MujocoBatchPhysics:
     @property
     def state(self) -> np.ndarray:
         """Mechanical states in the task's order, shape (N, n), float64; a new array."""
-        state = np.empty((self.num_envs, len(self.plant.task.state_names)))
+        state = np.empty((self.num_envs, len(self.simulation.task.state_names)))
         state[:, self._positions], state[:, self._velocities] = self._qpos, self._qvel
         return state
 
@@ -160,11 +160,11 @@ class MujocoBatchPhysics:
         self._nominal.install()  # raises if somebody replaced ours since the last episodes
         self._states[rows] = self._rest
         self._qpos[rows], self._qvel[rows] = states[:, self._positions], states[:, self._velocities]
-        if self.plant.motors_added:
+        if self.simulation.motors_added:
             for at, one in enumerate(self._wiring):
                 self._act[rows, int(one.act) + NOISE_KEY] = keys + at
         if self._disturber.on:
-            self._disturber.reset(rows, keys, self.plant.held(states))
+            self._disturber.reset(rows, keys, self.simulation.holding_forces(states))
 
     def step(self, kernel: Any, steps: Any) -> bool:
         """Take an environment step of every simulation; `kernel` is `Kernels.step_rows` of `codrl_mj.envs.compiled`.
@@ -175,8 +175,8 @@ class MujocoBatchPhysics:
         if steps is not self._steps:  # who helps goes on with what it was first given
             self._steps, self._board = steps, new_board()
         arguments = self._rows, tuple(steps)
-        return share(
-            kernel, self._board, self._lanes, self.num_envs, self.plant.inner_steps, *arguments
+        return run_shared(
+            kernel, self._board, self._lanes, self.num_envs, self.simulation.inner_steps, *arguments
         )
 
     def observe(self, kernel: Any, rows: np.ndarray, observations: np.ndarray) -> None:
@@ -190,15 +190,15 @@ class MujocoBatchPhysics:
 
     def check_finite(self, states: np.ndarray, rows: np.ndarray) -> None:
         """Raise if a state among `rows` (a mask, shape (N,)) left the finite numbers, naming the simulation."""
-        fine = np.abs(states) <= LARGEST
+        fine = np.abs(states) <= MAX_STATE
         broken = np.flatnonzero(~fine.all(axis=1) & rows)
         if len(broken) == 0:
             return
         first = broken[0]
-        entry = self.plant.task.state_names[int(np.argmin(fine[first]))]
+        entry = self.simulation.task.state_names[int(np.argmin(fine[first]))]
         value = states[first][np.argmin(fine[first])]
         raise SimulationDivergedError(
-            f"{self.plant.task.name}: {len(broken)} of {len(states)} simulations diverged;"
+            f"{self.simulation.task.name}: {len(broken)} of {len(states)} simulations diverged;"
             f" environment {first} at t = {self._time[first, 0]:g} s: {entry} = {value:g}. Reset"
             " them; if this repeats, shorten the integration step (inner_steps) or lower the gains"
         )

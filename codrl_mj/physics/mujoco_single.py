@@ -11,7 +11,7 @@ from codrl_mj.actuators import ActuatorModel
 from codrl_mj.engine.families import HEAD
 from codrl_mj.physics.base import Physics, SimulationConfig
 from codrl_mj.physics.mjcf import flags_with_friction, needed_callbacks, task_model
-from codrl_mj.physics.stepping import Wiring, compiled_stepping, places_of
+from codrl_mj.physics.stepping import Wiring, compiled_stepping, make_pointer_table
 from codrl_mj.physics.variation import write_fields
 
 ARM = Wiring._fields.index("arm")
@@ -26,17 +26,17 @@ class MujocoPhysics(Physics):
     inside them after every integration step.
     """
 
-    def __init__(self, plant: SimulationConfig) -> None:
+    def __init__(self, simulation: SimulationConfig) -> None:
         """Compile the model and install the callbacks that it needs."""
-        super().__init__(plant)
-        self.model = task_model(plant)
+        super().__init__(simulation)
+        self.model = task_model(simulation)
         self.data = mujoco.MjData(self.model)
         self._flags = self.model.opt.disableflags
-        task = plant.task
+        task = simulation.task
         self._qpos_order, self._qvel_order = _progression(task.qpos), _progression(task.qvel)
         self.wiring: list[Wiring] = []
         """Where the actuators' numbers are in the model."""
-        for name, actuator in zip(task.motors, plant.actuators, strict=True):
+        for name, actuator in zip(task.motors, simulation.actuators, strict=True):
             index = self.model.actuator(name).id
             joint = self.model.actuator_trnid[index, 0]
             dof, qpos = self.model.jnt_dofadr[joint], self.model.jnt_qposadr[joint]
@@ -49,16 +49,16 @@ class MujocoPhysics(Physics):
         self.settings = np.hstack(
             [np.array(self.wiring, dtype=np.float64), self._disturber.numbers]
         )
-        """See `codrl_mj.physics.stepping`, where `places` and `where`, too, are explained."""
+        """See `codrl_mj.physics.stepping`, where `pointer_table` and `where`, too, are explained."""
         self._bind()
         self.reset(np.zeros(len(task.state_names)))
 
     def _bind(self) -> None:
         """Take the views that a step uses, and make sure that the callbacks are there."""
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
-        self.stepping = compiled_stepping(self.plant)
-        self.places = places_of(self.data, self.settings, self._disturber.memory, self.trace)
-        self.where = self.places.ctypes.data
+        self.stepping = compiled_stepping(self.simulation)
+        self.pointer_table = make_pointer_table(self.data, self.settings, self._disturber.memory, self.trace)
+        self.pointers = self.pointer_table.ctypes.data
         self.scene: tuple[Any, Any] | None = (self.model, self.data)
         self._callbacks = needed_callbacks(self.model)
         self.install()
@@ -100,17 +100,17 @@ class MujocoPhysics(Physics):
     def reset(self, state: np.ndarray, key: float = 0.0) -> None:
         """See `Physics.reset`."""
         self.install()  # raises if somebody replaced ours since the last episode
-        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), self.where)
+        self.stepping.start(np.asarray(state, dtype=np.float64), float(key), self.pointers)
 
     def set_actuators(self, actuators: Sequence[ActuatorModel]) -> None:
         """Exchange the actuators for others of their family; to be followed by a reset.
 
         What they add to their joints is the model's: see `set_model`.
         """
-        if not self.plant.motors_added:
+        if not self.simulation.motors_added:
             return
-        for row, (one, limit) in enumerate(zip(actuators, self.plant.max_forces, strict=True)):
-            index, arm, numbers = int(self.wiring[row].actuator), one.arm_radius, one.numbers
+        for row, (one, limit) in enumerate(zip(actuators, self.simulation.max_forces, strict=True)):
+            index, arm, numbers = int(self.wiring[row].actuator), one.arm_radius, one.parameter_values
             self.model.actuator_user[index, HEAD : HEAD + len(numbers)] = numbers
             self.model.actuator_gear[self.model.actuator_outadr[index], 0] = 1.0 / arm
             self.model.actuator_ctrlrange[int(self.wiring[row].ctrl)] = -limit * arm, limit * arm
@@ -136,13 +136,13 @@ class MujocoPhysics(Physics):
 
     def step(self, desired_force: Any) -> None:
         """See `Physics.step`."""
-        if not self.stepping.step(desired_force, self.where):
+        if not self.stepping.step(desired_force, self.pointers):
             self.check_finite()
 
-    def observed(self, row: np.ndarray) -> np.ndarray:
+    def read_sensors(self, row: np.ndarray) -> np.ndarray:
         """See `Physics.observed`."""
-        seen = np.empty((len(row), len(self.plant.family.OBSERVED)))
-        self.stepping.observed(row, seen, self.where)
+        seen = np.empty((len(row), len(self.simulation.family.OBSERVED)))
+        self.stepping.read_sensors(row, seen, self.pointers)
         return seen
 
     def snapshot(self) -> np.ndarray:
@@ -166,4 +166,4 @@ def _progression(entries: tuple[int, ...]) -> slice:
 
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_VIEWS = ("model", "_qpos", "_qvel", "stepping", "where", "places", "bound", "scene")
+_VIEWS = ("model", "_qpos", "_qvel", "stepping", "pointers", "pointer_table", "bound_arrays", "scene")

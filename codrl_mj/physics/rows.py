@@ -15,8 +15,8 @@ from codrl_mj.compile_cache import njit
 from codrl_mj.engine.layout import address_of, addresses, engine_function
 from codrl_mj.engine.memory import copy_bytes, f64, internal
 from codrl_mj.physics.mujoco_single import ARM, MujocoPhysics
-from codrl_mj.physics.sharing import apart
-from codrl_mj.physics.stepping import Places
+from codrl_mj.physics.sharing import cache_aligned_copy
+from codrl_mj.physics.stepping import PointerTable
 
 STATE = mujoco.mjtState
 INTEGRATION = int(STATE.mjSTATE_INTEGRATION)
@@ -32,7 +32,7 @@ _MOVING = {
     "plugin_state": STATE.mjSTATE_PLUGIN,
 }
 """Parts of MuJoCo's state that an environment step changes; nobody changes the others."""
-_MEMORY = Places._fields.index("memory")
+_MEMORY = PointerTable._fields.index("memory")
 
 
 class Rows(NamedTuple):
@@ -55,34 +55,34 @@ class Lane(NamedTuple):
     """
     parts: np.ndarray
     """For each part of the state: its address in the data, its first entry in a row, its length; shape (p, 3)."""
-    places: np.ndarray
+    pointer_table: np.ndarray
     """The simulation's, see `codrl_mj.physics.stepping`."""
     settings: np.ndarray
     """The lane's own copy; likewise the next."""
     trace: np.ndarray
 
 
-def part(model: mujoco.MjModel, name: str) -> slice:
+def state_slice(model: mujoco.MjModel, name: str) -> slice:
     """Where a row of states has a part of the engine's state, by its name in the data."""
     flag = int(_MOVING[name])
     first = mujoco.mj_stateSize(model, INTEGRATION & (flag - 1))
     return slice(first, first + mujoco.mj_stateSize(model, flag))
 
 
-def lane(physics: MujocoPhysics, data: mujoco.MjData, fields: Mapping[str, np.ndarray]) -> Lane:
+def make_lane(physics: MujocoPhysics, data: mujoco.MjData, fields: Mapping[str, np.ndarray]) -> Lane:
     """The lane of other data, with a model of its own, for simulations like this one; the rows have these fields."""
     rows = [
         (address_of(data.model, name), values.ctypes.data, values.strides[0], values[0].nbytes)
         for name, values in fields.items()
     ]
-    parts = [(name, part(data.model, name)) for name in _MOVING]
+    parts = [(name, state_slice(data.model, name)) for name in _MOVING]
     live = [(address_of(data, name), one.start, one.stop - one.start) for name, one in parts]
-    settings, trace = apart(physics.settings), apart(physics.trace)
+    settings, trace = cache_aligned_copy(physics.settings), cache_aligned_copy(physics.trace)
     model, live_data = addresses(data)
     own = {"settings": settings.ctypes.data, "trace": trace.ctypes.data}
-    places = Places(*physics.places.tolist())._replace(model=model, data=live_data, **own)
+    pointer_table = PointerTable(*physics.pointer_table.tolist())._replace(model=model, data=live_data, **own)
     tables = np.array(rows, np.int64).reshape(-1, 4), np.array(live, np.int64)
-    return Lane(*tables, apart(np.array(places, np.int64)), settings, trace)
+    return Lane(*tables, cache_aligned_copy(np.array(pointer_table, np.int64)), settings, trace)
 
 
 @internal
@@ -97,7 +97,7 @@ def load_fields(row: int, lane: Lane) -> None:
 def load(rows: Rows, row: int, lane: Lane) -> None:
     """Make the lane's simulation the one of a row."""
     load_fields(row, lane)
-    lane.places[_MEMORY] = rows.memory.ctypes.data + row * rows.memory.strides[0]
+    lane.pointer_table[_MEMORY] = rows.memory.ctypes.data + row * rows.memory.strides[0]
     state = rows.states.ctypes.data + row * rows.states.strides[0]
     for which in range(len(lane.parts)):
         live, kept = f64(lane.parts[which, 0]), f64(state + 8 * lane.parts[which, 1])
@@ -126,7 +126,7 @@ def derive_fields(rows: np.ndarray, lane: Any, derived: np.ndarray) -> None:
     lane = Lane(*lane)
     for row in rows:
         load_fields(row, lane)
-        _set_const(lane.places[0], lane.places[1])
+        _set_const(lane.pointer_table[0], lane.pointer_table[1])
         for field in derived:
             source, first, stride, size = lane.fields[field]
             copy_bytes(first + row * stride, source, size)

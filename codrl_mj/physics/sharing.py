@@ -39,12 +39,12 @@ present one.
 """
 
 
-def cpus() -> int:
+def num_cpus() -> int:
     """How many CPUs this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def apart(array: np.ndarray) -> np.ndarray:
+def cache_aligned_copy(array: np.ndarray) -> np.ndarray:
     """A copy on cache lines of its own: what threads write in turn would slow them down severalfold."""
     room = np.empty(array.nbytes + 128, np.uint8)
     start = -room.ctypes.data % 64
@@ -55,7 +55,7 @@ def apart(array: np.ndarray) -> np.ndarray:
 
 def new_board() -> np.ndarray:
     """Where threads meet that share the rows of one batch."""
-    return apart(np.zeros(32, np.int64))
+    return cache_aligned_copy(np.zeros(32, np.int64))
 
 
 @internal
@@ -102,7 +102,7 @@ def _joined(board: np.ndarray, last: int) -> int:
     return 0
 
 
-def shared(do: Compiled) -> Compiled:
+def make_shared_kernel(do: Compiled) -> Compiled:
     """What shares rows: (whether it leads, board, rows, threads, lane, arguments) -> nothing.
 
     It leads one turn; or it helps in turns as they come, until none has begun in a short while.
@@ -169,7 +169,7 @@ def _dismiss() -> None:
         worker.thread.join(1.0)
 
 
-def share(
+def run_shared(
     function: Compiled,
     board: np.ndarray,
     lanes: Sequence[Any],

@@ -1,7 +1,7 @@
 """One environment step of one simulation in MuJoCo, compiled: the engine's step with what comes before and after it.
 
-A compiled function knows a simulation by one number, `where`: the address of its `Places`.
-`settings` has a row for each actuator, a `Wiring` and then a disturber's `Numbers`; `memory` is a
+A compiled function knows a simulation by one number, `where`: the address of its `PointerTable`.
+`settings` has a row for each actuator, a `Wiring` and then a disturber's `DisturberParameters`; `memory` is a
 disturber's, a row for each actuator; `trace` that of `Physics`. They are live: what changes them
 changes the simulation. What an environment has beside it, options and observation, is for
 `codrl_mj.envs.compiled`.
@@ -17,14 +17,14 @@ from numba.extending import overload
 
 from codrl_mj.actuators import Family
 from codrl_mj.compile_cache import njit
-from codrl_mj.disturbances import OFF
+from codrl_mj.disturbances import NO_DISTURBANCES
 from codrl_mj.engine.doors import user_of
 from codrl_mj.engine.families import HEAD, Slot, compiled_observe, load_family, signals_at
 from codrl_mj.engine.layout import DATA, MODEL, addresses, engine_function
 from codrl_mj.engine.memory import f64, i64, internal, on_stack, row_as
 from codrl_mj.physics.base import SimulationConfig
-from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_fine
-from codrl_mj.physics.disturber import KEY_COLUMN, Numbers, disturb
+from codrl_mj.physics.compiled_task import Compiled, compiled_constrain, compiled_reader, is_finite_state
+from codrl_mj.physics.disturber import KEY_COLUMN, DisturberParameters, disturb
 
 TORQUE, NOISE_KEY = Slot._fields.index("torque"), Slot._fields.index("noise_key")
 
@@ -49,7 +49,7 @@ class Wiring(NamedTuple):
 WIRING = len(Wiring._fields)
 
 
-class Places(NamedTuple):
+class PointerTable(NamedTuple):
     """Where a simulation is: an int64 array, which must live as long as it."""
 
     model: int
@@ -69,18 +69,18 @@ class Places(NamedTuple):
     """Of the trace."""
 
 
-def places_of(data: Any, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray) -> np.ndarray:
-    """The `Places` of a simulation, by its `MjData`; all of them are contiguous, and stay the caller's."""
+def make_pointer_table(data: Any, settings: np.ndarray, memory: np.ndarray, trace: np.ndarray) -> np.ndarray:
+    """The `PointerTable` of a simulation, by its `MjData`; all of them are contiguous, and stay the caller's."""
     each = (one.ctypes.data for one in (settings, memory, trace))
     sizes = *settings.shape, memory.shape[-1], len(trace), trace.shape[-1]
     return np.array([*addresses(data), *each, 0, 0, *sizes], np.int64)
 
 
 @internal
-def simulation_at(where: int) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
+def simulation_at(pointers: int) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
     """Addresses of model and data of the simulation at an address, settings, memory and trace."""
-    at = i64(where)
-    found = Places(
+    at = i64(pointers)
+    found = PointerTable(
         at[0], at[1], at[2], at[3], at[4], at[5], at[6], at[7], at[8], at[9], at[10], at[11]
     )
     settings = numba.carray(f64(found.settings), (found.actuators, found.of_settings))
@@ -89,14 +89,14 @@ def simulation_at(where: int) -> tuple[int, int, np.ndarray, np.ndarray, np.ndar
     return found.model, found.data, settings, memory, trace
 
 
-OPTIONS, OBSERVATION = Places._fields.index("options"), Places._fields.index("observation")
+OPTIONS, OBSERVATION = PointerTable._fields.index("options"), PointerTable._fields.index("observation")
 
 
 class Stepping(NamedTuple):
     """Compiled functions; `where` is that of the module's docstring."""
 
     step: Compiled
-    """(force, where) -> whether the state is still one of numbers within `LARGEST`: takes one
+    """(force, where) -> whether the state is still one of numbers within `MAX_STATE`: takes one
     environment step under a desired force [N or N*m], or under several, an array (n,). What the
     actuators did is in `trace`.
     """
@@ -104,19 +104,19 @@ class Stepping(NamedTuple):
     """(state (n,), key, where) -> nothing: starts an episode, as `Physics.reset` does."""
     read: Compiled
     """(state (n,), where) -> nothing: fills `state` with the present one."""
-    observed: Compiled
+    read_sensors: Compiled
     """(row of trace (n, c), seen (n, k), where) -> nothing: fills `seen` with what the sensors say at present."""
 
 
-def compiled_stepping(plant: SimulationConfig) -> Stepping:
+def compiled_stepping(simulation: SimulationConfig) -> Stepping:
     """The functions for simulations of a plant; compiled as they are used, once a process."""
-    task, disturbed = plant.task, plant.disturbances != OFF
-    if plant.motors_added:
-        load_family(plant.family)
-    order, explicit = (task.qpos, task.qvel), plant.integrator == "euler"
+    task, disturbed = simulation.task, simulation.disturbances != NO_DISTURBANCES
+    if simulation.motors_added:
+        load_family(simulation.family)
+    order, explicit = (task.qpos, task.qvel), simulation.integrator == "euler"
     kept = compiled_constrain(task.constrain, task.state_names, *order)
     return _stepping(
-        kept, compiled_reader(*order), *order, explicit, disturbed, plant.family, plant.motors_added
+        kept, compiled_reader(*order), *order, explicit, disturbed, simulation.family, simulation.motors_added
     )
 
 
@@ -149,8 +149,8 @@ def _stepping(
     observe = compiled_observe(family) if family.OBSERVED else None
 
     @njit(nogil=True, error_model="numpy")
-    def step(force: Any, where: int) -> bool:
-        model, data, settings, memory, trace = simulation_at(where)
+    def step(force: Any, pointers: int) -> bool:
+        model, data, settings, memory, trace = simulation_at(pointers)
         timestep = MODEL.opt.timestep(model)
         qpos, qvel, ctrl, act = DATA.qpos(data), DATA.qvel(data), DATA.ctrl(data), DATA.act(data)
         state = numba.carray(on_stack(size), size)
@@ -159,7 +159,7 @@ def _stepping(
                 wiring = row_as(settings[actuator], Wiring)
                 command = force_of(force, actuator)
                 if disturbed:
-                    numbers = row_as(settings[actuator, WIRING:], Numbers)
+                    numbers = row_as(settings[actuator, WIRING:], DisturberParameters)
                     command, DATA.qfrc_applied(data)[int(wiring.dof)] = disturb(
                         numbers, memory[actuator], command
                     )
@@ -186,11 +186,11 @@ def _stepping(
                     row[1] = row[0]
                 row[2 + count] = qvel[int(wiring.dof)]
         read_state(qpos, qvel, state)
-        return is_fine(state)
+        return is_finite_state(state)
 
     @njit(nogil=True, error_model="numpy")
-    def start(state: np.ndarray, key: float, where: int) -> None:
-        model, data, settings, memory, _ = simulation_at(where)
+    def start(state: np.ndarray, key: float, pointers: int) -> None:
+        model, data, settings, memory, _ = simulation_at(pointers)
         engine_reset(model, data)
         qpos, qvel = DATA.qpos(data), DATA.qvel(data)
         for entry in range(len(positions)):
@@ -203,7 +203,7 @@ def _stepping(
                     key + actuator
                 )
             if disturbed:
-                hold = row_as(settings[actuator, WIRING:], Numbers).hold
+                hold = row_as(settings[actuator, WIRING:], DisturberParameters).hold
                 position = qpos[int(row_as(settings[actuator], Wiring).qpos)]
                 memory[actuator] = 0.0
                 memory[actuator, : memory.shape[1] + KEY_COLUMN] = (
@@ -212,13 +212,13 @@ def _stepping(
                 memory[actuator, memory.shape[1] + KEY_COLUMN] = key + actuator
 
     @njit(nogil=True, error_model="numpy")
-    def read(state: np.ndarray, where: int) -> None:
-        _, data, _, _, _ = simulation_at(where)
+    def read(state: np.ndarray, pointers: int) -> None:
+        _, data, _, _, _ = simulation_at(pointers)
         read_state(DATA.qpos(data), DATA.qvel(data), state)
 
     @njit(nogil=True, error_model="numpy")
-    def observed(row: np.ndarray, seen: np.ndarray, where: int) -> None:
-        model, data, settings, _, _ = simulation_at(where)
+    def read_sensors(row: np.ndarray, seen: np.ndarray, pointers: int) -> None:
+        model, data, settings, _, _ = simulation_at(pointers)
         if observe is not None:
             for actuator in range(len(settings)):
                 wiring = row_as(settings[actuator], Wiring)
@@ -231,4 +231,4 @@ def _stepping(
                     seen[actuator].ctypes.data,
                 )
 
-    return Stepping(step, start, read, observed)
+    return Stepping(step, start, read, read_sensors)

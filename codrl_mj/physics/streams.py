@@ -69,16 +69,16 @@ class Streams:
         """Where every stream stands, shape (N, 6), uint64."""
         words = np.empty((len(self.generators), WORDS), dtype=np.uint64)
         for row, generator in zip(words, self.generators, strict=True):
-            row[:] = words_of(generator)
+            row[:] = generator_words(generator)
         return words
 
     def set_state(self, words: np.ndarray) -> None:
         """Continue from what `state` returned."""
         for row, generator in zip(words, self.generators, strict=True):
-            set_words(generator, row)
+            set_generator_words(generator, row)
 
 
-def words_of(generator: np.random.Generator) -> np.ndarray:
+def generator_words(generator: np.random.Generator) -> np.ndarray:
     """Where a generator stands, shape (6,), uint64."""
     pcg: Any = generator.bit_generator.state
     if pcg["bit_generator"] != "PCG64":
@@ -97,8 +97,8 @@ def words_of(generator: np.random.Generator) -> np.ndarray:
     return np.array(words, dtype=np.uint64)
 
 
-def set_words(generator: np.random.Generator, words: np.ndarray) -> None:
-    """Let a PCG64 generator continue from what `words_of` returned."""
+def set_generator_words(generator: np.random.Generator, words: np.ndarray) -> None:
+    """Let a PCG64 generator continue from what `generator_words` returned."""
     row = words.tolist()
     generator.bit_generator.state = {
         "bit_generator": "PCG64",

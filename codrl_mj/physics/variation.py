@@ -9,22 +9,22 @@ import mujoco
 import numpy as np
 
 from codrl_mj.actuators import IDEAL, ActuatorModel
-from codrl_mj.disturbances import PLAIN, Joint
+from codrl_mj.disturbances import UNMODIFIED_JOINT, Joint
 from codrl_mj.engine.hill import GRAVITY
 from codrl_mj.physics.base import SimulationConfig
 from codrl_mj.physics.mjcf import hills, task_model
 from codrl_mj.tasks import TASKS
 
-SHOWN = ("geom_pos", "geom_size")
+VISUAL_FIELDS = ("geom_pos", "geom_size")
 """Fields that only pictures depend on."""
 _FIELDS = {
     "mass": ("body_mass", "body_inertia"),
-    "length": ("body_ipos", "body_inertia", "body_pos", *SHOWN),
+    "length": ("body_ipos", "body_inertia", "body_pos", *VISUAL_FIELDS),
     "damping": ("dof_damping",),
     "gravity": ("opt.gravity", "jnt_user"),
 }
-VARIED = tuple(
-    dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in SHOWN)
+DYNAMIC_FIELDS = tuple(
+    dict.fromkeys(name for names in _FIELDS.values() for name in names if name not in VISUAL_FIELDS)
 )
 """Fields that the dynamics depend on."""
 
@@ -40,7 +40,7 @@ class JointAddress(NamedTuple):
     """The model's number is that many times the motor's."""
 
 
-def mounts_of(model: mujoco.MjModel, index: int) -> tuple[JointAddress | None, ...]:
+def joint_addresses(model: mujoco.MjModel, index: int) -> tuple[JointAddress | None, ...]:
     """Where an actuator's additions go, entries as in `JointAdditions`; None where the model has no place for them.
 
     Those of a motor in the control callback are its joint's; a plugin keeps gear, inertia and
@@ -67,7 +67,7 @@ def mounts_of(model: mujoco.MjModel, index: int) -> tuple[JointAddress | None, .
 
 
 @functools.cache
-def bare_model(task: str, joint: Joint = PLAIN) -> mujoco.MjModel:
+def bare_model(task: str, joint: Joint = UNMODIFIED_JOINT) -> mujoco.MjModel:
     """The model of the task of a name, with nothing on its actuated joints but what is given; read only."""
     return task_model(
         SimulationConfig(TASKS[task], (IDEAL,) * len(TASKS[task].motors), joint=joint)
@@ -78,19 +78,19 @@ def without_motors(model: mujoco.MjModel, motors: Mapping[int, ActuatorModel]) -
     """A copy of a model without what its motors, by the indices of their actuators, add to it."""
     bare = copy.copy(model)
     for index, motor in motors.items():
-        for mount, added in zip(mounts_of(model, index), motor.additions, strict=True):
+        for mount, added in zip(joint_addresses(model, index), motor.additions, strict=True):
             if mount is not None:
                 getattr(bare, mount.field)[mount.place] -= added * mount.scale
     return bare
 
 
-def mounting_of(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
+def arms_and_additions(motors: Sequence[Sequence[ActuatorModel]]) -> tuple[np.ndarray, np.ndarray]:
     """The arms [m] of the motors of m simulations, (m, n), and their `JointAdditions`, (m, n, 3)."""
     arms = np.array([[one.arm_radius for one in each] for each in motors])
     return arms, np.array([[one.additions for one in each] for each in motors])
 
 
-def variable(model: mujoco.MjModel) -> tuple[str, ...]:
+def variable_names(model: mujoco.MjModel) -> tuple[str, ...]:
     """Names of what can be varied of a model."""
     bodies = {
         body: model.body(body).name for body in range(1, model.nbody) if model.body(body).name
@@ -146,7 +146,7 @@ class Variation:
         varies these, too.
         """
         self.names = tuple(names)
-        self._mounts = [mounts_of(model, index) for index in motors]
+        self._mounts = [joint_addresses(model, index) for index in motors]
         fields = [field for name in names for field in _FIELDS[name.split(".")[1]]]
         fields += [
             mount.field for mounts in self._mounts for mount in mounts if mount is not None
@@ -168,13 +168,13 @@ class Variation:
         """The varied fields of the model, by name (`opt.` before an option's), shape (m, ...).
 
         `values`, shape (m, k), has a column for each of `names`, NaN where it is as it was;
-        `additions` are as `mounting_of` has them; `shown` includes the fields that only pictures
+        `additions` are as `arms_and_additions` has them; `shown` includes the fields that only pictures
         depend on.
         """
         fields = {
             field: np.repeat(nominal[np.newaxis], len(values), axis=0)
             for field, nominal in self._nominal.items()
-            if shown or field not in SHOWN
+            if shown or field not in VISUAL_FIELDS
         }
         for name, column in zip(
             self.names, np.where(np.isnan(values), self._neutral, values).T, strict=True

@@ -57,13 +57,13 @@ class Task(fields.Checked):
     """Name on the command line, such as `cartpole`."""
     env_id: str
     """Its id in Gymnasium's registry, such as `codrl_mj/CartPole-v0`."""
-    max_episode_steps: int | None = field(metadata=fields.integer(None, least=1).metadata)
+    max_episode_steps: int | None = field(metadata=fields.integer(None, minimum=1).metadata)
     """Time limit [environment steps]; None for none."""
     asset: str
     """MJCF file: a name among ours, or a path."""
     step_duration: float = field(metadata=fields.real(1.0, above=0.0, unit="s").metadata)
     """Duration of one environment step [s]."""
-    motor_inner_steps: int = field(metadata=fields.integer(1, least=1).metadata)
+    motor_inner_steps: int = field(metadata=fields.integer(1, minimum=1).metadata)
     """Integration steps per environment step when a motor is in the loop."""
     max_force: Any
     """Largest desired force [N] or torque [N*m] of any action; where the action is the force, it
@@ -97,7 +97,7 @@ class Task(fields.Checked):
     goal and has been there for `goal_hold`. None where the goal is to last: an episode then
     succeeds if it is not terminated before the time limit.
     """
-    goal_hold: float = fields.real(0.0, least=0.0, unit="s")
+    goal_hold: float = fields.real(0.0, minimum=0.0, unit="s")
     """How long an episode that succeeds has been at the goal when it ends [s]."""
 
     forces: tuple[Any, ...] | None = None
@@ -119,7 +119,7 @@ class Task(fields.Checked):
     """
     observation_space: spaces.Box = None  # type: ignore[assignment]
     """The observation space, Gymnasium's; without bounds unless told otherwise."""
-    render_fps: int = fields.integer(0, least=0)
+    render_fps: int = fields.integer(0, minimum=0)
     """Frames per second of a video with one frame a step: real time unless told otherwise, as Gymnasium does."""
     motors: tuple[str, ...] = ("motor",)
     """Names of the MJCF model's actuators that the task drives, in the order of actions and forces.
@@ -137,7 +137,7 @@ class Task(fields.Checked):
     """Makes that environment, or the equations of motion in closed form, to be driven by any force:
     the analytic physics, and the oracle of the certificate.
     """
-    ideal_inner_steps: int = fields.integer(1, least=1)
+    ideal_inner_steps: int = fields.integer(1, minimum=1)
     """Integration steps per environment step when the actuator is ideal: Gymnasium's."""
     paper: tuple[DCMotorActuator, ...] = ()
     """The paper's actuators, one for each motor, of which other named actuators are variations;
@@ -156,7 +156,7 @@ class Task(fields.Checked):
         """Validate, and fill in what follows from the rest."""
         super().__post_init__()
         check_fields(self)
-        fields.check_names(self.integrators, INTEGRATORS, "integrator", every=True)
+        fields.check_names(self.integrators, INTEGRATORS, "integrator", list_all=True)
         asset_path(self.asset)
         half, size = len(self.state_names) // 2, (len(self.observation_names),)
         limits = self.max_forces.astype(np.float32)
@@ -278,7 +278,7 @@ class Task(fields.Checked):
         low, high = self.initial_bounds(asked)  # type: ignore[arg-type]
         if asked is not None:
             fields.check_names(
-                asked.data, sorted(map(str, asked.names)), "reset option", every=True
+                asked.data, sorted(map(str, asked.names)), "reset option", list_all=True
             )
             if not (np.isfinite([low, high]).all() and np.less_equal(low, high).all()):
                 raise ValueError(

@@ -30,19 +30,19 @@ class TrainConfig(Checked):
     """What to train in: task, actuator and all else."""
     agent: AgentConfig = PPOConfig()
     """The agent's settings."""
-    seed: int = integer(0, least=0, most=2**32 - 1)
+    seed: int = integer(0, minimum=0, maximum=2**32 - 1)
     """Seed of weights, actions and environments, from 0 to 2**32 - 1."""
-    total_steps: int | None = integer(200_000, least=1, optional=True)
+    total_steps: int | None = integer(200_000, minimum=1, optional=True)
     """Environment steps in all, >= 1; rounded up to whole rollouts. None: until `total_episodes`."""
-    num_envs: int = integer(8, least=1)
+    num_envs: int = integer(8, minimum=1)
     """Environments side by side, >= 1."""
-    total_episodes: int | None = integer(None, least=1)
+    total_episodes: int | None = integer(None, minimum=1)
     """Training episodes in all, >= 1, where they and not the steps are counted; None: until `total_steps`."""
-    checkpoint_interval: int = integer(20_000, least=1)
+    checkpoint_interval: int = integer(20_000, minimum=1)
     """Environment steps between two checkpoints, >= 1; the next end of a rollout counts."""
-    evaluation_interval: int = integer(20_000, least=1)
+    evaluation_interval: int = integer(20_000, minimum=1)
     """Environment steps between two evaluations of the greedy policy, >= 1, of which the best policy is kept."""
-    evaluation_episodes: int = integer(20, least=1)
+    evaluation_episodes: int = integer(20, minimum=1)
     """Episodes of each evaluation, >= 1: of the task as Gymnasium poses it, on the actuator trained through."""
 
     def __post_init__(self) -> None:

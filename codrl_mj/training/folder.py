@@ -13,8 +13,8 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from codrl_mj.actuators import label_of, set_display_name, trusting
-from codrl_mj.fields import command, differing
+from codrl_mj.actuators import display_label, set_display_name, trusting
+from codrl_mj.fields import command, differences
 from codrl_mj.runs import (
     BEST,
     CHECKPOINT,
@@ -94,7 +94,7 @@ def admit(
         raise FileExistsError(
             f"run folder {run} exists already: {remedy}choose another --out, or delete it"
         )
-    labels = [label_of(one) for one in config.actuators]
+    labels = [display_label(one) for one in config.actuators]
     return {
         "train": config.as_mapping(),
         **made_with,
@@ -150,7 +150,7 @@ def check_same(
 ) -> None:
     """Raise unless a run folder's training can be continued to the result that it would have had uninterrupted."""
     begun = load_config(run, trust=True)  # as its caller does, who names it
-    if other := differing(begun.as_mapping(), config.as_mapping()):
+    if other := differences(begun.as_mapping(), config.as_mapping()):
         told = "; ".join(
             f"{name}: {there!r} and {asked!r}" for name, (there, asked) in other.items()
         )
@@ -166,7 +166,7 @@ def check_same(
         )
     changed = [
         f"{name} was {was}, is {is_now}"
-        for name, (was, is_now) in differing(versions, now["versions"]).items()
+        for name, (was, is_now) in differences(versions, now["versions"]).items()
     ]
     if then.get("code") != now["code"]:
         changed.append(

@@ -188,7 +188,7 @@ def keep(
         traces.append(physics.trace[-1].T.copy())
         states.append(physics.state)
     columns = np.array(traces).swapaxes(0, 1)  # each of shape (steps, motors)
-    signals = dict(zip(trace_names(physics.plant.family), columns, strict=True))
+    signals = dict(zip(trace_names(physics.simulation.family), columns, strict=True))
     current, voltage, force = signals["current"], signals["voltage"], signals["actual_force"]
     current, state = np.vstack([np.zeros_like(current[:1]), current]), np.array(states)
 

@@ -88,7 +88,7 @@ def beside(
     data = mujoco.MjData(model)
     slot_of = slots(data, actuators)
     kinds: dict[int, Family] = {at: type(one) for at, one in actuators.items()}
-    parameters = {at: parameters_type(kinds[at])(*one.numbers) for at, one in actuators.items()}
+    parameters = {at: parameters_type(kinds[at])(*one.parameter_values) for at, one in actuators.items()}
     states = {at: kind.State(*[0.0] * len(kind.State._fields)) for at, kind in kinds.items()}
     found = {at: np.empty((2, len(controls), len(entries(one)))) for at, one in actuators.items()}
     for at in actuators:
@@ -149,7 +149,7 @@ BELOW_ONE = float(np.nextafter(1.0, 0.0))
 )
 def stable(actuator: ActuatorModel, timestep: float) -> Iterator[Case]:
     """What the family says of its parameters; of a loop, of which that is infinite from 1 on, the spectral radius."""
-    found = float(actuator.instability(np.array([actuator.numbers]), timestep)[0])
+    found = float(actuator.instability(np.array([actuator.parameter_values]), timestep)[0])
     radius = spectral_radius(actuator, timestep) if isinstance(actuator, DCMotorActuator) else found
     yield Case(max(found, radius) if radius < 1.0 else radius, f"at a step of {timestep:g} s")
 

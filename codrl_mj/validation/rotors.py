@@ -79,7 +79,7 @@ def motors_on(
                 ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE),
             )
         else:
-            mjcf.drive(driver, motor, None)
+            mjcf.configure_actuator(driver, motor, None)
     model = spec.compile()
     if not all(isinstance(motor, Motor) for motor in motors):
         install_callbacks(model)

@@ -117,7 +117,7 @@ def _run(
         try:
             for physics in (mujoco, analytic):
                 physics.step(force)
-            at = trace_names(analytic.plant.family).index("actual_force")
+            at = trace_names(analytic.simulation.family).index("actual_force")
             delivered = [float(physics.trace[-1, 0, at]) for physics in (mujoco, analytic)]
             growth.follow(force)
         except SimulationDivergedError as error:

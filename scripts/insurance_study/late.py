@@ -88,13 +88,13 @@ class Late(ActuatorModel):
     advance: ClassVar = staticmethod(advance)
     observe: ClassVar = staticmethod(observe)
 
-    time_constant: float = real(0.0, least=0.0, unit="s")
+    time_constant: float = real(0.0, minimum=0.0, unit="s")
     """Time constant [s], >= 0."""
-    delay: float = real(0.0, least=0.0, unit="s")
+    delay: float = real(0.0, minimum=0.0, unit="s")
     """Delay of the command [s], >= 0, at most `LONGEST` steps of the policy."""
     gain: float = real(1.0, above=0.0)
     """What of the torque is delivered in the end, > 0."""
-    held: float = real(10.0, least=1.0)
+    held: float = real(10.0, minimum=1.0)
     """Integration steps to a step of the policy, >= 1."""
     largest: float = real(1.0, above=0.0, unit="N*m")
     """The torque [N*m] that a shown command of one stands for, > 0."""

@@ -44,11 +44,11 @@ class Reproduction(Program):
     """Of the agents: those that the paper prints, and those that learn where these do not."""
     root: Path = Path("runs/paper")
     """Folder of the run folders."""
-    sarsa_seeds: int = integer(30, least=1)
+    sarsa_seeds: int = integer(30, minimum=1)
     """Training runs of each kind of SARSA (mountain_car), which take seconds."""
-    episodes: int | None = integer(None, least=1)
+    episodes: int | None = integer(None, minimum=1)
     """Cut every training off after so many episodes, for trying things out; the default is the paper's budgets."""
-    test_episodes: int = integer(100, least=1)
+    test_episodes: int = integer(100, minimum=1)
     """Test episodes of each policy."""
     mesh: tyro.conf.Suppress[Mesh] = Mesh()
     """Of value iteration."""

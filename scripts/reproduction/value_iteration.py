@@ -25,11 +25,11 @@ DISCOUNTS = (0.85, 0.9, 0.95, 0.99, 0.999)
 class Mesh(Checked):
     """Where values are computed; between its points they are interpolated."""
 
-    positions: int = integer(121, least=2)
+    positions: int = integer(121, minimum=2)
     """Points from wall to wall, >= 2."""
-    speeds: int = integer(121, least=2)
+    speeds: int = integer(121, minimum=2)
     """Points between the speed limits, >= 2."""
-    forces: int = integer(21, least=3)
+    forces: int = integer(21, minimum=3)
     """Forces to choose from, evenly from -1 N to 1 N, >= 3; an odd number, so that there is one of 0."""
 
     def __post_init__(self) -> None:

@@ -28,7 +28,7 @@ timesteps = between(1e-4, 0.1)
 
 def advance(actuator, dt, state, torque, speed):
     """State, torque and signals after a step."""
-    parameters = parameters_type(type(actuator))(*actuator.numbers)
+    parameters = parameters_type(type(actuator))(*actuator.parameter_values)
     return actuator.advance(
         parameters, dt, actuator.State(*state), Inputs(torque, 0.0, speed, 0.0, 0.0)
     )
@@ -226,7 +226,7 @@ def test_a_resistance_under_which_the_saturated_current_oscillates_is_refused_wi
         DCMotorActuator(supply=Supply(resistance=resistance)) for resistance in (2.99, 3.0)
     )
     assert allowed.check(0.05) is None
-    radii = DCMotorActuator.instability(np.array([allowed.numbers, refused.numbers]), 0.05)
+    radii = DCMotorActuator.instability(np.array([allowed.parameter_values, refused.parameter_values]), 0.05)
     np.testing.assert_array_equal(radii < 1.0, [True, False])
     with pytest.raises(
         ValueError, match=r"supply\.resistance = 3: must be < 2\*L/dt - R = 3 ohm .* of 0\.05 s"
@@ -302,7 +302,7 @@ def test_under_a_voltage_only_the_winding_is_left_and_the_sensor_drives_nothing(
     )
     command = actuator.commands()["voltage"]
     driven, loop = command.actuator, command.actuator.controller
-    assert (actuator.tracks, driven.tracks) == (True, False)
+    assert (actuator.is_torque_controlled, driven.is_torque_controlled) == (True, False)
     assert (loop.kp, loop.ki, loop.kd, loop.integral_leak, loop.bemf_compensation) == (
         0,
         0,
@@ -322,7 +322,7 @@ def test_under_a_voltage_only_the_winding_is_left_and_the_sensor_drives_nothing(
     assert {*command.fixed} == fields - kept
     assert advance(driven, 0.01, (1.0, 0.0, 0.0), 7.0, 2.0)[2].voltage == 7.0
     parameters, rest = (
-        parameters_type(type(driven))(*driven.numbers),
+        parameters_type(type(driven))(*driven.parameter_values),
         Inputs(0.0, 0.0, 0.0, 0.0, 0.0),
     )
     assert driven.observe(parameters, 0.01, driven.Signals(1.5, 1.5, 7.0, 0.0), rest) == (2.0, 2.0)

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 import codrl_mj
 from codrl_mj.actuators import Drive, GearMotor, Inputs, SampledLoop, Supply, parameters_type
-from codrl_mj.actuators.sampled import designed_gains, jump, run_samples
+from codrl_mj.actuators.sampled import designed_gains, solve_designed_loop, run_samples
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 
 # R [ohm], L [H], K [N*m/A], V [V]: maxon EC45 flat, DCX22L; Faulhaber 1331T; T-motor AK80-6;
@@ -42,7 +42,7 @@ def drive(name, rate=20e3, **loop):
 
 def responses(one, timestep, torques, speeds):
     """States, torques and signals of steps under held torques and speeds at the rotor."""
-    parameters, state = parameters_type(Drive)(*one.numbers), one.State(*[0.0] * 9)
+    parameters, state = parameters_type(Drive)(*one.parameter_values), one.State(*[0.0] * 9)
     found = []
     for torque, speed in zip(torques, speeds, strict=True):
         state, delivered, signals = one.advance(
@@ -164,7 +164,7 @@ def test_the_closed_form_is_the_stepping(name, rate, bandwidth, samples, command
     resistance, inductance, _, voltage = WINDINGS[name]
     x = resistance / rate / inductance
     kp, ki = designed_gains(resistance, inductance, 1 / rate, bandwidth * rate)
-    parameters = parameters_type(Drive)(*drive(name, rate).numbers)
+    parameters = parameters_type(Drive)(*drive(name, rate).parameter_values)
     current, integral, stepped, volts = 0.0, 0.0, 0.0, 0.0
     for reference, back_emf in commands:
         reference, back_emf = (
@@ -172,7 +172,7 @@ def test_the_closed_form_is_the_stepping(name, rate, bandwidth, samples, command
         )
         reference /= resistance
         limits = ((sign * voltage - back_emf) / resistance for sign in (-1, 1))
-        current, integral, total, drawn, _ = jump(
+        current, integral, total, drawn, _ = solve_designed_loop(
             current, integral, reference, *limits, samples, x, bandwidth, -math.expm1(-x)
         )
         winding = (samples, resistance, math.exp(-x), -math.expm1(-x) / x)

@@ -34,7 +34,7 @@ def test_it_is_the_exact_answer_to_the_interpolated_commands(
         whole + fraction,
     )
     parameters, state, found = (
-        parameters_type(Lag)(*lag.numbers),
+        parameters_type(Lag)(*lag.parameter_values),
         lag.State(*[0.0] * len(lag.State._fields)),
         [],
     )

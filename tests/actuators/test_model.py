@@ -22,11 +22,11 @@ from codrl_mj.actuators import (
     Motor,
     Supply,
     family_name,
-    family_number,
+    family_id,
     field_paths,
     parameter_paths,
     parameters_type,
-    reference,
+    import_path,
 )
 from codrl_mj.fields import flag, integer, part, real
 from tests.actuators.strategies import of_every_family
@@ -36,8 +36,8 @@ from tests.actuators.strategies import of_every_family
 class Inner:
     """A part of a family."""
 
-    gain: float = real(1.0, least=0.0)
-    count: int = integer(2, least=1)
+    gain: float = real(1.0, minimum=0.0)
+    count: int = integer(2, minimum=1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,10 +71,10 @@ def test_parts_are_what_a_family_declares_and_not_what_it_has_by_default():
 @given(of_every_family)
 def test_numbers_make_the_actuator_again(actuator):
     family = type(actuator)
-    found = family.from_numbers(actuator.numbers, actuator.arm_radius)
-    assert found.numbers == actuator.numbers
-    assert len(actuator.numbers) == len(parameters_type(family)._fields)
-    assert family.from_numbers(np.array(actuator.numbers), actuator.arm_radius) == found
+    found = family.from_parameter_values(actuator.parameter_values, actuator.arm_radius)
+    assert found.parameter_values == actuator.parameter_values
+    assert len(actuator.parameter_values) == len(parameters_type(family)._fields)
+    assert family.from_parameter_values(np.array(actuator.parameter_values), actuator.arm_radius) == found
     if family is Drive:  # the gear's ratio goes into the arm and out again
         assert found.motor.arm_radius == pytest.approx(actuator.motor.arm_radius, rel=1e-15)
         found = found.replaced({"motor.arm_radius": actuator.motor.arm_radius})
@@ -85,7 +85,7 @@ def test_numbers_make_the_actuator_again(actuator):
 
 @given(of_every_family, st.sampled_from([1e-3, 0.002, 0.00123, 0.01, 0.05]))
 def test_what_is_refused_is_what_counts_as_unstable(actuator, timestep):
-    (radius,) = type(actuator).instability(np.array([actuator.numbers]), timestep)
+    (radius,) = type(actuator).instability(np.array([actuator.parameter_values]), timestep)
     try:
         actuator.check(timestep)
     except ValueError:
@@ -95,10 +95,10 @@ def test_what_is_refused_is_what_counts_as_unstable(actuator, timestep):
 
 
 def test_an_absent_part_and_one_of_its_numbers_are_one_actuator():
-    assert DCMotorActuator.from_numbers(DCMotorActuator(supply=Supply()).numbers).supply is None
-    assert Nested().numbers == Nested(maybe=Inner(gain=4.0)).numbers
-    assert Nested.from_numbers(Nested(maybe=Inner(5.0)).numbers, 0.5) == Nested(maybe=Inner(5.0))
-    found = Nested.from_numbers((0.0, 2.0, 7.0, 4.0, 2.0), 0.25)
+    assert DCMotorActuator.from_parameter_values(DCMotorActuator(supply=Supply()).parameter_values).supply is None
+    assert Nested().parameter_values == Nested(maybe=Inner(gain=4.0)).parameter_values
+    assert Nested.from_parameter_values(Nested(maybe=Inner(5.0)).parameter_values, 0.5) == Nested(maybe=Inner(5.0))
+    found = Nested.from_parameter_values((0.0, 2.0, 7.0, 4.0, 2.0), 0.25)
     assert found == Nested(0.25, False, Inner(2.0, 7))
     assert (type(found.always.count), found.on) == (
         int,
@@ -122,7 +122,7 @@ def test_paths_are_those_of_all_fields_and_parameters_all_but_the_arm():
         "maybe_gain": "maybe.gain",
         "maybe_count": "maybe.count",
     }
-    assert Nested(on=False, always=Inner(2.0, 7)).numbers == (0.0, 2.0, 7.0, 4.0, 2.0)
+    assert Nested(on=False, always=Inner(2.0, 7)).parameter_values == (0.0, 2.0, 7.0, 4.0, 2.0)
     assert parameters_type(DCMotorActuator)._fields[:2] == ("resistance", "inductance")
     assert field_paths(type(IDEAL)) == ()
     assert parameters_type(type(IDEAL))._fields == ()
@@ -136,7 +136,7 @@ class Twice(ActuatorModel):
     inner: Inner = Inner()
 
 
-LOOP = parameters_type(DCMotorActuator)(*DCMotorActuator().numbers)
+LOOP = parameters_type(DCMotorActuator)(*DCMotorActuator().parameter_values)
 LEAST = {  # field: the least that it may be, or what it must be more than
     "Motor": {
         ">": ("resistance", "inductance", "torque_constant", "arm_radius"),
@@ -208,27 +208,27 @@ def test_quantities_have_their_bounds(kind, field, sign):
             r"CurrentLoop\.bemf_compensation = 1: must be true or false",
         ),
         (lambda: Lag(gain=0.0), r"Lag\.gain = 0\.0: must be a finite number > 0"),
-        (lambda: Nested.from_numbers((0.0,) * 3), "zip"),
-        (lambda: Nested.from_numbers((0.0,) * 6), "zip"),
+        (lambda: Nested.from_parameter_values((0.0,) * 3), "zip"),
+        (lambda: Nested.from_parameter_values((0.0,) * 6), "zip"),
         (
-            lambda: Nested.from_numbers((0.5, 2.0, 7.0, 4.0, 2.0)),
+            lambda: Nested.from_parameter_values((0.5, 2.0, 7.0, 4.0, 2.0)),
             r"Nested\.on = 0\.5: must be true or false",
         ),
-        (lambda: DCMotorActuator.from_numbers(LOOP._replace(substeps=1.5)), r"\.substeps = 1\.5"),
+        (lambda: DCMotorActuator.from_parameter_values(LOOP._replace(substeps=1.5)), r"\.substeps = 1\.5"),
         (
-            lambda: DCMotorActuator.from_numbers(LOOP._replace(substeps=math.inf)),
+            lambda: DCMotorActuator.from_parameter_values(LOOP._replace(substeps=math.inf)),
             r"\.substeps = inf",
         ),
         (
-            lambda: DCMotorActuator.from_numbers(LOOP._replace(bemf_compensation=2.0)),
+            lambda: DCMotorActuator.from_parameter_values(LOOP._replace(bemf_compensation=2.0)),
             r"\.bemf_compensation = 2",
         ),
         (
-            lambda: DCMotorActuator.from_numbers(LOOP._replace(supply_resistance=-1.0)),
+            lambda: DCMotorActuator.from_parameter_values(LOOP._replace(supply_resistance=-1.0)),
             r"Supply\.resistance = -1\.0",
         ),
         (
-            lambda: DCMotorActuator.from_numbers(LOOP, 0.0),
+            lambda: DCMotorActuator.from_parameter_values(LOOP, 0.0),
             r"Motor\.arm_radius = 0\.0: must be a finite number > 0",
         ),
         (
@@ -294,12 +294,12 @@ def test_a_family_of_ours_has_its_name_and_anybody_elses_its_place_whatever_name
         family = "lag"
 
     assert [family_name(family) for family in FAMILIES.values()] == [*FAMILIES]
-    assert family_name(Nested) == reference(Nested) == f"{__name__}:Nested"
-    assert family_name(Impostor) == reference(Impostor) != "lag"
+    assert family_name(Nested) == import_path(Nested) == f"{__name__}:Nested"
+    assert family_name(Impostor) == import_path(Impostor) != "lag"
 
 
 def test_numbers_of_families_have_six_digits_and_differ():
-    numbers = [family_number(family) for family in (*FAMILIES.values(), Nested, Open)]
+    numbers = [family_id(family) for family in (*FAMILIES.values(), Nested, Open)]
     assert len({*numbers}) == len(numbers)
     assert all(0 <= number < 10**6 and float(f"{number:.6g}") == number for number in numbers)
 

@@ -22,12 +22,12 @@ from codrl_mj.actuators import (
     Supply,
     TorqueSpeed,
     actuator_from_mapping,
-    actuator_over,
+    override_actuator,
     check_same_family,
     find_family,
-    label_of,
+    display_label,
     mapping_of,
-    name_of,
+    display_name,
     named_mapping,
     resolve,
     set_display_name,
@@ -386,10 +386,10 @@ def test_a_family_is_found_by_its_name_and_by_its_place():
 )
 def test_an_actuator_is_called_what_it_was_asked_for_by(files, given, name):
     made = resolve(given, CARTPOLE.paper[0], "cartpole")
-    assert name_of(made, CARTPOLE.paper[0]) == name
+    assert display_name(made, CARTPOLE.paper[0]) == name
     again = resolve(json.loads(json.dumps(named_mapping(made))), None, "nobody")
     assert again == made
-    assert label_of(again) == label_of(made)
+    assert display_label(again) == display_label(made)
 
 
 def test_a_motor_of_the_catalogue_is_known_by_its_numbers_and_written_short():
@@ -397,14 +397,14 @@ def test_a_motor_of_the_catalogue_is_known_by_its_numbers_and_written_short():
     geared = dataclasses.replace(
         there, motor=dataclasses.replace(there.motor, gear_ratio=70.3, arm_radius=200.0)
     )
-    assert label_of(geared) == ""
-    assert name_of(geared) == "kraken-x60"
+    assert display_label(geared) == ""
+    assert display_name(geared) == "kraken-x60"
     assert named_mapping(set_display_name(geared, "kraken-x60")) == {
         "name": "kraken-x60",
         "motor": {"gear_ratio": 70.3, "arm_radius": 200.0},
     }
     other = dataclasses.replace(there, motor=dataclasses.replace(there.motor, resistance=1.0))
-    assert name_of(other) == "drive"
+    assert display_name(other) == "drive"
     assert named_mapping(set_display_name(other, "kraken-x60")) == {
         "name": "kraken-x60",
         "motor": {"resistance": 1.0},
@@ -417,10 +417,10 @@ def test_a_motor_of_the_catalogue_is_known_by_its_numbers_and_written_short():
 
 def test_a_name_is_nothing_of_the_actuator(files):
     asked, plain = resolve("drawer.toml", None, "nobody"), resolve("maxon-re65", None, "nobody")
-    assert (name_of(asked), name_of(plain)) == ("drawer", "maxon-re65")
+    assert (display_name(asked), display_name(plain)) == ("drawer", "maxon-re65")
     assert (asked, hash(asked), asked.as_mapping()) == (plain, hash(plain), plain.as_mapping())
     assert (
-        label_of(set_display_name(IDEAL, "nothing")) == label_of(MINE) == ""
+        display_label(set_display_name(IDEAL, "nothing")) == display_label(MINE) == ""
     )  # which may be known by other names
 
 
@@ -432,18 +432,18 @@ def test_a_name_is_nothing_of_the_actuator(files):
 
 def test_single_fields_are_set_over_anothers():
     base = DCMotorActuator(Motor(resistance=2.0), CurrentLoop(kp=3.0, ki=4.0))
-    changed = actuator_over(base, {"controller": {"kp": 5.0}, "motor": {"inductance": 0.3}})
+    changed = override_actuator(base, {"controller": {"kp": 5.0}, "motor": {"inductance": 0.3}})
     assert changed == DCMotorActuator(
         Motor(resistance=2.0, inductance=0.3), CurrentLoop(kp=5.0, ki=4.0)
     )
-    assert actuator_over(base, {"supply": {"voltage": 12.0}}).supply == Supply(voltage=12.0)
+    assert override_actuator(base, {"supply": {"voltage": 12.0}}).supply == Supply(voltage=12.0)
     assert (
-        actuator_over(DCMotorActuator(supply=Supply(12.0)), {"supply": None}) == DCMotorActuator()
+        override_actuator(DCMotorActuator(supply=Supply(12.0)), {"supply": None}) == DCMotorActuator()
     )
-    assert actuator_over(changed, {}) is changed
-    assert actuator_over(Lag(0.1, 0.2), {"delay": 0.3}) == Lag(0.1, 0.3)
-    assert actuator_over(TorqueSpeed(), {"max_torque": 2.0}) == TorqueSpeed(max_torque=2.0)
-    assert actuator_over(IDEAL, {"motor": {}}) is IDEAL
+    assert override_actuator(changed, {}) is changed
+    assert override_actuator(Lag(0.1, 0.2), {"delay": 0.3}) == Lag(0.1, 0.3)
+    assert override_actuator(TorqueSpeed(), {"max_torque": 2.0}) == TorqueSpeed(max_torque=2.0)
+    assert override_actuator(IDEAL, {"motor": {}}) is IDEAL
 
 
 def test_a_part_that_is_given_in_part_is_over_what_stands_for_it():

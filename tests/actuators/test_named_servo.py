@@ -16,9 +16,9 @@ from codrl_mj.actuators import (
     Drive,
     Servo,
     ServoLoop,
-    actuator_over,
-    label_of,
-    name_of,
+    override_actuator,
+    display_label,
+    display_name,
     named_mapping,
     resolve,
 )
@@ -105,19 +105,19 @@ def test_a_servo_without_a_gain_gets_ten_times_the_slope_of_its_motor_and_says_s
 
 def test_a_servo_becomes_its_drive_again_and_keeps_its_name():
     made, drive = resolve(SERVO, None, "x"), resolve(MOTOR, None, "x")
-    assert name_of(made) == f"{MOTOR} servo, changed"  # another friction
-    plain = actuator_over(drive, {"family": "servo", "loop": ServoLoop(velocity_gain=2.0)})
+    assert display_name(made) == f"{MOTOR} servo, changed"  # another friction
+    plain = override_actuator(drive, {"family": "servo", "loop": ServoLoop(velocity_gain=2.0)})
     assert plain == Servo(drive.motor, drive.controller, drive.supply, ServoLoop(velocity_gain=2.0))
-    assert actuator_over(drive, {"family": Servo, "loop": {"velocity_gain": 2.0}}) == plain
-    again = actuator_over(plain, {"family": "drive"})
-    assert (type(again), again, label_of(plain), label_of(again)) == (
+    assert override_actuator(drive, {"family": Servo, "loop": {"velocity_gain": 2.0}}) == plain
+    again = override_actuator(plain, {"family": "drive"})
+    assert (type(again), again, display_label(plain), display_label(again)) == (
         Drive,
         drive,
         f"{MOTOR} servo",
         MOTOR,
     )
     read = resolve(json.loads(json.dumps(named_mapping(plain))), None, "x")
-    assert (read, label_of(read)) == (plain, label_of(plain))
+    assert (read, display_label(read)) == (plain, display_label(plain))
 
 
 @pytest.mark.parametrize("controls", ["position", "velocity"])
@@ -185,7 +185,7 @@ def test_the_command_line_makes_a_servo_of_a_name_and_a_run_keeps_it(files, monk
     made = load_config(Path("run")).actuators[0]
     changes = {"motor": {"gear_ratio": 50.0}, "loop": {"position_gain": 10.0}}
     assert made == resolve({"name": "sheet.toml", "family": "servo", **changes}, None, "x")
-    assert label_of(made) == "sheet servo"
+    assert display_label(made) == "sheet servo"
 
 
 def test_the_way_to_a_servo_is_told_where_it_is_missed(capsys, files):
@@ -202,6 +202,6 @@ def test_a_servo_in_a_file_is_shown_as_its_motor_and_its_loops(capsys, files):
     assert "loop.velocity_gain" in capsys.readouterr().out
     assert find_loop("servo_sheet.yaml") == ServoLoop(**GAINS)
     assert find_loop("sheet.toml") is None
-    assert find_drive("servo_sheet.yaml") == actuator_over(
+    assert find_drive("servo_sheet.yaml") == override_actuator(
         find_drive("sheet.toml"), {"motor": SERVO["motor"]}
     )

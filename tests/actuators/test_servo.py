@@ -330,7 +330,7 @@ def test_a_servo_says_which_limit_it_met_and_what_it_drew(limits, met):
     current = {name: limits[name] for name in limits if name == "max_current"}
     loop = ServoLoop("velocity", servo_rate=1000.0, velocity_gain=0.05, **kinds)
     one = Servo(MOTOR, SampledLoop(20e3, **current), Supply(limits.get("volts", 1e4)), loop)
-    parameters, state, speed = parameters_type(Servo)(*one.numbers), one.State(*[0.0] * 13), 20.0
+    parameters, state, speed = parameters_type(Servo)(*one.parameter_values), one.State(*[0.0] * 13), 20.0
     motor, before = one.motor, 0.0
     for target in (80.0, -60.0):
         state, _, seen = one.advance(

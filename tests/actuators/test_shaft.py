@@ -20,7 +20,7 @@ HOT = GearMotor(
 def advanced(one, timestep, torques, speed=0.0, inertia=math.inf):
     """Signals of steps, and the last state."""
     parameters, state = (
-        parameters_type(type(one))(*one.numbers),
+        parameters_type(type(one))(*one.parameter_values),
         one.State(*[0.0] * len(one.State._fields)),
     )
     found = []
@@ -163,7 +163,7 @@ def test_a_bridge_loses_its_dead_band():
 
 
 def parameters_of(**motor):
-    return parameters_type(Drive)(*Drive(GearMotor(**motor)).numbers)
+    return parameters_type(Drive)(*Drive(GearMotor(**motor)).parameter_values)
 
 
 @pytest.mark.parametrize("speed", [-20.0, -3.0, 3.0, 20.0])

@@ -45,7 +45,7 @@ def electrical_matrix(actuator, timestep):
     Only the states that some gain reads are part of the loop: the current always, the integral if
     ki > 0 and the previous error if kd > 0.
     """
-    parameters = parameters_type(DCMotorActuator)(*actuator.numbers)._replace(
+    parameters = parameters_type(DCMotorActuator)(*actuator.parameter_values)._replace(
         max_voltage=np.inf, substeps=1
     )
     states = [0, *[1] * (actuator.controller.ki > 0), *[2] * (actuator.controller.kd > 0)]
@@ -211,7 +211,7 @@ def test_an_unstable_loop_is_refused_with_its_radius_and_a_remedy_that_works(act
 def test_many_are_each_the_one_to_the_last_bit_and_the_quick_test_is_below_one_where_they_are(
     several, dt
 ):
-    numbers = np.array([one.numbers for one in several])
+    numbers = np.array([one.parameter_values for one in several])
     radii = spectral_radii(DCMotorActuator, numbers, dt)
     np.testing.assert_array_equal(radii, [spectral_radius(one, dt) for one in several])
     np.testing.assert_array_equal(stability_radii(DCMotorActuator, numbers, dt) < 1.0, radii < 1.0)
@@ -223,7 +223,7 @@ def test_the_quick_test_asks_the_eigenvalues_on_the_edge(motor, pole, nudge, dt)
     kp = (1.0 - pole) * motor.inductance / dt - motor.resistance
     assume(kp >= 0.0)
     numbers = np.array(
-        [DCMotorActuator(motor, CurrentLoop(kp=kp + nudge * np.spacing(max(kp, 1.0)))).numbers]
+        [DCMotorActuator(motor, CurrentLoop(kp=kp + nudge * np.spacing(max(kp, 1.0)))).parameter_values]
     )
     np.testing.assert_array_equal(
         stability_radii(DCMotorActuator, numbers, dt), spectral_radii(DCMotorActuator, numbers, dt)
@@ -233,7 +233,7 @@ def test_the_quick_test_asks_the_eigenvalues_on_the_edge(motor, pole, nudge, dt)
 def test_the_quick_test_asks_nobody_where_the_case_is_clear(monkeypatch):
     monkeypatch.setattr("codrl_mj.actuators.stability.spectral_radii", None)
     numbers = np.array(
-        [DCMotorActuator(controller=CurrentLoop(kp=kp)).numbers for kp in (1.0, 1e4)]
+        [DCMotorActuator(controller=CurrentLoop(kp=kp)).parameter_values for kp in (1.0, 1e4)]
     )
     np.testing.assert_array_equal(stability_radii(DCMotorActuator, numbers, 0.01), [0.0, np.inf])
 
@@ -242,7 +242,7 @@ def test_the_quick_test_asks_nobody_where_the_case_is_clear(monkeypatch):
 def test_gains_that_overflow_are_unstable_at_any_number_of_substeps(field):
     numbers = np.array(
         [
-            with_gains(DCMotorActuator(), **{field: 1e308}, substeps=count).numbers
+            with_gains(DCMotorActuator(), **{field: 1e308}, substeps=count).parameter_values
             for count in (1, 4)
         ]
     )

@@ -6,7 +6,7 @@ import mujoco
 import pytest
 
 import codrl_mj
-from codrl_mj.actuators import Inputs, TorqueSpeed, actuator_over, parameters_type
+from codrl_mj.actuators import Inputs, TorqueSpeed, override_actuator, parameters_type
 
 # Isaac Lab, source/isaaclab/test/actuators/test_dc_motor.py, test_dc_motor_clip, at
 # saturation_effort 100, velocity_limit 50, effort_limit 60; mjlab, tests/test_dc_actuator.py, at
@@ -37,7 +37,7 @@ CASES = [  # motor, desired, speed, delivered, in the first and fourth quadrant
 def test_points_in_four_quadrants_are_those_of_others(motor, desired, speed, expected, sign):
     inputs = Inputs(sign * desired, 0.0, sign * speed, 0.0, 0.0)
     _, torque, signals = motor.advance(
-        parameters_type(TorqueSpeed)(*motor.numbers), 0.01, (), inputs
+        parameters_type(TorqueSpeed)(*motor.parameter_values), 0.01, (), inputs
     )
     assert torque == pytest.approx(sign * expected, rel=1e-12, abs=1e-12)
     assert signals.lower_limit <= torque <= signals.upper_limit
@@ -62,8 +62,8 @@ def test_nothing_but_what_is_given_limits_a_printed_line_in_mujoco(speed, more):
 
 
 def test_a_stall_torque_set_over_the_defaults_is_not_cut_either():
-    motor = actuator_over(TorqueSpeed(), {"stall_torque": 24.0})
+    motor = override_actuator(TorqueSpeed(), {"stall_torque": 24.0})
     for asked, expected in ((30.0, 24.0), (-30.0, -24.0)):
-        numbers = parameters_type(TorqueSpeed)(*motor.numbers)
+        numbers = parameters_type(TorqueSpeed)(*motor.parameter_values)
         assert motor.advance(numbers, 0.01, (), Inputs(asked, 0.0, 0.0, 0.0, 0.0))[1] == expected
     assert math.isinf(motor.max_torque)

@@ -54,7 +54,7 @@ def _both(actuators, integrator, kind="hinge"):
             mujoco.mj_step(model, data)
             seen = read(data)
             # one door stores the force, the other makes it from the torque
-            wanted = np.where([one.tracks for one in motors], desired[:count], seen["actual_force"])
+            wanted = np.where([one.is_torque_controlled for one in motors], desired[:count], seen["actual_force"])
             np.testing.assert_allclose(seen.pop("desired_force"), wanted, rtol=1e-15)
             rows.append(np.concatenate((data.qpos, data.qvel, data.qfrc_actuator, *seen.values())))
         assert list(codrl_mj.engine.motors(model).values()) == motors

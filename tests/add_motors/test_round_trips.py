@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import codrl_mj
-from codrl_mj.actuators import Lag, reference
+from codrl_mj.actuators import Lag, import_path
 from codrl_mj.plugin import NAME, registered
 from tests.add_motors.models import (
     GYMNASIUM,
@@ -166,8 +166,8 @@ def test_another_process_has_the_same_motors_and_imports_no_code_because_a_model
     ("old", "new", "reason"),
     [
         ("250700 ", "2507 ", "user data do not begin with codrl_mj's signature"),
-        (reference(Lag), reference(type(LOOP)), "name different families"),
-        (reference(Lag), "codrl_mj.actuators:Nobody", "'codrl_mj.actuators:Nobody' is not loaded"),
+        (import_path(Lag), import_path(type(LOOP)), "name different families"),
+        (import_path(Lag), "codrl_mj.actuators:Nobody", "'codrl_mj.actuators:Nobody' is not loaded"),
         (" 0.3 0.007", "", "fewer numbers than the family has parameters"),
     ],
 )

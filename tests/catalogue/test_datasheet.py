@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from codrl_mj.catalogue import Datasheet, derivation, from_datasheet, motor_entry, units
-from codrl_mj.catalogue.datasheet import KINDS, named
+from codrl_mj.catalogue.datasheet import KINDS, to_field_names
 
 UNITS = {  # by definition: SI value of one unit
     "V": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
@@ -65,11 +65,11 @@ POLOLU = {
 )
 def test_usual_units_have_pint_s_sizes_to_the_bit(kind, unit, monkeypatch):
     numbers = [
-        units.in_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
+        units.to_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
     ]
     monkeypatch.setattr(units, "_USUAL", {})
     assert numbers == [
-        units.in_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
+        units.to_si(number, unit, kind, weights=True) for number in (1.0, 0.1, 12345.678, -3e-7)
     ]
 
 
@@ -361,7 +361,7 @@ def test_a_phase_of_a_star_may_be_written_as_a_product():
 )
 def test_values_are_read_as_makers_write_them(name, printed, value):
     """By definition: kgf 9.80665 N, oz 28.349523 g, in 25.4 mm, a turn 2 pi."""
-    (reading,) = Datasheet(**named({name: printed})).readings().values()
+    (reading,) = Datasheet(**to_field_names({name: printed})).readings().values()
     assert reading.value == pytest.approx(value, rel=1e-6)
 
 
@@ -616,7 +616,7 @@ def test_a_file_is_read_whatever_editor_saved_it(tmp_path):
     for end in ("\n", "\r\n"):
         for encoding in ("utf-8", "utf-8-sig", "utf-16"):
             file.write_bytes(end.join(lines).encode(encoding))
-            assert motor_entry(str(file)).numbers == expected
+            assert motor_entry(str(file)).parameters == expected
     file.write_bytes("\n".join([*lines, 'rotor_inertia = "60 µg*m^2 at motor"']).encode("cp1252"))
     with pytest.raises(
         ValueError, match=r"line 10 has the byte 0xb5 \(µ in Windows-1252\).*save the file as UTF-8"

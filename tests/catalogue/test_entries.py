@@ -63,7 +63,7 @@ def test_every_value_has_a_source_or_a_reason(name):
 def test_a_motor_agrees_with_itself_or_its_notes_say_why_not(name):
     entry = motor_entry(name)
     large = {
-        one.quantity for one in entry.numbers.disagreements if abs(one.difference) > 0.05 - 1e-4
+        one.quantity for one in entry.parameters.disagreements if abs(one.difference) > 0.05 - 1e-4
     }
     assert large == {quantity for motor, quantity in EXPLAINED if motor == name}
     for quantity in large:
@@ -74,7 +74,7 @@ def test_a_motor_agrees_with_itself_or_its_notes_say_why_not(name):
 def test_the_model_stands_at_the_printed_points(name):
     """Two equations, winding and shaft, solved for the free motor; and the blocked one."""
     entry = motor_entry(name)
-    numbers, printed = entry.numbers, entry.datasheet.readings()
+    numbers, printed = entry.parameters, entry.datasheet.readings()
     friction = (numbers.coulomb_friction or 0.0), (numbers.viscous_friction or 0.0)
     if {"no_load_speed", "nominal_voltage"} <= printed.keys():
         matrix = [
@@ -104,7 +104,7 @@ def test_the_model_stands_at_the_printed_points(name):
 @pytest.mark.parametrize("name", ["faulhaber-1331-006", "maxon-ec45-flat-50w", "maxon-re65"])
 def test_what_a_motor_bears_for_ever_is_what_its_thermal_numbers_bear(name):
     """At 22 to 25 degC around it, with copper's 0.0039/K; some of the heat is friction's and the iron's."""
-    numbers = motor_entry(name).numbers
+    numbers = motor_entry(name).parameters
     rise = numbers.max_temperature - 25.0
     heat = numbers.continuous_current**2 * numbers.resistance * (1.0 + 0.0039 * rise)
     assert 0.7 < numbers.thermal_resistance * heat / rise < 1.0
@@ -114,7 +114,7 @@ def test_what_a_motor_bears_for_ever_is_what_its_thermal_numbers_bear(name):
 def test_the_pmg_132_is_gym_electric_motors():
     theirs, ours = (
         DcPermanentlyExcitedMotor._default_motor_parameter,
-        motor_entry("heinzmann-pmg-132").numbers,
+        motor_entry("heinzmann-pmg-132").parameters,
     )
     assert (ours.resistance, ours.inductance) == pytest.approx((theirs["r_a"], theirs["l_a"]))
     assert (ours.torque_constant, ours.rotor_inertia) == pytest.approx(
@@ -126,7 +126,7 @@ def test_a_file_of_ones_own_is_an_entry(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(OWN)
     entry = motor_entry(str(path))
-    assert (entry.name, entry.numbers.inductance) == ("mine", pytest.approx(1e-3))
+    assert (entry.name, entry.parameters.inductance) == ("mine", pytest.approx(1e-3))
     assert entry.sources == {"resistance": "my bench", "torque_constant": "my bench"}
 
 
@@ -141,7 +141,7 @@ def test_a_file_of_ones_own_need_not_say_who_makes_it_and_its_numbers_are_looked
     path.write_text(path.read_text().replace('R = ""', 'rotor_inertia = ""'))
     entry = motor_entry(str(path))
     assert (entry.manufacturer, entry.product, entry.kind, entry.sources) == ("", "mine", "", {})
-    assert entry.numbers.torque_constant == pytest.approx(60.0 / (2.0 * np.pi * 340.0))
+    assert entry.parameters.torque_constant == pytest.approx(60.0 / (2.0 * np.pi * 340.0))
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_the_pages_have_every_motor_and_their_examples_run(tmp_path, capsys):
     path, written = tmp_path / "my_motor.toml", re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     for upto in range(1, len(written) + 1):
         path.write_text("".join(written[:upto]))
-        assert motor_entry(str(path)).numbers.rotor_inertia == pytest.approx(1.05e-6)
+        assert motor_entry(str(path)).parameters.rotor_inertia == pytest.approx(1.05e-6)
     assert motor_entry(str(path)).sources["stall_torque"] == "a page"
     assert set(motor_entry(str(path)).estimated) == {"inductance"}
 

@@ -118,7 +118,7 @@ def test_the_current_loop_in_c_is_the_drive_s_sample_by_sample(tmp_path, name, d
     library, kind = compiled(tmp_path, double, "current_step", "current_reference")
     state = (kind * 2)()
     library.current_reset(state)
-    parameters, period = parameters_type(Drive)(*drive.numbers), 1.0 / drive.controller.sample_rate
+    parameters, period = parameters_type(Drive)(*drive.parameter_values), 1.0 / drive.controller.sample_rate
     ours, decay = State(*[0.0] * 9), np.exp(-motor.resistance * period / motor.inductance)
     random = np.random.default_rng(0)
     saturated = 0
@@ -165,7 +165,7 @@ def test_the_paper_s_loop_in_c_is_the_actuator_s_sample_by_sample(tmp_path, name
     actuator = dataclasses.replace(usual, controller=controller, supply=supply)
     written(tmp_path, "cartpole", "dqn", double=double, actuator=actuator)
     library, kind = compiled(tmp_path, double, "current_step", "current_reference")
-    parameters = parameters_type(DCMotorActuator)(*actuator.numbers)
+    parameters = parameters_type(DCMotorActuator)(*actuator.parameter_values)
     header = (tmp_path / "controller.h").read_text()
     period = 1.0 / float(
         header.partition("CONTROLLER_CURRENT_RATE ")[2].partition(" ")[0].rstrip("f")
@@ -235,7 +235,7 @@ def test_the_servo_s_loops_in_c_are_the_servo_s_sample_by_sample(tmp_path, name,
     assert library.servo_target(kind(0.5)) == pytest.approx(0.5 * 3.0)
     state, random, limited, free = (kind * 1)(), np.random.default_rng(0), 0, 0
     library.servo_reset(state)
-    parameters, period = parameters_type(Servo)(*servo.numbers), 1.0 / loop.servo_rate
+    parameters, period = parameters_type(Servo)(*servo.parameter_values), 1.0 / loop.servo_rate
     ours, position, speed = Servo.State(*[0.0] * len(Servo.State._fields)), 0.0, 0.0
     for sample in range(1000):
         if sample % 50 == 0:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from codrl_mj.actuators import GearMotor, SampledLoop, Servo, ServoLoop, Supply
-from codrl_mj.disturbances import Disturbances, quantised, rate_limited, whole_and_fraction
+from codrl_mj.disturbances import Disturbances, quantize, limit_rate, whole_and_fraction
 from codrl_mj.physics.disturber import Disturber
 
 commands = st.lists(st.floats(-10, 10), min_size=1, max_size=30)
@@ -154,7 +154,7 @@ def test_the_delay_counts_integration_steps_within_an_environment_step():
 
 @given(st.floats(-1e3, 1e3), st.floats(1e-3, 10), st.floats(0.1, 2e3))
 def test_a_quantised_command_is_the_nearest_multiple_within_the_limit(command, quantum, limit):
-    value = quantised(command, quantum, limit)
+    value = quantize(command, quantum, limit)
     clipped = np.clip(command, -limit, limit)
     assert abs(value) <= limit
     if abs(value) < limit:
@@ -162,12 +162,12 @@ def test_a_quantised_command_is_the_nearest_multiple_within_the_limit(command, q
         assert abs(value - command) <= quantum / 2 * (1 + 1e-9) + 1e-12 * abs(command)
     else:
         assert abs(clipped - value) <= quantum
-    assert quantised(np.array([-command]), quantum, limit)[0] == -value
+    assert quantize(np.array([-command]), quantum, limit)[0] == -value
 
 
 def test_half_way_goes_to_the_even_multiple():
     np.testing.assert_array_equal(
-        quantised(np.array([0.25, 0.75, -0.25, 1.25]), 0.5, 9.0), [0.0, 1.0, 0.0, 1.0]
+        quantize(np.array([0.25, 0.75, -0.25, 1.25]), 0.5, 9.0), [0.0, 1.0, 0.0, 1.0]
     )
 
 
@@ -175,7 +175,7 @@ def test_half_way_goes_to_the_even_multiple():
 def test_a_rate_limited_command_moves_towards_its_target_and_never_faster(values, change):
     last = 0.0
     for target in values:
-        value = rate_limited(np.array([target]), np.array([last]), change)[0]
+        value = limit_rate(np.array([target]), np.array([last]), change)[0]
         assert abs(value - last) <= change * (1 + 1e-12) + 1e-12
         if abs(target - last) <= change:
             assert value == pytest.approx(target, abs=1e-12)

@@ -7,7 +7,7 @@ import gymnasium
 import pytest
 
 import codrl_mj
-from codrl_mj.disturbances import OFF, PLAIN, Disturbances, Joint, resolve
+from codrl_mj.disturbances import NO_DISTURBANCES, UNMODIFIED_JOINT, Disturbances, Joint, resolve
 from tests.disturbances.everything import MOST, RUBBED
 
 FIELDS = [
@@ -18,8 +18,8 @@ FIELDS = [
 def test_everything_is_off_by_default_and_public():
     assert codrl_mj.Disturbances is Disturbances
     assert codrl_mj.Joint is Joint
-    assert {*dataclasses.asdict(OFF).values(), *dataclasses.asdict(PLAIN).values()} == {0.0}
-    assert not OFF.random
+    assert {*dataclasses.asdict(NO_DISTURBANCES).values(), *dataclasses.asdict(UNMODIFIED_JOINT).values()} == {0.0}
+    assert not NO_DISTURBANCES.random
     assert {*MOST, *RUBBED} == {name for _, name in FIELDS}
 
 
@@ -52,7 +52,7 @@ def test_pulses_need_a_duration_and_an_interval_and_these_need_pulses(fields, me
 
 
 @pytest.mark.parametrize(
-    ("kind", "off", "given"), [(Disturbances, OFF, MOST), (Joint, PLAIN, RUBBED)]
+    ("kind", "off", "given"), [(Disturbances, NO_DISTURBANCES, MOST), (Joint, UNMODIFIED_JOINT, RUBBED)]
 )
 def test_a_mapping_is_as_good(kind, off, given):
     full = kind(**given)
@@ -67,12 +67,12 @@ def test_a_mapping_is_as_good(kind, off, given):
     [
         (
             {"comand_delay": 1},
-            OFF,
+            NO_DISTURBANCES,
             "unknown field disturbances.comand_delay; did you mean disturbances.command_delay?",
         ),
-        ({"frictoin": 1}, PLAIN, "unknown field joint.frictoin; did you mean joint.friction?"),
-        (3, OFF, "'disturbances' = 3: must be a mapping of Disturbances's fields"),
-        (3, PLAIN, "'joint' = 3: must be a mapping of Joint's fields"),
+        ({"frictoin": 1}, UNMODIFIED_JOINT, "unknown field joint.frictoin; did you mean joint.friction?"),
+        (3, NO_DISTURBANCES, "'disturbances' = 3: must be a mapping of Disturbances's fields"),
+        (3, UNMODIFIED_JOINT, "'joint' = 3: must be a mapping of Joint's fields"),
     ],
 )
 def test_what_is_no_description_is_refused(given, off, message):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from codrl_mj.actuators.noise import LARGEST_KEY
+from codrl_mj.actuators.noise import MAX_KEY
 from codrl_mj.disturbances import START, Disturbances
 from codrl_mj.physics.disturber import Disturber
 
@@ -16,7 +16,7 @@ PULSES = Disturbances(pulse_force=FORCE, pulse_duration=DURATION, pulse_interval
 def _loads(timestep, steps, simulations, seed=0):
     """Loads (steps, simulations), and when the present or next pulse starts, before each step."""
     disturber = Disturber(PULSES, timestep, np.array([10.0]), simulations)
-    keys = np.floor(np.random.default_rng(seed).random(simulations) * LARGEST_KEY)
+    keys = np.floor(np.random.default_rng(seed).random(simulations) * MAX_KEY)
     disturber.reset(np.arange(simulations), keys)
     loads, starts = [], []
     for _ in range(steps):

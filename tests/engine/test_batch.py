@@ -71,7 +71,7 @@ def test_each_simulation_of_a_batch_may_have_its_own_motor(name, nthread):
     engine.load_family(Spring)
     motors, models = FAMILIES[name], [rotor(one) for one in FAMILIES[name]]
     batch = Batch(models[0], nsim=SIMULATIONS, nthread=nthread)
-    batch.expand("actuator_user")[:, 0, HEAD:] = [one.numbers for one in motors]
+    batch.expand("actuator_user")[:, 0, HEAD:] = [one.parameter_values for one in motors]
     batch.expand("actuator_gear")[:, 0, 0] = [1.0 / one.arm_radius for one in motors]
     np.testing.assert_array_equal(batched(batch, models[0]), serial(models))
 

@@ -20,7 +20,7 @@ from codrl_mj.actuators import (
     ServoLoop,
     Supply,
     TorqueSpeed,
-    family_number,
+    family_id,
     parameters_type,
 )
 from codrl_mj.actuators.noise import standard_normal
@@ -33,7 +33,7 @@ from codrl_mj.physics import (
     install_callbacks,
     motors,
 )
-from codrl_mj.physics.mjcf import drive
+from codrl_mj.physics.mjcf import configure_actuator
 from codrl_mj.tasks import TASKS
 from tests.engine.models import FULL, changed, controls, rotor, rotor_spec, trajectory
 from tests.tasks.faces import every_rebuilt
@@ -60,15 +60,15 @@ class Seen(NamedTuple):
 class Coil:
     """A part of a spring."""
 
-    stiffness: float = real(0.7, least=0.0)
-    turns: int = integer(3, least=1)
+    stiffness: float = real(0.7, minimum=0.0)
+    turns: int = integer(3, minimum=1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Brake:
     """A part that a spring may lack."""
 
-    drag: float = real(0.0, least=0.0)
+    drag: float = real(0.0, minimum=0.0)
 
 
 def _softened(torque, limit):
@@ -202,7 +202,7 @@ pytestmark = pytest.mark.usefixtures("_families")
 @pytest.mark.parametrize("actuator", ALL, ids=lambda one: type(one).__name__)
 def test_a_family_runs_in_the_callback_bit_for_bit_as_in_python(actuator, integrator):
     model, family = rotor(actuator, integrator=integrator), type(actuator)
-    data, parameters = mujoco.MjData(model), parameters_type(family)(*actuator.numbers)
+    data, parameters = mujoco.MjData(model), parameters_type(family)(*actuator.parameter_values)
     states, shown = len(family.State._fields), signals_at(family)
     data.act[Slot._fields.index("noise_key")] = KEY
     state, timestep, gear = (
@@ -253,7 +253,7 @@ def test_it_is_read_back_from_the_model_as_it_was_written(actuator):
     ((index, found),) = motors(rotor(actuator)).items()
     assert index == 0
     assert type(found) is type(actuator)
-    assert found.numbers == actuator.numbers
+    assert found.parameter_values == actuator.parameter_values
     assert found.arm_radius == pytest.approx(actuator.arm_radius, rel=1e-15)
 
 
@@ -268,7 +268,7 @@ def hinges(*actuators):
         + "</worldbody></mujoco>"
     )
     for index, actuator in enumerate(actuators):
-        drive(
+        configure_actuator(
             spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=str(index)), actuator, None
         )
     return spec.compile()
@@ -313,7 +313,7 @@ def test_a_model_compiles_its_families_on_installation():
             return state, 2.0 * inputs.desired_torque, state
 
     spec = rotor_spec()
-    drive(spec.actuator("motor"), Late(), None)
+    configure_actuator(spec.actuator("motor"), Late(), None)
     model = spec.compile()
     with pytest.raises(
         ValueError, match=r"motor: .* is not known in this process: import its module"
@@ -336,11 +336,11 @@ def test_two_families_of_one_number_are_refused_and_the_first_stays(monkeypatch)
 
     monkeypatch.setattr(
         "codrl_mj.engine.families.family_number",
-        lambda family: family_number(Spring),  # noqa: ARG005
+        lambda family: family_id(Spring),  # noqa: ARG005
     )
     with pytest.raises(
         ValueError,
-        match=f"Other and .*:Spring have the same number {family_number(Spring)}: rename one",
+        match=f"Other and .*:Spring have the same number {family_id(Spring)}: rename one",
     ):
         engine.load_family(Other)
     before = loaded_families()
@@ -351,9 +351,9 @@ def test_two_families_of_one_number_are_refused_and_the_first_stays(monkeypatch)
 
 
 def test_a_familys_number_is_its_own_and_survives_an_xml_file(tmp_path):
-    numbers = [family_number(type(one)) for one in ALL]
+    numbers = [family_id(type(one)) for one in ALL]
     assert len(set(numbers)) == len({type(one) for one in ALL})
-    assert user_head(Spring)[2] == family_number(Spring)
+    assert user_head(Spring)[2] == family_id(Spring)
     spec = rotor_spec(Spring())
     spec.compile()
     path = tmp_path / "model.xml"

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("bare_engine")
 HEAD, SIZE = user_head(DCMotorActuator), slot_size(DCMotorActuator)
 
 
-OURS = (*HEAD, *DCMotorActuator().numbers)
+OURS = (*HEAD, *DCMotorActuator().parameter_values)
 
 
 def general(user=(), actdim=SIZE, **kinds):

@@ -91,9 +91,9 @@ def test_a_servo_that_is_too_slow_for_its_gain_is_refused_with_a_step_that_does(
 class Spring(ActuatorModel):
     """A family of somebody's, which closes a loop over position and speed without saying so."""
 
-    stiffness: float = real(1.0, least=0.0)
-    damping: float = real(0.0, least=0.0)
-    dry: float = real(0.0, least=0.0)
+    stiffness: float = real(1.0, minimum=0.0)
+    damping: float = real(0.0, minimum=0.0)
+    dry: float = real(0.0, minimum=0.0)
 
     @staticmethod
     def advance(parameters, timestep, state, inputs: Inputs):  # noqa: ARG004

@@ -127,7 +127,7 @@ def test_the_drawn_actuator_is_what_acts(task, physics):
             )
         ends.add(tuple(ours.state))
         if physics == "mujoco":
-            assert tuple(ours.model.actuator_user[0, HEAD:]) == actuator.numbers
+            assert tuple(ours.model.actuator_user[0, HEAD:]) == actuator.parameter_values
     assert len(ends) == 4
 
 
@@ -444,7 +444,7 @@ def test_a_nominal_actuator_may_be_unstable_if_its_draws_are_not():
 
 def test_the_radius_of_one_is_that_among_many():
     generator = np.random.default_rng(0)
-    vectors = np.array([DCMotorActuator().numbers] * 300)
+    vectors = np.array([DCMotorActuator().parameter_values] * 300)
     vectors[:, 4:8] = generator.uniform(0.0, [20.0, 50.0, 0.05, 1.0], (300, 4))
     vectors[generator.random(300) < 0.3, 5] = 0.0
     vectors[generator.random(300) < 0.3, 6] = 0.0
@@ -462,7 +462,7 @@ def test_the_radius_of_one_is_that_among_many():
 
 def test_the_quick_proof_of_stability_and_the_radius_agree():
     generator = np.random.default_rng(1)
-    vectors = np.array([DCMotorActuator().numbers] * 20000)
+    vectors = np.array([DCMotorActuator().parameter_values] * 20000)
     vectors[:, 0:2] = np.exp(generator.uniform(-3.0, 1.0, (20000, 2)))
     vectors[:, 4:7] = np.exp(generator.uniform(-9.0, 4.0, (20000, 3))) * (1.0, 1.0, 1e-3)
     vectors[generator.random(20000) < 0.3, 5] = 0.0
@@ -478,7 +478,7 @@ def test_the_quick_proof_of_stability_and_the_radius_agree():
     assert np.isin(quick, (0.0, np.inf)).mean() > 0.8  # it is what saves the time
     edge = np.array(
         [
-            DCMotorActuator(controller=CurrentLoop(kp=kp)).numbers
+            DCMotorActuator(controller=CurrentLoop(kp=kp)).parameter_values
             for kp in 9.0 + np.linspace(-1e-9, 1e-9, 401)
         ]
     )

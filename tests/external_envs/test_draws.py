@@ -42,7 +42,7 @@ def test_motors_are_drawn_at_every_reset_and_initial_states_are_not_touched():
 
 def test_a_drawn_motor_is_the_motor_that_it_would_be_from_the_first():
     fields = {"motor.rotor_inertia": 3e-5, "motor.coulomb_friction": 0.02, "motor.gear_ratio": 1.5}
-    made = Drive.of(motor_entry("maxon-ec45-flat-50w").numbers).replaced(
+    made = Drive.from_motor_parameters(motor_entry("maxon-ec45-flat-50w").parameters).replaced(
         fields | {"motor.resistance": 1.1}
     )
     draws = {".*": {name: codrl_mj.Choice([value]) for name, value in fields.items()}}

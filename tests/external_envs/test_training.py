@@ -130,7 +130,7 @@ def test_a_file_says_what_is_behind_what(tmp_path):
     (tmp_path / "train.yaml").write_text(text + "agent: {name: sac, gamma: 0.98}\n")
     found = read_config(tmp_path / "train.yaml")
     assert found.env.driven == {
-        "b.*": Drive.of(motor_entry("maxon-ec45-flat-50w").numbers),
+        "b.*": Drive.from_motor_parameters(motor_entry("maxon-ec45-flat-50w").parameters),
         "f.*": Lag(),
     }
     assert found.env.make().unwrapped.frame_skip == 2

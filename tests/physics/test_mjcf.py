@@ -22,7 +22,7 @@ from codrl_mj.disturbances import Joint
 from codrl_mj.engine import motors
 from codrl_mj.engine.families import HEAD, slot_size, user_head
 from codrl_mj.physics import MujocoPhysics, SimulationConfig
-from codrl_mj.physics.mjcf import drive, task_model
+from codrl_mj.physics.mjcf import configure_actuator, task_model
 from codrl_mj.physics.mujoco_batch import MujocoBatchPhysics
 from codrl_mj.tasks import TASKS
 from codrl_mj.user_code import asset_path
@@ -40,7 +40,7 @@ XML = """
 
 def _spec(actuator=None, max_force=None):
     spec = mujoco.MjSpec.from_string(XML)
-    drive(spec.actuator("drive"), actuator or DCMotorActuator(), max_force)
+    configure_actuator(spec.actuator("drive"), actuator or DCMotorActuator(), max_force)
     return spec
 
 
@@ -55,7 +55,7 @@ def test_every_family_comes_back_as_it_was_written_and_the_ideal_one_is_none_of_
         {} if actuator == IDEAL else {0: type(actuator)}
     )
     for one in found.values():
-        assert one.numbers == actuator.numbers
+        assert one.parameter_values == actuator.parameter_values
         assert one.arm_radius == pytest.approx(
             actuator.arm_radius, rel=1e-15
         )  # through gear = 1/arm
@@ -96,7 +96,7 @@ def test_a_motor_s_arm_and_limits_are_its_own_behind_an_actuator_of_several_outp
 
 def test_the_ideal_actuator_is_a_plain_motor_of_gear_one_whatever_was_there_before():
     spec = _spec(DCMotorActuator(Motor(arm_radius=0.2)), 3.0)
-    drive(spec.actuator("drive"), IDEAL, None)
+    configure_actuator(spec.actuator("drive"), IDEAL, None)
     model, plain = spec.compile(), mujoco.MjModel.from_xml_string(XML)
     assert (
         motors(model) == motors(plain) == motors(mujoco.MjModel.from_xml_string("<mujoco/>")) == {}
@@ -124,7 +124,7 @@ def test_motors_are_found_by_their_index_in_order():
             name=f"extra{index}", trntype=mujoco.mjtTrn.mjTRN_JOINT, target="hinge"
         )
         if index != 1:
-            drive(driver, DCMotorActuator(controller=CurrentLoop(kp=float(index + 2))), None)
+            configure_actuator(driver, DCMotorActuator(controller=CurrentLoop(kp=float(index + 2))), None)
     found = motors(spec.compile())
     assert {index: actuator.controller.kp for index, actuator in found.items()} == {
         0: 1.0,

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import pytest
 
-from codrl_mj.physics.sharing import _WORKERS, apart, new_board, share, shared
+from codrl_mj.physics.sharing import _WORKERS, cache_aligned_copy, new_board, run_shared, make_shared_kernel
 
 
 @numba.njit
@@ -25,7 +25,7 @@ def _do(first, end, lane, done, rounds):
 
 @pytest.fixture(scope="module")
 def work():
-    return shared(_do)
+    return make_shared_kernel(_do)
 
 
 class _Batch:
@@ -34,12 +34,12 @@ class _Batch:
     def __init__(self, count, threads, rounds=0):
         self.board, self.lanes = (
             new_board(),
-            [(apart(np.zeros(1, np.int64)),) for _ in range(threads)],
+            [(cache_aligned_copy(np.zeros(1, np.int64)),) for _ in range(threads)],
         )
         self.done, self.rounds = np.zeros(count, np.int64), rounds
 
     def turn(self, work, steps=1000):
-        return share(work, self.board, self.lanes, len(self.done), steps, self.done, self.rounds)
+        return run_shared(work, self.board, self.lanes, len(self.done), steps, self.done, self.rounds)
 
     @property
     def by_lane(self):

@@ -201,7 +201,7 @@ def test_bad_input_costs_one_line_and_leaves_nothing(capsys, arguments, message)
 def test_operating_points_are_laid_over_the_diagram():
     points = np.array([[800.0, 0.1], [-20.0, 2.0]])
     drive, entry = find_drive("maxon-ec45-flat-50w"), find_entry("maxon-ec45-flat-50w")
-    plot = torque_speed_diagram(drive, entry.numbers, points)
+    plot = torque_speed_diagram(drive, entry.parameters, points)
     curves = {curve.label: curve for curve in plot.curves}
     np.testing.assert_array_equal(
         np.column_stack([curves["operating points"].x, curves["operating points"].y]), points

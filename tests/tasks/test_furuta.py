@@ -161,7 +161,7 @@ def test_energy_is_kept_over_an_episode_without_damping():
 
 
 def test_its_own_actuator_is_the_motor_of_the_catalogue_at_every_door():
-    motor = Drive.of(motor_entry("quanser-qube-servo-2").numbers)
+    motor = Drive.from_motor_parameters(motor_entry("quanser-qube-servo-2").parameters)
     assert (motor.supply.voltage, motor.controller.max_current) == (18.0, 2.0)
     assert motor.motor.torque_constant * motor.controller.max_current == pytest.approx(MAX_TORQUE)
     assert EnvConfig("furuta").actuator == motor

@@ -45,7 +45,7 @@ def torque_speed_diagram(drive: Drive, numbers: Any = None, points: Any = None) 
 
     Args:
         drive: whose voltage, `max_current`, gear and friction are drawn.
-        numbers: `codrl_mj.catalogue.MotorNumbers`, for the continuous current; None where it is not
+        numbers: `codrl_mj.catalogue.MotorParameters`, for the continuous current; None where it is not
             known.
         points: shape (n, 2), operating points to lay over it: speed [rad/s] and torque [N*m] of the
             output.
@@ -348,10 +348,10 @@ def held_step(steps: Mapping[str, tuple[ActuatorModel, float, float]]) -> Plot |
     curves = []
     for name, (actuator, asked, timestep) in steps.items():
         kind: Any = type(actuator)
-        if not actuator.tracks or actuator.MOTION or not kind.State._fields or asked == 0.0:
+        if not actuator.is_torque_controlled or actuator.MOTION or not kind.State._fields or asked == 0.0:
             continue
         parameters, state = (
-            parameters_type(kind)(*actuator.numbers),
+            parameters_type(kind)(*actuator.parameter_values),
             kind.State(*[0.0] * len(kind.State._fields)),
         )
         share = [0.0]

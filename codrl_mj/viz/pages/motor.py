@@ -93,7 +93,7 @@ def _abilities(known: Mapping[str, Any], drive: Drive, entry: MotorEntry | None)
     if known["assumed"]:
         table += page.paragraph(f"{known['assumed']}.", "soft")
     try:
-        plots = page.plots([torque_speed_diagram(drive, entry and entry.numbers)])
+        plots = page.plots([torque_speed_diagram(drive, entry and entry.parameters)])
     except ValueError as error:
         plots = page.note(str(error))
     return Markup('<div class="beside">{}{}</div>').format(plots, table)

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from codrl_mj.actuators import actuator_over
+from codrl_mj.actuators import override_actuator
 from codrl_mj.evaluation import RandomPolicy
 from codrl_mj.fields import field_docs, parts
 
@@ -243,7 +243,7 @@ class Session:
             lambda: {
                 "actuator": {
                     **self.config.driven,
-                    pattern: actuator_over(self.config.driven[pattern], value),
+                    pattern: override_actuator(self.config.driven[pattern], value),
                 }
             }
         )

@@ -64,7 +64,7 @@ def test_limits_behind_a_supply_are_where_the_motor_settles():
         settled = []
         for asked, speed in itertools.product((-1e3, 1e3), speeds):
             parameters, state, torque = (
-                parameters_type(DCMotorActuator)(*actuator.numbers),
+                parameters_type(DCMotorActuator)(*actuator.parameter_values),
                 actuator.State(0.0, 0.0, 0.0),
                 0.0,
             )
