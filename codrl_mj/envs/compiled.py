@@ -210,11 +210,11 @@ def _kernels(
             steps.signals,
             steps.elapsed,
         )
-        where, last = lane.places.ctypes.data, lane.trace[len(lane.trace) - 1]
-        lane.places[OPTIONS] = steps.options.ctypes.data
+        where, last = lane.pointer_table.ctypes.data, lane.trace[len(lane.trace) - 1]
+        lane.pointer_table[OPTIONS] = steps.options.ctypes.data
         for row in range(first, end):
             load(rows, row, lane)
-            lane.places[OBSERVATION] = observations[row].ctypes.data
+            lane.pointer_table[OBSERVATION] = observations[row].ctypes.data
             reward, over, fine = step(steps.forces[row], where)
             store(rows, row, lane)
             elapsed[row] += 1
@@ -233,7 +233,7 @@ def _kernels(
         nothing, state = np.zeros(lane.trace.shape[1:]), np.empty(size)
         for row in which:
             load(rows, row, lane)
-            lane.places[OBSERVATION] = observations[row].ctypes.data
-            look(nothing, state, lane.places.ctypes.data)
+            lane.pointer_table[OBSERVATION] = observations[row].ctypes.data
+            look(nothing, state, lane.pointer_table.ctypes.data)
 
     return Kernels(step, reset, make_shared_kernel(step_some), observe_rows)
