@@ -122,7 +122,7 @@ def test_two_motors_have_two_forces_within_their_own_limits():
         ({"actuator": "lag", "physics": "analytic"}, "arm rebuilds no environment of Gymnasium's"),
         (
             {"actuator": "weak"},
-            "'weak': a variation of the paper's actuator, of which arm has none",
+            "'weak': a variation of the paper's actuator, but arm has none",
         ),
     ],
 )

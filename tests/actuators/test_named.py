@@ -263,7 +263,7 @@ BARE = dataclasses.replace(CARTPOLE, paper=(), name="bare")
             {"family": "slipped.other:Mine"},
             r"'Mine'; must be module:NAME; did you mean 'MINES'\? .*other\.py",
         ),
-        (f"{__name__}:CARTPOLE", "is neither an actuator nor a family of them"),
+        (f"{__name__}:CARTPOLE", "must be an actuator or a family of actuators"),
         (f"{__name__}:MIEN", "has no attribute 'MIEN'; must be module:NAME"),
         ("nowhere_at_all:MINE", "No module named 'nowhere_at_all'"),
         (":", "must be module:NAME"),
@@ -292,7 +292,7 @@ def test_what_describes_no_actuator_is_refused_with_the_reason(files, given, mes
 @pytest.mark.parametrize("name", ["paper", "weak", "open_loop", "over.yaml"])
 def test_a_task_without_a_papers_actuator_has_no_variations_of_it(files, name):
     with pytest.raises(
-        ValueError, match=r"actuator = '\w+': .* of which bare has none; known are current_loop"
+        ValueError, match=r"actuator = '\w+': .* but bare has none; known names: current_loop"
     ):
         resolve_actuators(name, BARE)
     assert resolve_actuators("ideal", BARE) == (IDEAL,)

@@ -356,7 +356,7 @@ def test_what_cannot_be_drawn_is_refused(make, randomize, message):
         ),
         (
             {**VOLTAGE, "randomize": {"controller.kp": Uniform(1, 2)}},
-            "the command goes past the controller",
+            "the command bypasses the controller",
         ),
         (
             {"actuator": GEARED, "randomize": {"motor.gear_ratio": Uniform(0, 1)}},

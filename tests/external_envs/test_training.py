@@ -152,7 +152,7 @@ def test_a_file_says_what_is_behind_what(tmp_path):
         ),
         (
             {"task": "HalfCheetah-v5", "actuator": "paper"},
-            "of which the environment HalfCheetah-v5 has none",
+            "but the environment HalfCheetah-v5 has none",
         ),
         ({"task": "HalfCheetah-v5", "max_episode_steps": 0}, "must be an integer >= 1"),
         ({"task": "HalfCheetah-v5", "options": {"frame_skip": {1, 2}}}, "that JSON can hold"),

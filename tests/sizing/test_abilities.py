@@ -134,7 +134,7 @@ def test_what_a_largest_current_leaves_of_torque_and_power():
         (Drive(GearMotor(), SampledLoop(max_current=3.0), Supply(5.0)), ""),
         (
             Drive(GearMotor(), SampledLoop(max_current=3.0)),
-            "assumed, for none is given: supply.voltage = 24 V",
+            "assumed, because not specified: supply.voltage = 24 V",
         ),
         (
             Drive(GearMotor(rotor_inertia=0.0), SampledLoop(), Supply(5.0)),

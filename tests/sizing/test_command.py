@@ -131,7 +131,7 @@ def test_a_file_is_written_filled_in_and_shown(capsys):
     Path("mine.toml").write_text(text)
     shown = printed(capsys, "show", "mine.toml")
     assert "mine.toml: mine\n" in shown
-    assert "assumed, for none is given: supply.voltage = 24 V, motor.rotor_inertia = 0" in shown
+    assert "assumed, because not specified: supply.voltage = 24 V, motor.rotor_inertia = 0" in shown
     assert "-0.0%" not in shown
     found = {row["name"]: row["value"] for row in read(capsys, "show", "mine.toml")["abilities"]}
     assert found["peak_torque"] == pytest.approx(38.0 * 60.0 / (2.0 * np.pi * 340.0))

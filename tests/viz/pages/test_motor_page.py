@@ -29,7 +29,7 @@ def test_what_is_assumed_stands_below_what_it_can_do():
     text = str(_abilities(explain(drive), drive, None))
     assert "at 12 V" in text
     assert (
-        "assumed, for none is given: controller.max_current = inf, motor.rotor_inertia = 0." in text
+        "assumed, because not specified: controller.max_current = inf, motor.rotor_inertia = 0." in text
     )
 
 

@@ -102,7 +102,7 @@ def test_it_says_which_loops_it_leaves_out_and_why_there_is_none():
     said = str(reports._loop([run({"lag": Lag(time_constant=0.1)})]))
     assert "lag: The delivered torque follows the desired one with a time constant" in said
     assert "There is no current loop in it." in said
-    assert "m: assumed, for none is given: supply.voltage = 24 V" in str(
+    assert "m: assumed, because not specified: supply.voltage = 24 V" in str(
         reports._loop([run({"m": Drive()})])
     )
 
