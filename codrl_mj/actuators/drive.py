@@ -380,8 +380,8 @@ class Drive(ActuatorModel):
         if share >= 2.0:
             raise UnstableError(
                 f"{text}, must be < 2; {remedy}, give the rotor its inertia (total:"
-                f" {inertia:.3g} kg*m^2), shorten the step, or pass allow_unstable=True to study it as"
-                " it is"
+                f" {inertia:.3g} kg*m^2), shorten the step, or pass allow_unstable=True to study it"
+                " as it is"
             )
         if share > 0.5:
             warnings.warn(

@@ -200,8 +200,8 @@ def resolve(actuator: Any, paper: DCMotorActuator | None, owner: str) -> Any:
         actuator = str(actuator)
     if not isinstance(actuator, str):
         raise ValueError(
-            f"actuator = {actuator!r}: must be a name ({', '.join(NAMED)}), an actuator or a mapping"
-            " of its fields"
+            f"actuator = {actuator!r}: must be a name ({', '.join(NAMED)}), an actuator or a"
+            " mapping of its fields"
         )
     if actuator == "ideal":
         return IDEAL
@@ -332,8 +332,8 @@ def override_actuator(base: ActuatorModel, changes: Mapping[str, Any]) -> Any:
         return base
     if isinstance(base, Ideal):
         raise ValueError(
-            "the ideal actuator has no motor and no controller whose fields could be set: name another"
-            " actuator, such as paper"
+            "the ideal actuator has no motor and no controller whose fields could be set: name"
+            " another actuator, such as paper"
         )
     if family != family_name(kind):
         kind = _related_family(family, kind)

@@ -51,6 +51,6 @@ class SampledLoop(Checked):
         if self.bandwidth > max_bandwidth:
             raise ValueError(
                 f"SampledLoop.bandwidth = {self.bandwidth:g}: must be <= {max_bandwidth:g} Hz at"
-                f" sample_rate = {self.sample_rate:g} Hz, where a delay of one sample leaves 4 degrees"
-                " of phase margin; lower it, or raise the sample rate"
+                f" sample_rate = {self.sample_rate:g} Hz, where a delay of one sample leaves 4"
+                " degrees of phase margin; lower it, or raise the sample rate"
             )

@@ -310,11 +310,11 @@ class ControlCommands:
     @property
     def memory(self) -> dict[str, np.ndarray]:
         """The commands on their way and the pulses to come, a live array, if there are disturbances."""
-        return {"disturbances": self._disturber.memory} if self._disturber.on else {}
+        return {"disturbances": self._disturber.memory} if self._disturber.enabled else {}
 
     def begin(self, key: float) -> None:
         """Forget everything at the start of an episode with this key of random numbers."""
-        if self._disturber.on:
+        if self._disturber.enabled:
             self._disturber.reset(np.zeros(1, dtype=int), key, self._held())
             self._data.qfrc_applied[self._dofs] = 0.0
 
@@ -331,7 +331,7 @@ class ControlCommands:
 
     def controls(self, action: Any) -> Any:
         """The environment's own action for one of `action_space`, as it arrives in a step; loads go to the joints."""
-        if (self._scales is not None or self._disturber.on) and np.shape(
+        if (self._scales is not None or self._disturber.enabled) and np.shape(
             action
         ) != self.action_space.shape:
             raise ValueError(
@@ -339,7 +339,7 @@ class ControlCommands:
             )
         if self._scales is not None:
             action = np.asarray(action, dtype=np.float64) * self._scales
-        if not self._disturber.on:
+        if not self._disturber.enabled:
             return action
         arrived = np.array(action, dtype=np.float64)
         wanted = arrived[self._controls] * self._gains

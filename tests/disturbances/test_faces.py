@@ -52,7 +52,7 @@ def test_off_is_bit_for_bit_as_without(task, physics):
     # the episodes after the first, too: nothing was drawn for a key in between
     assert_same(run(env, 60, seed=0), run(_env(task, physics=physics), 60, seed=0))
     if physics == "mujoco":
-        assert env.physics._disturber.on is False
+        assert env.physics._disturber.enabled is False
 
 
 @two_tasks

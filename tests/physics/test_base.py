@@ -69,7 +69,7 @@ def test_a_physics_without_a_model_refuses_its_fields_by_its_own_name(monkeypatc
 
     plant = SimulationConfig(TASKS["pendulum"], [IDEAL])
     said = (
-        "fields = body_mass, body_ipos: they are a MuJoCo model's, which {!r} has not; use 'mujoco'"
+        "fields = body_mass, body_ipos: only a MuJoCo model has such fields, not {!r}; use 'mujoco'"
     )
     for make, name in ((AnalyticPhysics, "analytic"), (Mine, "Mine")):
         with pytest.raises(ValueError, match=said.format(name)):

@@ -186,7 +186,7 @@ def test_its_own_actuator_is_the_motor_of_the_catalogue_at_every_door():
         ),
         (
             {"physics": "analytic"},
-            r"the Drive's armature = 4e-06: the equations have no place for it",
+            r"the Drive's armature = 4e-06: the equations have no term for it",
         ),
     ],
 )
