@@ -92,7 +92,7 @@ class Randomization:
         self.in_model = (*of_model, *added)
         """The paths that the model, besides its motors' parameters, depends on."""
         self.variation = (
-            Variation(model, of_model, list(motors), mounting=bool(added))
+            Variation(model, of_model, list(motors), vary_additions=bool(added))
             if self.in_model
             else None
         )

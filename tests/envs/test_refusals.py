@@ -105,7 +105,7 @@ VOLTAGE = {"action": "voltage", "levels": (-1.0, 1.0)}
         ),
         ({"actuator": {"supply": {"resistance": 9.0}}}, "supply.resistance = 9: must be < "),
         ({"physics": "analytic", "joint": {"damping": 0.1}}, "use physics='mujoco'"),
-        ({"physics": "analytic", "joint": {"friction": 0.1}}, "no place for it"),
+        ({"physics": "analytic", "joint": {"friction": 0.1}}, "no term for it"),
         ({"physics": "analytic", "joint": {"armature": 0.1}}, "joint.armature = 0.1"),
         (
             {"render_mode": "rgb_array", "camera": "fixd"},

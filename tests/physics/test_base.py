@@ -75,5 +75,5 @@ def test_a_physics_without_a_model_refuses_its_fields_by_its_own_name(monkeypatc
         with pytest.raises(ValueError, match=said.format(name)):
             make(plant).set_model(FIELDS)
     monkeypatch.setitem(PHYSICS, "mine", Mine)
-    with pytest.raises(ValueError, match="which 'mine' has not"):
+    with pytest.raises(ValueError, match="fields, not 'mine'"):
         Mine(plant).set_model(FIELDS)
