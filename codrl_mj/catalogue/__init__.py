@@ -1,4 +1,4 @@
-"""Off-the-shelf motors: datasheets as they are printed, the numbers that follow from them, and a catalogue."""
+"""Off-the-shelf motors: printed datasheets, the parameters derived from them, and a catalogue."""
 
 from codrl_mj.catalogue.datasheet import (
     Datasheet,

@@ -511,11 +511,11 @@ def test_without_strictness_a_contradiction_is_only_listed():
 
 def test_the_rules_speak_of_fields():
     for quantity, formula in (*derivation.RULES, *(check[:2] for check in derivation.CHECKS)):
-        assert {quantity, *derivation.compiled(formula).co_names} <= {
+        assert {quantity, *derivation.compile_formula(formula).co_names} <= {
             *KINDS,
             *derivation.AT_OUTPUT,
         }, formula
-    first = derivation.compiled(derivation.RULES[0][1])
+    first = derivation.compile_formula(derivation.RULES[0][1])
     assert first.co_names == ("nominal_voltage", "stall_current")
     assert eval(first, {}, {"nominal_voltage": 12.0, "stall_current": 133.0}) == 12.0 / 133.0
 

@@ -158,7 +158,7 @@ def test_a_file_of_ones_own_need_not_say_who_makes_it_and_its_numbers_are_looked
             ),
         ),
         ("resistance =", "resistanse =", "did you mean resistance?"),
-        ('= "the rest"', '= ["resistance"]', "not one for torque_constant"),
+        ('= "the rest"', '= ["resistance"]', "none for torque_constant"),
         ('= "the rest"', "= 5", "must be a list of entries"),
         ('= "the rest"', "= [5]", "must be a list of entries"),
         ('kind = "brushed"', "kind = 5", "kind = 5: must be text"),
@@ -171,7 +171,7 @@ def test_a_file_of_ones_own_need_not_say_who_makes_it_and_its_numbers_are_looked
             "unknown entry estimated.rotor_inertia",
         ),
         ("[estimated]\ninductance =", "estimated =", "unknown datasheet field estimated"),
-        ("[datasheet]", "[datasheet", "is no TOML file"),
+        ("[datasheet]", "[datasheet", "is not a readable TOML file"),
     ],
 )
 def test_a_file_that_lacks_something_is_refused(tmp_path, old, new, words):

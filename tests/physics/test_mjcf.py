@@ -181,7 +181,7 @@ def test_user_data_too_short_for_a_motor_is_refused():
     )
     with pytest.raises(
         ValueError,
-        match=r"drive: user = .*: a Actuator needs 3 numbers and resistance, inductance, ",
+        match=r"drive: user = .*: a DCMotorActuator needs 3 numbers and resistance, inductance, ",
     ):
         motors(mujoco.MjModel.from_xml_string(short))
 

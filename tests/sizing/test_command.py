@@ -117,7 +117,7 @@ def test_show_takes_a_datasheet_of_one_s_own_and_any_drive(capsys):
 def test_a_file_is_written_filled_in_and_shown(capsys):
     printed(capsys, "new", "mine.toml")
     assert main(["motor", "new", "mine.toml"]) == 2
-    assert "mine.toml: is there already" in capsys.readouterr().err
+    assert "mine.toml: already exists" in capsys.readouterr().err
     assert main(["motor", "show", "mine.toml"]) == 2
     assert "datasheet.resistance is not printed" in capsys.readouterr().err
     text = Path("mine.toml").read_text()
