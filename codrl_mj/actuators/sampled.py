@@ -62,9 +62,8 @@ def solve_designed_loop(
 
     The arguments are x = R*T/L, y = wc*T and `lost` = 1 - e; v lies between `low` and `high`.
 
-    Returns:
-        i, c, the sum of i over the samples' starts [A], the sum of v times the mean current of each
-            sample [A^2], and the number of saturated samples.
+    The result is i, c, the sum of i over the samples' starts [A], the sum of v times the mean
+    current of each sample [A^2], and the number of saturated samples.
     """
     # The names follow the module's docstring: `step` is P, `gain` G, `rest` e and `rising` 1 - m.
     step = _DEFAULT_STEP if y == _DEFAULT_ANGLE else -math.expm1(-y)
@@ -155,8 +154,8 @@ def run_samples(
     and `lasting` is m. A delayed loop applies the voltage of the previous sample, `pending`.
     Back-calculation has the tracking time kp/ki.
 
-    Returns:
-        i [A], the integral [V], the pending voltage [V], and then as `solve_designed_loop`.
+    The result is i [A], the integral [V], the pending voltage [V], and then the last three entries
+    of `solve_designed_loop`.
     """
     total, drawn, saturated, gain = 0.0, 0.0, 0, kp + ki
     tracking = ki / gain if gain > 0.0 else 0.0

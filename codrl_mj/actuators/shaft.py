@@ -288,8 +288,7 @@ def advance_motor(
     share of it that the back-EMF removes in a time h; above 1 it oscillates, above 2 it grows. So
     the time is divided into 2*c pieces, with a new speed for each.
 
-    Returns:
-        Winding and speed [rad/s] afterwards, and the averages.
+    The result is the winding and the speed [rad/s] afterwards, and the averages.
     """
     # Viscous friction belongs to the joint, and `external_acceleration` includes it at the initial
     # speed. So only the change since then is added.

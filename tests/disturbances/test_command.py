@@ -21,7 +21,7 @@ commands = st.lists(st.floats(-10, 10), min_size=1, max_size=30)
 def _arrivals(disturbances, timestep, given_commands, limit=10.0):
     disturber = Disturber(disturbances, timestep, np.array([limit]), 1)
     return np.array(
-        [disturber.disturbed(np.array([[command]]))[0][0, 0] for command in given_commands]
+        [disturber.disturb_commands(np.array([[command]]))[0][0, 0] for command in given_commands]
     )
 
 

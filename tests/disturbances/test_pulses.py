@@ -20,7 +20,7 @@ def _loads(timestep, steps, simulations, seed=0):
     disturber.reset(np.arange(simulations), keys)
     loads, starts = [], []
     for _ in range(steps):
-        loads.append(disturber.disturbed(np.zeros((simulations, 1)))[1][:, 0])
+        loads.append(disturber.disturb_commands(np.zeros((simulations, 1)))[1][:, 0])
         starts.append(disturber.memory[:, -4 + START].copy())
     return np.array(loads), np.array(starts)
 
@@ -66,7 +66,7 @@ def test_the_impulse_of_a_pulse_is_its_force_times_its_duration():
         Disturbances(pulse_force=3.0, pulse_duration=0.07, pulse_interval=40.0), 0.02, np.ones(1), 1
     )
     disturber.reset(np.zeros(1, np.int64), 5.0)
-    loads = np.array([disturber.disturbed(np.zeros((1, 1)))[1][0, 0] for _ in range(4000)])
+    loads = np.array([disturber.disturb_commands(np.zeros((1, 1)))[1][0, 0] for _ in range(4000)])
     (first,) = np.flatnonzero(np.diff((loads != 0).astype(int)) == 1)[:1]
     assert abs(loads[first : first + 8].sum() * 0.02) == pytest.approx(3.0 * 0.07, rel=1e-9)
 

@@ -179,7 +179,7 @@ def test_its_own_actuator_is_the_motor_of_the_catalogue_at_every_door():
         *(
             (
                 {"actuator": name},
-                f"'{name}': a variation of the paper's actuator, of which furuta has none",
+                f"'{name}': a variation of the paper's actuator, but furuta has none",
             )
             for name in NAMED
             if name != "ideal"
