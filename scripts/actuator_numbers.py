@@ -99,7 +99,7 @@ def _on_a_slide(task: str) -> bool:
 
 def motor_row(name: str) -> dict[str, Any]:
     """Measure a motor of the catalogue, cold, at its nominal voltage (or 24 V) and its own gear."""
-    drive, numbers = find_drive(name), motor_entry(name).numbers
+    drive, numbers = find_drive(name), motor_entry(name).parameters
     loop = design(drive)
     # Stall and no load are properties of the motor, so the controller does not limit the current.
     cold = dataclasses.replace(drive.motor, **NO_HEATING)
@@ -200,7 +200,7 @@ def _motor_line(row: dict[str, str]) -> list[str]:
     entry = motor_entry(row["motor"])
     measured = ("stall_torque", "no_load_speed", "continuous_torque")
     return [
-        f"`{row['motor']}`" + (" t" if entry.numbers.thermal_resistance else ""),
+        f"`{row['motor']}`" + (" t" if entry.parameters.thermal_resistance else ""),
         *(_number(row[name]) for name in ("voltage", "gear_ratio", *measured)),
     ]
 

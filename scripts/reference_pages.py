@@ -51,7 +51,7 @@ MODULE_NAMES = {
     "external_envs": (
         "building.motors_added",
         "dm_control.make_dm_control",
-        "world.GymnasiumEnvSource",
+        "gymnasium_source.GymnasiumEnvSource",
     ),
     "viz.pages": (
         *(

@@ -285,7 +285,7 @@ class Position(ActuatorModel):
     Signals: ClassVar[type] = Seen
     advance: ClassVar = staticmethod(advance)
     MOTION: ClassVar[bool] = True
-    tracks: ClassVar[bool] = False
+    is_torque_controlled: ClassVar[bool] = False
     gain: float = real(5.0, above=0.0)
 
 

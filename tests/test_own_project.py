@@ -71,7 +71,7 @@ def register_variation(task=arm.TASK, **fields):
 def test_the_family_runs_in_the_engine_as_in_python():
     env = make_arm(series_elastic.SOFT)
     parameters = codrl_mj.actuators.parameters_type(series_elastic.SeriesElastic)(
-        *series_elastic.SOFT.numbers
+        *series_elastic.SOFT.parameter_values
     )
     states = [series_elastic.State(0.0, 0.0)] * 2
     for action in actions(20, 1)[:, 0]:
@@ -122,7 +122,7 @@ def test_two_motors_have_two_forces_within_their_own_limits():
         ({"actuator": "lag", "physics": "analytic"}, "arm rebuilds no environment of Gymnasium's"),
         (
             {"actuator": "weak"},
-            "'weak': a variation of the paper's actuator, of which arm has none",
+            "'weak': a variation of the paper's actuator, but arm has none",
         ),
     ],
 )

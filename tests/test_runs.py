@@ -12,8 +12,8 @@ from codrl_mj.actuators import (
     CurrentLoop,
     DCMotorActuator,
     Motor,
-    actuator_over,
     mapping_of,
+    override_actuator,
     resolve,
 )
 from codrl_mj.cli import main
@@ -30,8 +30,8 @@ PROGRESS = "steps,episodes,mean_return,steps_per_second,seconds\n"
 UNITS = {"returns": "reward", "tracking_rms": "N*m", "peak_voltage": "V"}
 
 
-GEARED = actuator_over(resolve("kraken-x60", None, "nobody"), {"motor": {"gear_ratio": 70.3}})
-OWN = actuator_over(GEARED, {"motor": {"resistance": 0.5}})
+GEARED = override_actuator(resolve("kraken-x60", None, "nobody"), {"motor": {"gear_ratio": 70.3}})
+OWN = override_actuator(GEARED, {"motor": {"resistance": 0.5}})
 
 
 def make_run(

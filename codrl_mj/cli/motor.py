@@ -94,7 +94,7 @@ class List:
     def run(self) -> tuple[int, Any]:
         """Print the table."""
         from codrl_mj.catalogue.datasheet import KINDS
-        from codrl_mj.catalogue.derivation import OTHER_NAMES
+        from codrl_mj.catalogue.derivation import PRINTED_NAMES
         from codrl_mj.sizing import catalogue_rows
         from codrl_mj.sizing.abilities import ABILITY_UNITS
 
@@ -118,7 +118,7 @@ class List:
         )
         print_text("at: nominal voltage. –: not on the datasheet; the voltage is then 24 V.")
         print("codrl-mj motor show NAME gives the source of each number")
-        kinds = {name: KINDS.get(OTHER_NAMES.get(name, name)) for name in rows[0]}
+        kinds = {name: KINDS.get(PRINTED_NAMES.get(name, name)) for name in rows[0]}
         units = ABILITY_UNITS | {
             name: kind.unit for name, kind in kinds.items() if kind is not None
         }
@@ -154,7 +154,7 @@ class Show:
         if self.out is not None:
             from codrl_mj.viz.pages.diagrams import torque_speed_diagram
 
-            figure = torque_speed_diagram(drive, entry and entry.numbers)
+            figure = torque_speed_diagram(drive, entry and entry.parameters)
         _print_explanation(
             f"{self.name}: {entry.title}" if entry else "", drive.voltage_limit, explanation
         )

@@ -78,7 +78,10 @@ class Feasible:
             self.name, self.gear_ratio, voltage=self.voltage, max_current=self.max_current
         )
         entry = find_entry(self.name)
-        continuous, unknown = entry.numbers.continuous_current if entry else None, uncounted(entry)
+        continuous, unknown = (
+            entry.parameters.continuous_current if entry else None,
+            uncounted(entry),
+        )
         demand = demand_of(self.task_or_run, trust=self.trust, motor=self.motor)
         judgment = feasibility(drive, demand, continuous)
         title = (
@@ -400,4 +403,6 @@ def _draw(drive: Any, demand: Any, name: str, path: Path) -> None:
     # it to the gear's output.
     torque = radius * (demand.torque + drive.additions.armature * demand.acceleration)
     points = np.column_stack([demand.speed / radius, torque])
-    save_plot(torque_speed_diagram(drive, None if entry is None else entry.numbers, points), path)
+    save_plot(
+        torque_speed_diagram(drive, None if entry is None else entry.parameters, points), path
+    )

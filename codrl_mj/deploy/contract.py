@@ -23,7 +23,7 @@ from codrl_mj.deploy.loops import loop_parameters
 from codrl_mj.deploy.network import extract_network
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
-from codrl_mj.fields import check_names, did_you_mean, differing
+from codrl_mj.fields import check_names, did_you_mean, differences
 from codrl_mj.runs.files import read_json, sealed, write_json
 from codrl_mj.runs.policies import Policy
 
@@ -309,8 +309,8 @@ class Contract(Interface):
                 )
             actual = _with_digest(mapping_of(actuators[name]))
             if actual["sha256"] != trained["sha256"]:
-                differences = differing(trained["fields"] or {}, actual["fields"] or {})
-                field, (expected, value) = next(iter(differences.items()), ("family", (None, None)))
+                changed = differences(trained["fields"] or {}, actual["fields"] or {})
+                field, (expected, value) = next(iter(changed.items()), ("family", (None, None)))
                 raise ValueError(
                     f"actuator {name!r}: {field} = {value}, must be {expected}, with which the"
                     " policy was trained; evaluate the policy with yours, or train with it"

@@ -68,7 +68,7 @@ class Episode:
             one if self.command == "force" else one.commands()[self.command].actuator
             for one in self.actuators
         )
-        return tuple(one.tracks for one in asked)
+        return tuple(one.is_torque_controlled for one in asked)
 
     @property
     def total(self) -> float:

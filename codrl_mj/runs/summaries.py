@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from codrl_mj.actuators import actuator_from_mapping, allow_imports, name_of
+from codrl_mj.actuators import actuator_from_mapping, allow_imports, display_name
 from codrl_mj.envs.sources import pattern_mapping
-from codrl_mj.fields import leaves
+from codrl_mj.fields import flatten
 from codrl_mj.runs import (
     BEST,
     CONFIG,
@@ -189,7 +189,7 @@ def read_run(path: Path, name: str | None = None) -> RunSummary:
         seconds=uninterrupted if seconds is None else seconds,
         modified=_modified(path),
         evaluation=evaluation,
-        configuration=leaves(
+        configuration=flatten(
             {
                 **config,
                 **{
@@ -286,7 +286,7 @@ def _actuator_of(env: Mapping[str, Any], task: str | None, labels: Any) -> str |
             continue
         try:
             with allow_imports(False):
-                names.append(name_of(actuator_from_mapping(actuator), paper))
+                names.append(display_name(actuator_from_mapping(actuator), paper))
         except (
             ValueError,
             TypeError,

@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from codrl_mj.actuators import Drive, GearMotor, Servo, ServoLoop, actuator_over, resolve
-from codrl_mj.catalogue import MotorEntry, MotorNumbers, motor_entry, motor_names
+from codrl_mj.actuators import Drive, GearMotor, Servo, ServoLoop, override_actuator, resolve
+from codrl_mj.catalogue import MotorEntry, MotorParameters, motor_entry, motor_names
 from codrl_mj.catalogue.datasheet import KINDS
-from codrl_mj.catalogue.derivation import OTHER_NAMES
+from codrl_mj.catalogue.derivation import PRINTED_NAMES
 from codrl_mj.fields import check_names
 
 
@@ -59,7 +59,7 @@ def find_drive(
     }
     base = resolve(name, None, "a motor on its own")
     if isinstance(base, Servo):
-        base = actuator_over(base, {"family": Drive.family})
+        base = override_actuator(base, {"family": Drive.family})
     if type(base) is not Drive:
         raise ValueError(
             f"motor = {name!r}: no motor behind a drive, but the actuator family {base.family};"
@@ -70,7 +70,7 @@ def find_drive(
         part: {key: value for key, value in to.items() if value is not None}
         for part, to in changes.items()
     }
-    return actuator_over(base, given)
+    return override_actuator(base, given)
 
 
 def find_entry(name: Any) -> MotorEntry | None:
@@ -109,7 +109,7 @@ ABILITY_UNITS = dict(
 
 def abilities(drive: Drive) -> Abilities:
     """What a drive can do."""
-    motor, resistance = drive.motor, drive.motor.resistance + drive.sag
+    motor, resistance = drive.motor, drive.motor.resistance + drive.supply_resistance
     passed = motor.torque_constant * motor.gear_efficiency  # [N*m/A]
     per_torque = resistance / passed  # [V/(N*m)]
     slope = motor.back_emf_constant + per_torque * motor.viscous_friction
@@ -136,7 +136,11 @@ def abilities(drive: Drive) -> Abilities:
 
 def most_power(drive: Drive) -> float:
     """The most mechanical power [W], i (V - R i) kT/kE, R of winding and supply; infinite without back-EMF."""
-    motor, limit, resistance = drive.motor, drive.voltage_limit, drive.motor.resistance + drive.sag
+    motor, limit, resistance = (
+        drive.motor,
+        drive.voltage_limit,
+        drive.motor.resistance + drive.supply_resistance,
+    )
     current = min(limit / resistance / 2, drive.controller.max_current)
     power = current * (limit - resistance * current) * motor.torque_constant
     return power / motor.back_emf_constant if motor.back_emf_constant else math.inf
@@ -190,7 +194,7 @@ def torque_limits(
     """
     speeds = np.asarray(speeds, dtype=float)
     back_emf = drive.motor.back_emf_constant * drive.motor.gear_ratio * speeds
-    winding = drive.motor.resistance, drive.voltage_limit, drive.sag
+    winding = drive.motor.resistance, drive.voltage_limit, drive.supply_resistance
     lowest, highest = -highest_current(*winding, -back_emf), highest_current(*winding, back_emf)
     low, high = (np.clip(bound, lowest, highest) for bound in (-current, current))
     return _at_output(drive.motor, low, speeds), _at_output(drive.motor, high, speeds)
@@ -250,7 +254,7 @@ def catalogue_rows(sort: str = "name") -> list[dict[str, Any]]:
     check_names([sort], COLUMNS, "column")
     rows = []
     for entry in map(motor_entry, motor_names()):
-        numbers, drive = entry.numbers, Drive.of(entry.numbers)
+        numbers, drive = entry.parameters, Drive.from_motor_parameters(entry.parameters)
         can = abilities(drive)._asdict()
         known = {name: getattr(numbers, name) for name in COLUMNS[2:8]}
         known |= {name: value if math.isfinite(value) else None for name, value in can.items()}
@@ -307,26 +311,26 @@ def explain(
     }
     if entry is None:
         return found
-    torque = continuous_torque(drive, entry.numbers.continuous_current)
+    torque = continuous_torque(drive, entry.parameters.continuous_current)
     found["abilities"].insert(2, _value("continuous_torque", torque, "N*m"))
     names = [
         field.name
-        for field in dataclasses.fields(MotorNumbers)
+        for field in dataclasses.fields(MotorParameters)
         if field.name not in ("derived", "disagreements")
     ]
-    derived = entry.numbers.derived
+    derived = entry.parameters.derived
     sources = {name: _sources(derived[name], entry) for name in names if name in derived}
     cited = list(dict.fromkeys(source for several in sources.values() for source in several))
     rounded = [
-        one.quantity for one in entry.numbers.disagreements if abs(one.difference) < _ROUNDED
+        one.quantity for one in entry.parameters.disagreements if abs(one.difference) < _ROUNDED
     ]
-    told = [str(one) for one in entry.numbers.disagreements if one.quantity not in rounded]
+    told = [str(one) for one in entry.parameters.disagreements if one.quantity not in rounded]
     if rounded:
         told.append(f"less than {_ROUNDED:.0%}, by rounding: {', '.join(rounded)}")
     return found | {
         **{name: getattr(entry, name) for name in ("manufacturer", "product", "kind")},
         "numbers": [
-            _value(name, getattr(entry.numbers, name), KINDS[OTHER_NAMES.get(name, name)].unit)
+            _value(name, getattr(entry.parameters, name), KINDS[PRINTED_NAMES.get(name, name)].unit)
             | {
                 "how": derived[name],
                 "sources": own,
@@ -355,7 +359,7 @@ def _value(name: str, value: Any, unit: str) -> dict[str, Any]:
 
 
 def _sources(sentence: str, entry: MotorEntry) -> list[str]:
-    """Where the printed values that a sentence of `MotorNumbers.derived` names were found."""
+    """Where the printed values that a sentence of `MotorParameters.derived` names were found."""
     known = (
         entry.sources.get(word) for word in re.findall(r"\w+", sentence.replace("_at_output", ""))
     )

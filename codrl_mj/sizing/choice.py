@@ -82,7 +82,9 @@ def uncounted(entry: MotorEntry | None) -> tuple[str, ...]:
     """What a motor's datasheet leaves open, and is not counted; of a drive without one that is all of its heat."""
     if entry is None:
         return ("continuous current",)
-    return tuple(name.replace("_", " ") for name in _WANTED if getattr(entry.numbers, name) is None)
+    return tuple(
+        name.replace("_", " ") for name in _WANTED if getattr(entry.parameters, name) is None
+    )
 
 
 def choose(
@@ -120,7 +122,7 @@ def choose(
     choices = []
     for name in motor_names() if motors is None else motors:
         entry = find_entry(name)
-        continuous = entry.numbers.continuous_current if entry else None
+        continuous = entry.parameters.continuous_current if entry else None
         for gear in gears or (None,):
             drive = find_drive(name, gear, voltage=voltage, max_current=max_current)
             fixed = gear is not None or (drive.motor.gear_ratio != 1.0 and not demand.linear)

@@ -65,7 +65,8 @@ def operation(demand: Demand, drive: Drive) -> Operation:
         torque=torque,
         speed=speed,
         current=current,
-        voltage=np.maximum(np.abs(terminal), np.abs(changing)) + drive.sag * np.abs(current),
+        voltage=np.maximum(np.abs(terminal), np.abs(changing))
+        + drive.supply_resistance * np.abs(current),
         rms_current=math.sqrt(square / float(demand.duration.sum())),
         copper_loss=motor.resistance * square / demand.episodes,
         energy_drawn=float(np.maximum(power, 0.0) @ demand.duration) / demand.episodes,
@@ -300,7 +301,7 @@ def _conditions(
         yield from _taken(drive, demand, asked)
     power = demand.torque * demand.speed
     driving = np.where(power >= 0.0, np.abs(demand.torque), 0.0)
-    current = min(limit / (motor.resistance + drive.sag), most)
+    current = min(limit / (motor.resistance + drive.supply_resistance), most)
     still = (
         motor.torque_constant * motor.gear_efficiency * current / drive.arm_radius
         - drive.additions.friction
@@ -319,7 +320,7 @@ def _conditions(
         torque * speed * motor.back_emf_constant > 0.0
     ):  # what the largest power takes at any gear [V]
         least = 2.0 * float(best_ratio(torque, speed, motor)) * motor.back_emf_constant * speed
-        least *= math.sqrt(1.0 + drive.sag / motor.resistance)
+        least *= math.sqrt(1.0 + drive.supply_resistance / motor.resistance)
     needed = float(power.max(initial=0.0)) / motor.gear_efficiency
     remedy = (
         f"no gear helps: raise the supply to {least:.4g} V and the largest current, or take a"

@@ -193,7 +193,7 @@ def respond(
         right = {"substeps": 1, "current_bias": 0.0, "current_noise": 0.0}
         one = one.replaced({f"controller.{name}": value for name, value in right.items()})
     family: Any = type(one)
-    parameters, rows = parameters_type(family)(*one.numbers), []
+    parameters, rows = parameters_type(family)(*one.parameter_values), []
     for reference in references:
         before = state.current
         torque = one.motor.torque_constant * float(reference)

@@ -47,7 +47,9 @@ class Swing(NamedTuple):
         """
         motor, ratio, added = drive.motor, 1.0 / drive.arm_radius, drive.additions
         back_emf = ratio * motor.back_emf_constant * np.asarray(speed)
-        current = highest_current(motor.resistance, drive.voltage_limit, drive.sag, back_emf)
+        current = highest_current(
+            motor.resistance, drive.voltage_limit, drive.supply_resistance, back_emf
+        )
         current = np.minimum(current, drive.controller.max_current)
         torque = np.minimum(
             self.largest, ratio * motor.torque_constant * motor.gear_efficiency * current
@@ -105,7 +107,12 @@ def least_voltage(swing: Swing, drive: Drive, energy: Callable[[Swing, Drive], f
     """The supply [V] from which `least_pumped` or `least_gain` is positive; infinite where no supply makes it so."""
 
     def enough(voltage: float) -> bool:
-        return energy(swing, dataclasses.replace(drive, supply=Supply(voltage, drive.sag))) > 0.0
+        return (
+            energy(
+                swing, dataclasses.replace(drive, supply=Supply(voltage, drive.supply_resistance))
+            )
+            > 0.0
+        )
 
     low, high = 0.0, 1.0
     while not enough(high):

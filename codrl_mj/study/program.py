@@ -37,7 +37,7 @@ class Program(Checked, abc.ABC):
     """Folder of the run folders."""
     out: Path = Path("docs/results")
     """Folder for the page, its figures and its tables."""
-    seeds: int = integer(5, least=1)
+    seeds: int = integer(5, minimum=1)
     """Training runs of each kind, with seeds from 0."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = Workers()
     accept_changes: bool = False

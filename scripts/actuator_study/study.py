@@ -27,11 +27,11 @@ class ActuatorStudy(Program):
     """Folder of the run folders."""
     tasks: tuple[str, ...] = tuple(SECONDS)
     """Tasks."""
-    seeds: int = integer(20, least=1)
+    seeds: int = integer(20, minimum=1)
     """Training runs of every arm, with seeds from 0."""
-    episodes: int = integer(50, least=1)
+    episodes: int = integer(50, minimum=1)
     """Test episodes of every policy."""
-    total_steps: int | None = integer(None, least=1)
+    total_steps: int | None = integer(None, minimum=1)
     """Environment steps of every training, for quick trials; None: the agents' own budgets."""
 
     def __post_init__(self) -> None:

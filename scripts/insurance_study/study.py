@@ -23,11 +23,11 @@ class InsuranceStudy(Program):
     """Folder of the run folders."""
     tasks: tuple[str, ...] = TASKS
     """Tasks."""
-    seeds: int = integer(20, least=1)
+    seeds: int = integer(20, minimum=1)
     """Training runs of every arm, with seeds from 0."""
-    first_seed: int = integer(0, least=0)
+    first_seed: int = integer(0, minimum=0)
     """First of these seeds; the pilot's is 1000."""
-    episodes: int = integer(50, least=1)
+    episodes: int = integer(50, minimum=1)
     """Test episodes of every policy."""
     new_only: bool = False
     """Skip tests of policies of the first study's arms, which would have to be trained again."""

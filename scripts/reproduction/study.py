@@ -44,11 +44,11 @@ class Reproduction(Program):
     """Settings of the agents: as printed in the paper, and repaired where these do not learn."""
     root: Path = Path("runs/paper")
     """Folder of the run folders."""
-    sarsa_seeds: int = integer(30, least=1)
+    sarsa_seeds: int = integer(30, minimum=1)
     """Training runs of each kind of SARSA (mountain_car), which take seconds."""
-    episodes: int | None = integer(None, least=1)
+    episodes: int | None = integer(None, minimum=1)
     """Maximum number of training episodes, for quick trials; default: the paper's budgets."""
-    test_episodes: int = integer(100, least=1)
+    test_episodes: int = integer(100, minimum=1)
     """Test episodes of each policy."""
     mesh: tyro.conf.Suppress[Mesh] = Mesh()
     """Mesh of value iteration."""

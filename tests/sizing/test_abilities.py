@@ -24,8 +24,11 @@ from codrl_mj.sizing import (
 @pytest.mark.parametrize("name", motor_names())
 def test_stall_and_no_load_are_what_the_datasheet_prints(name):
     entry = motor_entry(name)
-    can, printed = abilities(Drive.of(entry.numbers)), entry.datasheet.readings()
-    ratio = entry.numbers.gear_ratio
+    can, printed = (
+        abilities(Drive.from_motor_parameters(entry.parameters)),
+        entry.datasheet.readings(),
+    )
+    ratio = entry.parameters.gear_ratio
     for field, ours in (("stall_torque", can.stall_torque), ("no_load_speed", can.no_load_speed)):
         if field in printed:
             at_motor = printed[field].shaft == "motor"
@@ -134,7 +137,7 @@ def test_what_a_largest_current_leaves_of_torque_and_power():
         (Drive(GearMotor(), SampledLoop(max_current=3.0), Supply(5.0)), ""),
         (
             Drive(GearMotor(), SampledLoop(max_current=3.0)),
-            "assumed, for none is given: supply.voltage = 24 V",
+            "assumed, because not specified: supply.voltage = 24 V",
         ),
         (
             Drive(GearMotor(rotor_inertia=0.0), SampledLoop(), Supply(5.0)),
@@ -217,16 +220,16 @@ def test_the_catalogue_in_rows_is_sorted_with_what_is_not_known_last():
 @pytest.mark.parametrize("name", motor_names())
 def test_every_number_is_explained(name):
     entry = motor_entry(name)
-    found = explain(Drive.of(entry.numbers), entry)
+    found = explain(Drive.from_motor_parameters(entry.parameters), entry)
     shown = {row["name"]: row for row in found["numbers"]}
-    fields = {field.name for field in dataclasses.fields(entry.numbers)} - {
+    fields = {field.name for field in dataclasses.fields(entry.parameters)} - {
         "derived",
         "disagreements",
     }
     assert shown.keys() | set(found["unknown"]) == fields
     assert shown["inductance"]["unit"] == "H"
     for field, row in shown.items():
-        assert row["how"] == entry.numbers.derived[field]
+        assert row["how"] == entry.parameters.derived[field]
         if (
             "printed" in row["how"]
             and not row["how"].endswith("is printed")
@@ -236,9 +239,9 @@ def test_every_number_is_explained(name):
     told = [
         one for one in found["disagreements"] if not one.startswith("less than 1%, by rounding: ")
     ]
-    large = [one for one in entry.numbers.disagreements if abs(one.difference) >= 0.01]
+    large = [one for one in entry.parameters.disagreements if abs(one.difference) >= 0.01]
     small = ", ".join(
-        one.quantity for one in entry.numbers.disagreements if abs(one.difference) < 0.01
+        one.quantity for one in entry.parameters.disagreements if abs(one.difference) < 0.01
     )
     assert told == list(map(str, large))
     assert found["disagreements"][len(told) :] == (

@@ -117,7 +117,7 @@ def test_show_takes_a_datasheet_of_one_s_own_and_any_drive(capsys):
 def test_a_file_is_written_filled_in_and_shown(capsys):
     printed(capsys, "new", "mine.toml")
     assert main(["motor", "new", "mine.toml"]) == 2
-    assert "mine.toml: is there already" in capsys.readouterr().err
+    assert "mine.toml: already exists" in capsys.readouterr().err
     assert main(["motor", "show", "mine.toml"]) == 2
     assert "datasheet.resistance is not printed" in capsys.readouterr().err
     text = Path("mine.toml").read_text()
@@ -131,7 +131,7 @@ def test_a_file_is_written_filled_in_and_shown(capsys):
     Path("mine.toml").write_text(text)
     shown = printed(capsys, "show", "mine.toml")
     assert "mine.toml: mine\n" in shown
-    assert "assumed, for none is given: supply.voltage = 24 V, motor.rotor_inertia = 0" in shown
+    assert "assumed, because not specified: supply.voltage = 24 V, motor.rotor_inertia = 0" in shown
     assert "-0.0%" not in shown
     found = {row["name"]: row["value"] for row in read(capsys, "show", "mine.toml")["abilities"]}
     assert found["peak_torque"] == pytest.approx(38.0 * 60.0 / (2.0 * np.pi * 340.0))
@@ -201,7 +201,7 @@ def test_bad_input_costs_one_line_and_leaves_nothing(capsys, arguments, message)
 def test_operating_points_are_laid_over_the_diagram():
     points = np.array([[800.0, 0.1], [-20.0, 2.0]])
     drive, entry = find_drive("maxon-ec45-flat-50w"), find_entry("maxon-ec45-flat-50w")
-    plot = torque_speed_diagram(drive, entry.numbers, points)
+    plot = torque_speed_diagram(drive, entry.parameters, points)
     curves = {curve.label: curve for curve in plot.curves}
     np.testing.assert_array_equal(
         np.column_stack([curves["operating points"].x, curves["operating points"].y]), points

@@ -261,7 +261,7 @@ def test_the_first_choice_delivers_what_was_asked(pendulum):
         Drive.State(*[0.0] * len(Drive.State._fields)),
         [],
     )
-    parameters = parameters_type(family)(*first.drive.numbers)
+    parameters = parameters_type(family)(*first.drive.parameter_values)
     for torque, speed in zip(asked.torque, asked.speed, strict=True):
         state, made, _ = Drive.advance(
             parameters, 0.05, state, Inputs(torque, 0.0, speed, 0.0, 0.0)

@@ -611,4 +611,4 @@ def test_what_is_assumed_of_a_motor_is_said(file, capsys):
         )
         == 0
     )
-    assert "assumed, for none is given: controller.max_current = inf" in capsys.readouterr().out
+    assert "assumed, because not specified: controller.max_current = inf" in capsys.readouterr().out

@@ -162,7 +162,7 @@ def test_energy_is_conserved_without_damping():
 
 
 def test_the_default_actuator_is_the_motor_of_the_catalog():
-    motor = Drive.of(motor_entry("quanser-qube-servo-2").numbers)
+    motor = Drive.from_motor_parameters(motor_entry("quanser-qube-servo-2").parameters)
     assert (motor.supply.voltage, motor.controller.max_current) == (18.0, 2.0)
     assert motor.motor.torque_constant * motor.controller.max_current == pytest.approx(MAX_TORQUE)
     assert EnvConfig("furuta").actuator == motor
@@ -180,14 +180,14 @@ def test_the_default_actuator_is_the_motor_of_the_catalog():
         *(
             (
                 {"actuator": name},
-                f"'{name}': a variation of the paper's actuator, of which furuta has none",
+                f"'{name}': a variation of the paper's actuator, but furuta has none",
             )
             for name in NAMED
             if name != "ideal"
         ),
         (
             {"physics": "analytic"},
-            r"the Drive's armature = 4e-06: the equations have no place for it",
+            r"the Drive's armature = 4e-06: the equations have no term for it",
         ),
     ],
 )

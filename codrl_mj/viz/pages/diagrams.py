@@ -47,7 +47,7 @@ def torque_speed_diagram(drive: Drive, numbers: Any = None, points: Any = None) 
 
     Args:
         drive: drive whose voltage, `max_current`, gear and friction are drawn.
-        numbers: `codrl_mj.catalogue.MotorNumbers`, for the continuous current; None if
+        numbers: `codrl_mj.catalogue.MotorParameters`, for the continuous current; None if
             it is unknown.
         points: operating points to draw too, shape (n, 2): speed [rad/s] and torque [N*m] of the
             output.
@@ -425,10 +425,15 @@ def torque_step_plot(steps: Mapping[str, tuple[ActuatorModel, float, float]]) ->
     curves = []
     for name, (actuator, desired, timestep) in steps.items():
         kind: Any = type(actuator)
-        if not actuator.tracks or actuator.MOTION or not kind.State._fields or desired == 0.0:
+        if (
+            not actuator.is_torque_controlled
+            or actuator.MOTION
+            or not kind.State._fields
+            or desired == 0.0
+        ):
             continue
         parameters, state = (
-            parameters_type(kind)(*actuator.numbers),
+            parameters_type(kind)(*actuator.parameter_values),
             kind.State(*[0.0] * len(kind.State._fields)),
         )
         share = [0.0]

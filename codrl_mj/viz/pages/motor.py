@@ -134,7 +134,7 @@ def _abilities(explanation: Mapping[str, Any], drive: Drive, entry: MotorEntry |
     if explanation["assumed"]:
         table += page.paragraph(f"{explanation['assumed']}.", "soft")
     try:
-        plots = page.plots([torque_speed_diagram(drive, entry and entry.numbers)])
+        plots = page.plots([torque_speed_diagram(drive, entry and entry.parameters)])
     except ValueError as error:
         plots = page.note(str(error))
     return Markup('<div class="beside">{}{}</div>').format(plots, table)
