@@ -21,9 +21,9 @@ import numpy as np
 import codrl_mj
 from codrl_mj.actuators import NAMED, Drive
 from codrl_mj.catalogue import motor_entry, motor_names
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 from codrl_mj.sizing import design, find_drive, torque_limits
-from codrl_mj.study.bench import BLOCKED, on_bench
+from codrl_mj.study.bench import BLOCKED_INERTIA, make_bench
 from codrl_mj.tasks import OURS, named_actuator
 from codrl_mj.validation.motor_catalogue import COLD
 
@@ -57,7 +57,7 @@ def free_run(
         inertia: of the load [kg*m^2].
         time_constant: about the one to be found [s], for how long to look.
     """
-    speeds = on_bench(actuator, timestep, inertia)(1e6, 20.0 * time_constant)[:, 2]
+    speeds = make_bench(actuator, timestep, inertia)(1e6, 20.0 * time_constant)[:, 2]
     return float(speeds[-1]), float(timestep * (1.0 + np.sum(1.0 - speeds / speeds[-1])))
 
 
@@ -65,7 +65,7 @@ def task_row(task: str, name: str) -> dict[str, Any]:
     """What a named actuator does on a task's bench: a torque step to the task's largest force, stall, free run."""
     spec, actuator = TASKS[task], named_actuator(name, task)
     timestep, motor = spec.step_duration / spec.motor_inner_steps, actuator.motor
-    asked, blocked = float(spec.max_forces[0]), on_bench(actuator, timestep, BLOCKED)
+    asked, blocked = float(spec.max_forces[0]), make_bench(actuator, timestep, BLOCKED_INERTIA)
     torques = blocked(asked, LONG)[:, 0]
     row: dict[str, Any] = {"task": task, "actuator": name}
     for band in (5, 2):
@@ -150,7 +150,7 @@ def _stall(drive: Drive, no_load_speed: float) -> float:
         / drive.motor.resistance
         / drive.arm_radius
     )
-    bench = on_bench(
+    bench = make_bench(
         drive, 1.0 / drive.controller.sample_rate, 1e4 * most * duration / no_load_speed
     )
     slow, less_slow = (bench(1e6, duration, share * no_load_speed)[-1, 1] for share in (0.01, 0.02))
@@ -246,7 +246,7 @@ def _write(measured: list[dict[str, Any]], path: Path) -> list[dict[str, str]]:
         }
         for row in measured
     ]
-    with writing(path) as temporary, temporary.open("w", newline="") as file:
+    with atomic_write(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(texts[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(texts)
@@ -263,7 +263,7 @@ def main() -> int:
     tables = {
         kind: _write(measured, options.out / TABLES[kind]) for kind, measured in rows().items()
     }
-    with writing(options.out / PAGE) as temporary:
+    with atomic_write(options.out / PAGE) as temporary:
         temporary.write_text(page(tables))
     print("\n".join(f"wrote {options.out / name}" for name in TABLES.values()))
     print(f"wrote {options.out / PAGE}")

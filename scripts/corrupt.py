@@ -37,7 +37,7 @@ from rich.table import Table
 
 from codrl_mj.cli import main as codrl_mj
 from codrl_mj.cli.terminal import console
-from codrl_mj.runs.files import leftovers, sealed
+from codrl_mj.runs.files import temporary_files, with_digest
 
 SOME = (1, 1, 1, 2, 3)
 """How many changes a case has, one as likely as the other."""
@@ -418,7 +418,7 @@ def corrupt_run(folder: Path, rng: random.Random) -> Case:
         content.pop("sha256", None)
         content = change_entry(content, rng)
         sealing = how != "entry" and isinstance(content, dict)
-        path.write_text(json.dumps(sealed(content) if sealing else content))
+        path.write_text(json.dumps(with_digest(content) if sealing else content))
     elif how == "exchanged" and other.is_file():
         path.write_bytes(other.read_bytes())
     else:
@@ -545,7 +545,7 @@ def attempt(case: Case, folder: Path, patience: float) -> Outcome:
     halves = [
         str(path.relative_to(folder))
         for place in [folder, *folder.rglob("*")]
-        for path, _ in leftovers(place)
+        for path, _ in temporary_files(place)
     ]
     return Outcome(status, interrupted, output.read_text(errors="replace"), lost + halves)
 

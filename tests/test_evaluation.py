@@ -294,7 +294,7 @@ def test_an_angle_that_is_asked_for_is_no_torque_that_could_be_missed():
         "Reacher-v5", {"joint0": Position(), "joint1": Lag(time_constant=0.1)}, max_episode_steps=4
     )
     (episode,) = run_episodes(RandomPolicy(env.action_space, 0), env.make, 1, 3)
-    assert episode.tracks == (False, True)
+    assert episode.is_torque_controlled == (False, True)
     result = summarize(env.task, [episode])
     assert result.motors["joint0"]["tracking_rms"] is None
     # overall it is the error of the one motor that was asked for a torque

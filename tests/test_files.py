@@ -7,7 +7,7 @@ import stat
 
 import pytest
 
-from codrl_mj.runs.files import read_json, sealed, write_json, writing
+from codrl_mj.runs.files import read_json, with_digest, write_json, atomic_write
 
 
 @pytest.mark.parametrize("existing", [None, "old and longer"], ids=["new", "there"])
@@ -17,7 +17,7 @@ def test_a_file_appears_whole_when_its_block_ends(tmp_path, name, existing):
     target = tmp_path / name
     if existing is not None:
         target.write_text(existing)
-    with writing(target) as temporary:
+    with atomic_write(target) as temporary:
         temporary.write_text("whole")
         assert (target.read_text() if target.exists() else None) == existing
         assert (temporary.suffix, temporary.parent) == (target.suffix, tmp_path)
@@ -32,7 +32,7 @@ def test_an_exception_leaves_the_folder_as_it_was(tmp_path, error, existing):
     target = tmp_path / "result.json"
     if existing is not None:
         target.write_text(existing)
-    with pytest.raises(error), writing(target) as temporary:  # noqa: PT012 - half of the block must run
+    with pytest.raises(error), atomic_write(target) as temporary:  # noqa: PT012 - half of the block must run
         temporary.write_text("half of it")
         raise error
     assert [path.read_text() for path in tmp_path.iterdir()] == (
@@ -54,7 +54,7 @@ def test_a_full_disk_while_writing_json_leaves_nothing(tmp_path, monkeypatch):
 
 def test_failing_to_replace_a_folder_leaves_no_temporary_file(tmp_path):
     (tmp_path / "taken").mkdir()
-    with pytest.raises(OSError, match="taken"), writing(tmp_path / "taken") as temporary:
+    with pytest.raises(OSError, match="taken"), atomic_write(tmp_path / "taken") as temporary:
         temporary.write_text("x")
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
@@ -65,7 +65,7 @@ def test_failing_to_replace_a_folder_leaves_no_temporary_file(tmp_path):
 def test_permissions_follow_the_umask(tmp_path, mask, mode):
     before = os.umask(mask)
     try:
-        with writing(tmp_path / "a.txt") as temporary:
+        with atomic_write(tmp_path / "a.txt") as temporary:
             temporary.write_text("x")
         assert os.umask(mask) == mask  # reading the mask did not change it
     finally:
@@ -91,7 +91,7 @@ CONTENT = {"b": {"limit": float("inf"), 10: (1, 2.5), 9: None}, "a": [float("nan
 
 def test_what_is_sealed_is_read_as_it_was_and_its_order_does_not_matter(tmp_path):
     write_json(tmp_path / "plain.json", CONTENT)
-    write_json(tmp_path / "sealed.json", sealed(CONTENT))
+    write_json(tmp_path / "sealed.json", with_digest(CONTENT))
     content = json.loads((tmp_path / "sealed.json").read_text())
     write_json(tmp_path / "turned.json", dict(reversed(content.items())))
     plain, read, turned = (
@@ -114,7 +114,7 @@ def test_what_is_sealed_is_read_as_it_was_and_its_order_does_not_matter(tmp_path
     ],
 )
 def test_what_is_sealed_and_was_changed_is_refused_until_its_seal_is_deleted(tmp_path, change):
-    path, content = tmp_path / "a.json", sealed(CONTENT)
+    path, content = tmp_path / "a.json", with_digest(CONTENT)
     change(content)
     write_json(path, content)
     with pytest.raises(

@@ -75,7 +75,7 @@ class Advise:
     def run(self) -> tuple[int, Any]:
         """Print the doses, what is known of what can be done, and the verdict last."""
         from codrl_mj.study.advice import advise
-        from codrl_mj.study.doses import REFERENCE_SPEEDS, posed
+        from codrl_mj.study.axes import REFERENCE_SPEEDS, study_env
         from codrl_mj.study.evidence import Evidence
 
         known = self.task in REFERENCE_SPEEDS
@@ -95,7 +95,7 @@ class Advise:
         found = None
         if known:
             try:
-                actuator = posed(self.task, named).actuator
+                actuator = study_env(self.task, named).actuator
             except ValueError as error:
                 given = {"--gear-ratio": self.gear_ratio, "--voltage": self.voltage}
                 about = ", ".join(flag for flag, value in given.items() if value is not None)
@@ -105,13 +105,13 @@ class Advise:
             say(actuator.assumed)
         measured = None
         if self.measure is not None:
-            from codrl_mj.study.advice import decide, measurement
+            from codrl_mj.study.advice import decide, plan_measurement
             from codrl_mj.study.parallel import Workers
             from codrl_mj.study.program import compute
 
-            asked = measurement(named, self.task, self.measure, self.root, trust=self.trust)
+            asked = plan_measurement(named, self.task, self.measure, self.root, trust=self.trust)
             compute(asked.grid, Workers(self.jobs))
-            options = asked.judged(asked.grid.collect())
+            options = asked.loss_bounds(asked.grid.collect())
             measured = {"options": options, "verdict": decide(options)}
             _print_options(
                 f"Measured: {self.measure} policies of either kind, 50 episodes each", options
@@ -125,11 +125,11 @@ class Advise:
 
 
 def _print(name: str, found: Any) -> None:
-    from codrl_mj.study.doses import AXES
+    from codrl_mj.study.axes import AXES
 
     columns = "what it does to the largest force", "value", "unit"
     rows: list[tuple[Any, ...]] = [
-        (title, format(getattr(found.found, field), digits), unit)
+        (title, format(getattr(found.delivery, field), digits), unit)
         for field, (title, unit, digits) in _DELIVERED.items()
     ]
     print_table(f"{name} on {found.task}, on the bench", columns, rows, right=("value",))
@@ -139,7 +139,7 @@ def _print(name: str, found: Any) -> None:
             unit = AXES[one.axis].unit.rpartition("[")[2].removesuffix("]").removeprefix("missing ")
             tested = ", ".join(dose.removeprefix(f"{one.axis} ") for dose in one.between)
             lost = _lost(one.outcome, "at least " * one.beyond)
-            rows.append((one.axis, f"{one.dose:.3g}", unit, *lost, tested))
+            rows.append((one.axis, f"{one.severity:.3g}", unit, *lost, tested))
         title = (
             "What policies lose by it that were trained on ideal forces [shares of the task's span]"
         )
@@ -167,7 +167,7 @@ def _print_options(title: str, options: Any) -> None:
     rows = []
     for name in OPTIONS:
         if name in options:
-            told = options[name].most or options[name].least
+            told = options[name].upper or options[name].lower
             rows.append(
                 (name, *(_lost(told, options[name].bound) if told else ("not tested", "", "", "")))
             )

@@ -161,7 +161,7 @@ class Show:
 
 def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
     """What it can do first, then its numbers, then what to know of them."""
-    from codrl_mj.sizing import unknown_in_words
+    from codrl_mj.sizing import describe_unknown
 
     def show(title: str, part: str) -> None:
         rows = [(row["name"], number(row["value"], 4), row["unit"]) for row in found[part]]
@@ -191,7 +191,7 @@ def _print_explained(title: str, volts: float, found: dict[str, Any]) -> None:
             ("source", [f"{number}: {source}" for number, source in enumerate(found["cited"], 1)]),
         ):
             say(*(f"{kind} {text}" if kind == "source" else f"{kind}: {text}" for text in texts))
-        say(unknown_in_words(found["unknown"]))
+        say(describe_unknown(found["unknown"]))
 
 
 _DESIGNED = (
@@ -242,7 +242,7 @@ class Design:
 
     def run(self) -> tuple[int, Any]:
         """Print the table, draw Bode's diagram."""
-        from codrl_mj.sizing import LoopDesign, design, designs, sampled_too_seldom
+        from codrl_mj.sizing import LoopDesign, design, designs, undersampling_warning
 
         drive = self.changes.drive(self.name)
         own, every = design(drive), designs(drive)
@@ -273,7 +273,7 @@ class Design:
         impossible = dict.fromkeys(one for one in every.values() if isinstance(one, str))
         say(
             *(f"not possible: {why}" for why in impossible),
-            sampled_too_seldom(drive),
+            undersampling_warning(drive),
             drive.assumed,
         )
         if self.out is not None:
@@ -304,10 +304,10 @@ class Step:
 
     def run(self) -> tuple[int, Any]:
         """Print the table, draw the responses."""
-        from codrl_mj.sizing import sampled_too_seldom, step
+        from codrl_mj.sizing import undersampling_warning, step_responses
 
         drive = self.changes.drive(self.name)
-        steps = step(drive)
+        steps = step_responses(drive)
         small, constant = steps.small, drive.motor.torque_constant
         settled, amplitude = small.settling_time(), float(small.reference[-1])
         responses = steps.recoveries.items()
@@ -328,7 +328,7 @@ class Step:
             for kind, one in recoveries.items()
         ]
         print_table("", columns, rows, right=columns[1:])
-        say(sampled_too_seldom(drive), drive.assumed)
+        say(undersampling_warning(drive), drive.assumed)
         if self.out is not None:
             from codrl_mj.viz.pages import diagrams
 

@@ -11,7 +11,7 @@ from rich.text import Text
 from codrl_mj.cli.motor import save_plot
 from codrl_mj.cli.parsing import AsJson, Trust
 from codrl_mj.cli.terminal import print_table, say
-from codrl_mj.runs import told_apart
+from codrl_mj.runs import unique_names
 
 Asked = Annotated[
     tyro.conf.Positional[str],
@@ -70,15 +70,15 @@ class Feasible:
             feasibility,
             find_drive,
             find_entry,
-            geared,
-            uncounted,
+            with_best_gear,
+            ignored_quantities,
         )
 
         drive = find_drive(
             self.name, self.gear_ratio, voltage=self.voltage, max_current=self.max_current
         )
         entry = find_entry(self.name)
-        continuous, unknown = entry.numbers.continuous_current if entry else None, uncounted(entry)
+        continuous, unknown = entry.numbers.continuous_current if entry else None, ignored_quantities(entry)
         demand = demand_of(self.asked, trust=self.trust, motor=self.motor)
         found = feasibility(drive, demand, continuous)
         title = f"{self.name}, {_gear(drive, demand)}, {drive.voltage_limit:g} V: {demand.source}"
@@ -94,19 +94,19 @@ class Feasible:
         print_table(
             title, ("bound", "of", "needs", "has", "unit", "", "says"), rows, right=("needs", "has")
         )
-        asked, best = found.operation, geared(drive, demand, continuous)
+        asked, best = found.operation, with_best_gear(drive, demand, continuous)
         at_best, (low, high) = (
             feasibility(best, demand, continuous),
-            sizing.equal_gears(best, demand, continuous),
+            sizing.equivalent_gears(best, demand, continuous),
         )
         say(
             f"{asked.energy_drawn:.3g} J drawn and {asked.copper_loss:.3g} J of heat in an episode,"
             f" {asked.rms_current:.3g} A rms; share of rotor and friction in the largest load:"
             f" {_share(drive, asked)}",
-            *map(str, found.in_the_way),
+            *map(str, found.failed_bounds),
             f"best {_gear(best, demand)}: {at_best.verdict}, with a margin of {at_best.margin:.0%};"
             f" the verdict is the same from {low:.3g} to {high:.3g}",
-            _uncounted(unknown, found.why),
+            _uncounted(unknown, found.reason),
             drive.assumed,
         )
         if self.out is not None:
@@ -182,7 +182,7 @@ class Choose:
         """Print the ranking, or of several motors the best for each."""
         import yaml
 
-        from codrl_mj.runs.files import writing
+        from codrl_mj.runs.files import atomic_write
         from codrl_mj.sizing import actuators_of, choose, demand_of, demands_of
 
         if self.top < 1:
@@ -213,21 +213,21 @@ class Choose:
         )
         for place, (name, choice) in enumerate(told):
             at = f"{choice.name} at {_gear(choice.drive, demands[name])}"
-            unknown = _uncounted(choice.unknown, choice.lacks)
-            about = "; ".join(filter(None, (choice.lacks, unknown, choice.drive.assumed)))
-            if about and (choice.lacks or place < len(shown)):
+            unknown = _uncounted(choice.unknown, choice.rejection_reason)
+            about = "; ".join(filter(None, (choice.rejection_reason, unknown, choice.drive.assumed)))
+            if about and (choice.rejection_reason or place < len(shown)):
                 say(f"{at}: {about}" if alone else f"{name}: {at}: {about}")
-        short = [found[0].name for found in ranked.values() if found[0].lacks]
+        short = [found[0].name for found in ranked.values() if found[0].rejection_reason]
         if self.out is not None:
             gears = [f"-{choice.ratio:.4g}" if self.gears else "" for _, choice in shown]
             stems = [choice.name.removesuffix(Path(choice.name).suffix) for _, choice in shown]
-            motors = told_apart(
+            motors = unique_names(
                 [Path(f"{stem}{gear}") for stem, gear in zip(stems, gears, strict=True)]
             )
             for (name, choice), motor in zip(shown, motors, strict=True):
                 picture = motor.replace("/", "-") if alone else name
                 _draw(choice.drive, demands[name], choice.name, self.out / f"{picture}.png")
-            with writing(self.out / "actuators.yaml") as temporary:
+            with atomic_write(self.out / "actuators.yaml") as temporary:
                 chosen = actuators_of(
                     {name: (found[0], demands[name]) for name, found in ranked.items()}
                 )
@@ -246,8 +246,8 @@ class Choose:
                 "voltage": choice.drive.voltage_limit,
                 "power": choice.power,
                 "verdict": choice.feasibility.verdict,
-                "does_it": not choice.lacks,
-                "lacks": choice.lacks,
+                "does_it": not choice.rejection_reason,
+                "lacks": choice.rejection_reason,
                 "margin": choice.feasibility.margin,
                 **_asked(choice.feasibility.operation),
                 "unknown": choice.unknown,
@@ -341,7 +341,7 @@ def _print_ranking(
         numbers = abs(asked.current).max(), asked.rms_current, asked.energy_drawn, asked.copper_loss
         gear, does = (
             _gear(choice.drive, demands[name]),
-            Text(choice.feasibility.verdict, "red" if choice.lacks else "green"),
+            Text(choice.feasibility.verdict, "red" if choice.rejection_reason else "green"),
         )
         row = (
             *((name, choice.name) if several else (choice.name,)),

@@ -20,7 +20,7 @@ from codrl_mj.cli.terminal import progress_bar
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.envs.worlds import is_world
 from codrl_mj.fields import did_you_mean
-from codrl_mj.runs import told_apart
+from codrl_mj.runs import unique_names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Replay(OfEpisodes):
 
 def _rank(verb: Any, env: Any, episode: Any) -> str:
     """Return how an episode compares with those of a run's evaluation, if it is one of the same environment."""
-    from codrl_mj.runs.summaries import rank, read_evaluation
+    from codrl_mj.runs.summaries import describe_rank, read_evaluation
 
     evaluation = read_evaluation(Path(verb.subject), verb.source.which == "best") or {}
     try:
@@ -145,7 +145,7 @@ def _rank(verb: Any, env: Any, episode: Any) -> str:
         ValueError,
     ):  # no evaluation, or one that this version does not read
         same = False
-    said = rank(evaluation, episode.total) if same else ""
+    said = describe_rank(evaluation, episode.total) if same else ""
     return f": seed {verb.seed}, return {episode.total:.3g}; {said}" if said else ""
 
 
@@ -223,7 +223,7 @@ class LiveView(OfEpisodes):
             return loaded.policy
 
         taken = {*found, "random", "zero"}
-        for name, run in zip(told_apart(self.policies), self.policies, strict=True):
+        for name, run in zip(unique_names(self.policies), self.policies, strict=True):
             found[f"run {name}" if name in taken else name] = functools.partial(policy_of, run)
         return found
 

@@ -23,7 +23,7 @@ from codrl_mj.deploy.network import network_of
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes
 from codrl_mj.fields import check_names, did_you_mean, differing
-from codrl_mj.runs.files import read_json, sealed, write_json
+from codrl_mj.runs.files import read_json, with_digest, write_json
 from codrl_mj.runs.policies import Policy
 
 FORMAT = "codrl_mj contract 1"
@@ -263,7 +263,7 @@ class Contract(Interface):
 
     def write(self, folder: Path) -> None:
         """Write `contract.json` into a folder, whole or not at all, with a digest of itself."""
-        write_json(folder / FILE, sealed({"format": FORMAT, **dataclasses.asdict(self)}))
+        write_json(folder / FILE, with_digest({"format": FORMAT, **dataclasses.asdict(self)}))
 
     def within(self, observations: np.ndarray) -> np.ndarray:
         """Whether observations (N, k) are finite and within the limits, shape (N,)."""

@@ -12,7 +12,7 @@ from codrl_mj.deploy.contract import Contract
 from codrl_mj.deploy.network import Network, network_of
 from codrl_mj.deploy.tiles import Tiles
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.runs.files import writing_folder
+from codrl_mj.runs.files import atomic_folder
 from codrl_mj.runs.policies import Policy, check_spaces
 
 ONNX, TABLE = "policy.onnx", "table.csv"
@@ -136,7 +136,7 @@ def export(
             f"the exported policy's actions differ by {worst:.3g} from the policy's own, must be at"
             f" most {golden['tolerance']:g}: it is not what its class says"
         )
-    with writing_folder(out) as folder:
+    with atomic_folder(out) as folder:
         (folder / ONNX).write_bytes(onnx_model(network, about).SerializeToString())
         contract.write(folder)
         for name, content in c_files(network, contract).items():

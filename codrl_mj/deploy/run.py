@@ -24,7 +24,7 @@ from codrl_mj.deploy.wire import (
     Answer,
     Wire,
 )
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 
 MOST_MISSED = 3
 """Frames in a row without an answer, after which a board is no longer told to drive."""
@@ -76,7 +76,7 @@ def run_board(
     """
     contract = Contract.read(folder)
     rows, missed, in_a_row, late, why = 0, 0, 0, 0, ""
-    with _opened(port, baud) as line, writing(log) as part, part.open("w", newline="") as file:
+    with _opened(port, baud) as line, atomic_write(log) as part, part.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(columns(contract) + motor_columns(contract))
         wire = Wire(contract, line.fileno(), line.fileno())

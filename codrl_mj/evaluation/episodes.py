@@ -17,7 +17,7 @@ from gymnasium import spaces
 from codrl_mj.actuators import IDEAL, actuator_from_mapping, mapping_of, trusting
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.fields import check_memory
-from codrl_mj.runs.files import below, writing
+from codrl_mj.runs.files import select_prefix, atomic_write
 from codrl_mj.runs.policies import Policy
 
 MakeEnv = Callable[[], gymnasium.Env[Any, Any]]
@@ -62,7 +62,7 @@ class Episode:
         return self.actuator if isinstance(self.actuator, tuple) else (self.actuator,)
 
     @property
-    def tracks(self) -> tuple[bool, ...]:
+    def is_torque_controlled(self) -> tuple[bool, ...]:
         """For each motor True if a torque was asked of it; a voltage, a position or a speed is none."""
         asked = (
             one if self.command == "force" else one.commands()[self.command].actuator
@@ -146,7 +146,7 @@ def save_episode(episode: Episode, path: Path) -> None:
     described = (
         [mapping_of(one) for one in episode.actuator] if several else mapping_of(episode.actuator)
     )
-    with writing(path) as temporary:
+    with atomic_write(path) as temporary:
         np.savez_compressed(temporary, actuator=json.dumps(described), **arrays)
 
 
@@ -173,8 +173,8 @@ def load_episode(path: Path, trust: bool = False) -> Episode:
             ]
         return Episode(
             **{field: arrays[field] for field in _ARRAYS},
-            trace=below("trace/", arrays),
-            signals=below("signals/", arrays),
+            trace=select_prefix("trace/", arrays),
+            signals=select_prefix("signals/", arrays),
             terminated=bool(arrays["terminated"]),
             actuator=tuple(actuators) if several else actuators[0],
             command=str(arrays["command"]),

@@ -187,7 +187,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     success = None
     if any(world.at_goal(episode) is not None for episode in episodes):
         success = wilson_rate(len(reached), len(episodes))
-    driven = [driven_in(episode) for episode in episodes]
+    driven = [motor_traces(episode) for episode in episodes]
     each_motor = (
         _measures(episodes, [[each[place]] for each in driven])
         for place, _ in enumerate(episodes[0].motors)
@@ -231,7 +231,7 @@ def _time_to_goal(world: EnvSource, episode: Episode) -> float | None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Driven:
+class MotorTrace:
     """What one motor did in an episode, at its shaft."""
 
     actuator: ActuatorModel
@@ -247,7 +247,7 @@ class Driven:
     """Force delivered to it [N or N*m]."""
     signals: dict[str, np.ndarray]
     """The family's."""
-    tracks: bool
+    is_torque_controlled: bool
     """True if a torque was asked of it. If False, `desired` is the torque delivered at each step's end."""
 
     @property
@@ -256,7 +256,7 @@ class Driven:
         return mechanical_work(self.force, self.speed, self.timestep)
 
     @property
-    def wound(self) -> bool:
+    def has_winding(self) -> bool:
         """Whether it has a winding whose current and voltage are known."""
         return {"current", "voltage"} <= self.signals.keys() and self.actuator.winding is not None
 
@@ -266,7 +266,7 @@ class Driven:
         return np.append(0.0, self.signals["current"])
 
 
-def driven_in(episode: Episode) -> list[Driven]:
+def motor_traces(episode: Episode) -> list[MotorTrace]:
     """What each motor did."""
     several = isinstance(episode.actuator, tuple)
     made = []
@@ -284,7 +284,7 @@ def driven_in(episode: Episode) -> list[Driven]:
             name: own[name] for name in actuator.Signals._fields if name in own
         }  # others are of other families
         made.append(
-            Driven(
+            MotorTrace(
                 actuator,
                 episode.timestep,
                 arm * np.repeat(asked, episode.inner_steps),
@@ -292,13 +292,13 @@ def driven_in(episode: Episode) -> list[Driven]:
                 np.append(episode.first_speeds[number], speed),
                 force,
                 shown,
-                episode.tracks[number],
+                episode.is_torque_controlled[number],
             )
         )
     return made
 
 
-def _measures(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]]) -> dict[str, Any]:
+def _measures(episodes: Sequence[Episode], driven: Sequence[Sequence[MotorTrace]]) -> dict[str, Any]:
     """What motors were asked for and did, of each episode the same ones, on the mean of them.
 
     How well the torque follows the desired one, which is held over an environment step; what the
@@ -306,7 +306,7 @@ def _measures(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]]) -
     """
     actual = [one.actual for each in driven for one in each]
     delivered = np.concatenate(actual)
-    tracked = [[one for one in each if one.tracks] for each in driven]
+    tracked = [[one for one in each if one.is_torque_controlled] for each in driven]
     found: dict[str, Any] = dict.fromkeys(
         ("tracking_rms", "tracking_percent", "tracking_max", "tracking_lag")
     )
@@ -340,7 +340,7 @@ def _root_mean_square(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]]) -> dict[str, Any]:
+def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[MotorTrace]]) -> dict[str, Any]:
     """What was asked of the actuators: of any but the ideal one, and of windings, as far as the family shows it."""
     each = (f"{limit}_saturated" for limit in ("voltage", "current", "temperature"))
     limits = {f"{name}_percent": name for name in ("saturated", *each)}
@@ -369,7 +369,7 @@ def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]])
         np.ptp(values) > 0.0 for values in warmed
     ):  # constant where nothing is known of it
         found["peak_temperature"] = float(np.concatenate(warmed).max())
-    wound = [[one for one in each if one.wound] for each in driven]
+    wound = [[one for one in each if one.has_winding] for each in driven]
     every = [one for each in wound for one in each]
     if not every:
         return found
@@ -393,7 +393,7 @@ def _electrical(episodes: Sequence[Episode], driven: Sequence[Sequence[Driven]])
     }
 
 
-def _energies(one: Driven) -> tuple[float, float, float, float, float]:
+def _energies(one: MotorTrace) -> tuple[float, float, float, float, float]:
     """Energy [J] drawn, returned, lost in the winding and left in it; the integral of the squared current [A^2*s]."""
     assert one.actuator.winding is not None
     resistance, inductance = one.actuator.winding

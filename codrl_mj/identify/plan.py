@@ -32,7 +32,7 @@ from codrl_mj.identify.synthetic import (
     sample_times,
     simulate,
 )
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 
 GOALS = {
     "resistance": 0.02,
@@ -153,7 +153,7 @@ def write_excitation(path: Path, option: Option) -> None:
     """Write what to play as CSV, a row for each change at the option's rate: `time` [s], `voltage` [V]."""
     time = np.arange(round(option.excitation.duration * option.rate) + 1) / option.rate
     table = np.column_stack([time, option.excitation.voltage(time + 1e-9 / option.rate)])
-    with writing(path) as temporary:
+    with atomic_write(path) as temporary:
         np.savetxt(temporary, table, fmt="%.10g", delimiter=",", header="time,voltage", comments="")
 
 

@@ -22,13 +22,13 @@ def finished(run: Path) -> bool:
     return (run / RESULT).is_file()
 
 
-def checkpoints(folder: Path) -> dict[Path, re.Match[str]]:
+def find_checkpoints(folder: Path) -> dict[Path, re.Match[str]]:
     """The checkpoints of a folder, the oldest first, and what their names say."""
     named = {path: CHECKPOINT.fullmatch(path.name) for path in sorted(folder.glob("*"))}
     return {path: match for path, match in named.items() if match is not None}
 
 
-def told_apart(folders: Sequence[Path]) -> list[str]:
+def unique_names(folders: Sequence[Path]) -> list[str]:
     """Names of some folders, with as much of their paths as tells them apart."""
     for length in range(1, 4):
         names = ["/".join(one.resolve().parts[-length:]) for one in folders]

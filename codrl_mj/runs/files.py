@@ -14,11 +14,11 @@ from typing import Any
 _SEAL = "sha256"
 _TEMPORARY = re.compile(
     r"\.(.+)-[a-z0-9_]{8}(\.[^.]+)?"
-)  # what tempfile makes of the names that `writing` asks for
+)  # what tempfile makes of the names that `atomic_write` asks for
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` that becomes `path` when the block ends, and disappears if it raises.
 
     The folder is made if it is missing. The temporary name keeps the suffix, which some encoders go
@@ -37,14 +37,14 @@ def writing(path: Path) -> Iterator[Path]:
         raise
 
 
-def leftovers(folder: Path) -> list[tuple[Path, str]]:
-    """What `writing` leaves in a folder if its process is killed, and the names that it was to become."""
+def temporary_files(folder: Path) -> list[tuple[Path, str]]:
+    """What `atomic_write` leaves in a folder if its process is killed, and the names that it was to become."""
     found = ((path, _TEMPORARY.fullmatch(path.name)) for path in folder.glob("*"))
     return [(path, match[1] + (match[2] or "")) for path, match in found if match is not None]
 
 
 @contextlib.contextmanager
-def writing_folder(path: Path) -> Iterator[Path]:
+def atomic_folder(path: Path) -> Iterator[Path]:
     """A temporary folder beside `path` that becomes `path` when the block ends, and disappears if it raises.
 
     It raises where `path` exists and is not an empty folder.
@@ -103,11 +103,11 @@ def check_page(path: Path) -> None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write `content` as indented JSON, whole or not at all."""
-    with writing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n")
 
 
-def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
+def with_digest(content: Mapping[str, Any]) -> dict[str, Any]:
     """The content and, as its entry `sha256`, a digest of all the rest, which `read_json` checks and takes off."""
     plain = json.loads(
         json.dumps(content)
@@ -125,7 +125,7 @@ def check_digest(path: Path, content: bytes, expected: Any, beside: str) -> None
         )
 
 
-def below(prefix: str, content: Mapping[str, Any]) -> dict[str, Any]:
+def select_prefix(prefix: str, content: Mapping[str, Any]) -> dict[str, Any]:
     """What the names with that prefix name, by the rest of them: a file's arrays stand side by side."""
     return {
         name.removeprefix(prefix): value
@@ -135,7 +135,7 @@ def below(prefix: str, content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_json(path: Path, what: str) -> Any:
-    """Read JSON; of what is `sealed`, the content alone. `what` the file is goes into the error.
+    """Read JSON; of what is `with_digest`, the content alone. `what` the file is goes into the error.
 
     A missing file is a FileNotFoundError, a truncated or edited one a ValueError.
     """
@@ -148,7 +148,7 @@ def read_json(path: Path, what: str) -> Any:
     if not isinstance(content, dict) or _SEAL not in content:
         return content
     plain = {name: value for name, value in content.items() if name != _SEAL}
-    if content[_SEAL] != sealed(plain)[_SEAL]:
+    if content[_SEAL] != with_digest(plain)[_SEAL]:
         raise ValueError(
             f"{path} is not the {what} that was written: its content does not have the {_SEAL} that"
             " it names. It was damaged or edited: copy it anew from where it came, or delete its"

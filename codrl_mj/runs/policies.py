@@ -18,7 +18,7 @@ from codrl_mj.actuators import trusting
 from codrl_mj.agents import AgentConfig, agent_from_mapping
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.runs import DESCRIPTION, DIGEST, WEIGHTS
-from codrl_mj.runs.files import check_digest, read_json, sealed, write_json, writing
+from codrl_mj.runs.files import check_digest, read_json, with_digest, write_json, atomic_write
 
 FORMAT = "codrl_mj policy 2"
 _ENTRIES = {"format", DIGEST, "agent", "observation_space", "action_space"}
@@ -67,9 +67,9 @@ def save_policy(policy: Any, agent: AgentConfig, folder: Path) -> None:
         "observation_space": _describe_space(policy.observation_space),
         "action_space": _describe_space(policy.action_space),
     }
-    with writing(folder / WEIGHTS) as temporary:
+    with atomic_write(folder / WEIGHTS) as temporary:
         temporary.write_bytes(weights)
-    write_json(folder / DESCRIPTION, sealed(description))
+    write_json(folder / DESCRIPTION, with_digest(description))
 
 
 def load_policy(folder: Path, trust: bool = False) -> Any:

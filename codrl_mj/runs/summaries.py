@@ -98,7 +98,7 @@ def find_runs(root: Path) -> list[RunSummary]:
     return sorted(found, key=lambda run: run.name)
 
 
-def typical_seed(evaluation: Mapping[str, Any] | None) -> int | None:
+def median_seed(evaluation: Mapping[str, Any] | None) -> int | None:
     """Return the seed of the evaluated episode with the median return (of two, the lower); None if none is known."""
     returns, conditions = (
         (evaluation or {}).get(name) for name in ("episode_returns", "conditions")
@@ -111,9 +111,9 @@ def typical_seed(evaluation: Mapping[str, Any] | None) -> int | None:
     return seed + sorted(range(len(returns)), key=returns.__getitem__)[(len(returns) - 1) // 2]
 
 
-def rank(evaluation: Mapping[str, Any] | None, total: float) -> str:
+def describe_rank(evaluation: Mapping[str, Any] | None, total: float) -> str:
     """Return in words how an episode's return compares with those of an evaluation; nothing where there is none."""
-    if (seed := typical_seed(evaluation)) is None or evaluation is None:
+    if (seed := median_seed(evaluation)) is None or evaluation is None:
         return ""
     returns = evaluation["episode_returns"]
     median, worse = (

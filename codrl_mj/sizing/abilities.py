@@ -83,7 +83,7 @@ class Abilities(NamedTuple):
     """What a drive can do at its supply's voltage, `max_current` aside in all but power and peak torque."""
 
     power: float
-    """The most mechanical power [W] of the motor, gear and friction aside: see `most_power`."""
+    """The most mechanical power [W] of the motor, gear and friction aside: see `max_power`."""
     peak_torque: float
     """As the stall torque [N*m], within `max_current`."""
 
@@ -123,7 +123,7 @@ def abilities(drive: Drive) -> Abilities:
         motor, np.array([min(stall, drive.controller.max_current), stall]), np.zeros(2)
     )
     return Abilities(
-        most_power(drive),
+        max_power(drive),
         float(peak),
         float(blocked),
         stall,
@@ -134,7 +134,7 @@ def abilities(drive: Drive) -> Abilities:
     )
 
 
-def most_power(drive: Drive) -> float:
+def max_power(drive: Drive) -> float:
     """The most mechanical power [W], i (V - R i) kT/kE, R of winding and supply; infinite without back-EMF."""
     motor, limit, resistance = drive.motor, drive.voltage_limit, drive.motor.resistance + drive.sag
     current = min(limit / resistance / 2, drive.controller.max_current)
@@ -342,7 +342,7 @@ def explain(
     }
 
 
-def unknown_in_words(names: Sequence[str]) -> str:
+def describe_unknown(names: Sequence[str]) -> str:
     """What is said of a motor's unknown numbers; empty where all are known."""
     words = ", ".join(name.replace("max_", "highest ").replace("_", " ") for name in names)
     return (

@@ -10,11 +10,11 @@ import numpy as np
 
 from codrl_mj.actuators import Drive, named_mapping, set_display_name
 from codrl_mj.catalogue import MotorEntry, motor_names
-from codrl_mj.sizing.abilities import find_drive, find_entry, most_power
+from codrl_mj.sizing.abilities import find_drive, find_entry, max_power
 from codrl_mj.sizing.demand import Demand
 from codrl_mj.sizing.feasibility import (
-    MOST_FRICTION,
-    MOST_SHARE,
+    MAX_FRICTION_SHARE,
+    MAX_ROTOR_SHARE,
     SURELY,
     VERDICTS,
     Feasibility,
@@ -44,17 +44,17 @@ class Candidate(NamedTuple):
     """Numbers that its datasheet leaves open, and that are not counted."""
     feasibility: Feasibility
     """The judgment."""
-    lacks: str
+    rejection_reason: str
     """The reason why it is not to be taken; empty where it is."""
 
-    def behind(self, gear: float) -> Drive:
+    def for_model_gear(self, gear: float) -> Drive:
         """The drive for an actuator of a model with a gear of its own, which the arm undoes: `Demand.model_gear`."""
         return self.drive.replaced({"motor.arm_radius": gear * self.drive.motor.arm_radius})
 
     @property
     def power(self) -> float:
         """The most mechanical power [W] that the motor makes at its supply: its size, whatever its winding and gear."""
-        return most_power(self.drive)
+        return max_power(self.drive)
 
     @property
     def ratio(self) -> float:
@@ -71,14 +71,14 @@ def actuators_of(choices: Mapping[str, tuple[Candidate, Demand]]) -> dict[str, A
     """
     found = {}
     for name, (choice, demand) in choices.items():
-        drive = set_display_name(choice.behind(demand.model_gear), Path(choice.name).stem)
+        drive = set_display_name(choice.for_model_gear(demand.model_gear), Path(choice.name).stem)
         found[" & ".join(map(re.escape, name.split(" & "))) if name else ".*"] = named_mapping(
             drive
         )
     return found
 
 
-def uncounted(entry: MotorEntry | None) -> tuple[str, ...]:
+def ignored_quantities(entry: MotorEntry | None) -> tuple[str, ...]:
     """What a motor's datasheet leaves open, and is not counted; of a drive without one that is all of its heat."""
     if entry is None:
         return ("continuous current",)
@@ -89,7 +89,7 @@ def choose(
     demand: Demand,
     motors: Sequence[str] | None = None,
     voltage: float | None = None,
-    least_margin: float = MARGIN,
+    min_margin: float = MARGIN,
     gears: Sequence[float] | None = None,
     max_current: float | None = None,
 ) -> list[Candidate]:
@@ -97,7 +97,7 @@ def choose(
 
     A motor does it if `feasibility` says `surely`, with a margin. More than enough of a motor is no
     merit: it is dear and heavy, and moves itself. A motor with a gear of its own keeps it, and on a
-    slide gets a wheel; the others get the gear of `geared`.
+    slide gets a wheel; the others get the gear of `with_best_gear`.
 
     Args:
         demand: what is asked.
@@ -112,9 +112,9 @@ def choose(
     Raises:
         ValueError: there is no such motor, or the margin or a gear is out of bounds.
     """
-    if not 0.0 <= least_margin < 1.0:
+    if not 0.0 <= min_margin < 1.0:
         raise ValueError(
-            f"least_margin = {least_margin:g}: must be >= 0 and < 1, the share that is to be left,"
+            f"least_margin = {min_margin:g}: must be >= 0 and < 1, the share that is to be left,"
             f" such as {MARGIN:g}"
         )
     choices = []
@@ -124,24 +124,24 @@ def choose(
         for gear in gears or (None,):
             drive = find_drive(name, gear, voltage=voltage, max_current=max_current)
             fixed = gear is not None or (drive.motor.gear_ratio != 1.0 and not demand.linear)
-            drive = drive if fixed else geared(drive, demand, continuous)
+            drive = drive if fixed else with_best_gear(drive, demand, continuous)
             found = feasibility(drive, demand, continuous)
             choices.append(
-                Candidate(name, drive, uncounted(entry), found, _lacks(found, least_margin))
+                Candidate(name, drive, ignored_quantities(entry), found, _rejection_reason(found, min_margin))
             )
 
     def rank(choice: Candidate) -> tuple[bool, int, float, float]:
         found = choice.feasibility
-        size = 0.0 if choice.lacks else choice.power
-        return choice.lacks != "", VERDICTS.index(found.verdict), size, found.shortage
+        size = 0.0 if choice.rejection_reason else choice.power
+        return choice.rejection_reason != "", VERDICTS.index(found.verdict), size, found.shortage
 
     return sorted(choices, key=rank)
 
 
-def _lacks(found: Feasibility, least: float) -> str:
+def _rejection_reason(found: Feasibility, least: float) -> str:
     """Return the reason why a motor is not to be taken; empty where it is."""
     if found.verdict != SURELY:
-        return f"{found.verdict}. {found.why}"
+        return f"{found.verdict}. {found.reason}"
     return (
         ""
         if found.margin >= least
@@ -149,10 +149,10 @@ def _lacks(found: Feasibility, least: float) -> str:
     )
 
 
-def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Drive:
+def with_best_gear(drive: Drive, demand: Demand, continuous: float | None = None) -> Drive:
     """Return the drive with its best gear, or on a slide wheel: that of the largest margin, rotor and friction counted.
 
-    A gear has a ratio >= 1. Friction may take `MOST_FRICTION` of the load where that leaves a
+    A gear has a ratio >= 1. Friction may take `MAX_FRICTION_SHARE` of the load where that leaves a
     margin. Each of the margin's parts is, but for friction, the largest of functions a/N + b*N, so
     it has one maximum over N.
 
@@ -170,7 +170,7 @@ def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Dri
     def load(logarithm: float) -> float:
         with_gear = _with_ratio(drive, demand, logarithm)
         asked = operation(demand, with_gear)
-        share = 0.0 if demand.exact else asked.own_share / MOST_SHARE
+        share = 0.0 if demand.exact else asked.own_share / MAX_ROTOR_SHARE
         return max(1.0 - margin(with_gear, asked, continuous), share)
 
     def best(highest: float) -> Drive:
@@ -181,14 +181,14 @@ def geared(drive: Drive, demand: Demand, continuous: float | None = None) -> Dri
     rubbed = (
         0.0 if demand.exact else friction_share(_with_ratio(drive, demand, 0.0), demand)
     )  # it grows with the ratio
-    if rubbed > 0.0 and MOST_FRICTION / rubbed > math.exp(low):
-        smooth = best(math.log(MOST_FRICTION / rubbed))
+    if rubbed > 0.0 and MAX_FRICTION_SHARE / rubbed > math.exp(low):
+        smooth = best(math.log(MAX_FRICTION_SHARE / rubbed))
         if margin(smooth, operation(demand, smooth), continuous) >= 0.0:
             return smooth
     return best(math.inf)
 
 
-def equal_gears(
+def equivalent_gears(
     best: Drive, demand: Demand, continuous: float | None = None
 ) -> tuple[float, float]:
     """Return the lowest and the highest ratio around the best one that have its verdict."""

@@ -98,7 +98,7 @@ def demands_of(
     if path.suffix == ".npz":
         try:
             with np.load(path, allow_pickle=False) as archive:
-                found = recorded(
+                found = demand_from_arrays(
                     archive["time"],
                     archive["torque"],
                     archive["speed"],
@@ -132,15 +132,15 @@ def demands_of(
         env = env.world.as_with_motors(env)
         ran = run_episodes(load_policy(path, trust), env.make, episodes, seed)
         return _gathered(f"the policy {path.name} of {env.task}", env, ran)
-    from codrl_mj.sizing.scripted import Scripted, state_observed
+    from codrl_mj.sizing.scripted import Scripted, observe_state
 
     env = EnvConfig(str(what), "ideal")
     policy, env = Scripted(env.world.scripted), env.world.as_with_motors(env)
-    ran = run_episodes(policy, lambda: state_observed(env.make()), episodes, seed)
+    ran = run_episodes(policy, lambda: observe_state(env.make()), episodes, seed)
     return _gathered(f"{policy.description} of {env.world.name}", env, ran)
 
 
-def recorded(time: Any, torque: Any, speed: Any, source: str = "a recording") -> Demand:
+def demand_from_arrays(time: Any, torque: Any, speed: Any, source: str = "a recording") -> Demand:
     """A demand from arrays of one's own, to be delivered as it is.
 
     Args:

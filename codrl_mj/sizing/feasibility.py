@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from codrl_mj.actuators import Drive, GearMotor
-from codrl_mj.sizing.abilities import most_power
+from codrl_mj.sizing.abilities import max_power
 from codrl_mj.sizing.demand import Demand
-from codrl_mj.sizing.swing import Swing, least_gain, least_pumped, least_voltage
+from codrl_mj.sizing.swing import Swing, min_energy_gain, min_pumped_energy, min_supply_voltage
 
 
 class Operation(NamedTuple):
@@ -96,9 +96,9 @@ VERDICTS = (SURELY, DEPENDS, TRY_IT, HOPELESS, SURELY_NOT)
 """From the best."""
 SUFFICIENT = ("voltage", "current", "heat", "rotor", "friction")
 """The bounds that suffice together."""
-MOST_SHARE = 0.5
+MAX_ROTOR_SHARE = 0.5
 """Largest share that rotor and friction may take of the largest load: in a task a policy can ask for no more."""
-MOST_FRICTION = 0.05
+MAX_FRICTION_SHARE = 0.05
 """Largest share that Coulomb friction at the joint may take of it. Policies that never met as much
 lost at most 0.05 of the score on five tasks and 0.10 on Mountain Car, and with twice as much up to
 0.18 (docs/results/actuators.md).
@@ -171,12 +171,12 @@ class Feasibility:
         return max(ratio for ratio in known if not math.isnan(ratio))
 
     @property
-    def why(self) -> str:
+    def reason(self) -> str:
         """Return what is in the way or not known, the decisive first; empty if nothing is."""
-        return ". ".join(map(str, self.in_the_way))
+        return ". ".join(map(str, self.failed_bounds))
 
     @property
-    def in_the_way(self) -> list[Bound]:
+    def failed_bounds(self) -> list[Bound]:
         """The bounds that do not hold or are not known, the decisive first."""
         return sorted(
             (b for b in self.bounds if not b.holds), key=lambda b: -VERDICTS.index(b.verdict)
@@ -330,7 +330,7 @@ def _conditions(
         "power",
         "tau omega / eta, largest",
         needed,
-        most_power(drive),
+        max_power(drive),
         "W",
         (TRY_IT, unmet),
         remedy,
@@ -352,13 +352,13 @@ def _taken(drive: Drive, demand: Demand, asked: Operation) -> Iterator[_Row]:
     """
     rubbed = friction_share(drive, demand)
     inertial = max(asked.own_share - rubbed, 1e-9)
-    scale = (math.sqrt(rubbed * rubbed + 4.0 * inertial * MOST_SHARE) - rubbed) / (2.0 * inertial)
+    scale = (math.sqrt(rubbed * rubbed + 4.0 * inertial * MAX_ROTOR_SHARE) - rubbed) / (2.0 * inertial)
     rows = (
         (
             "rotor",
             "rotor and friction",
             asked.own_share,
-            MOST_SHARE,
+            MAX_ROTOR_SHARE,
             scale,
             "let policies command voltage",
         ),
@@ -366,8 +366,8 @@ def _taken(drive: Drive, demand: Demand, asked: Operation) -> Iterator[_Row]:
             "friction",
             "Coulomb friction",
             rubbed,
-            MOST_FRICTION,
-            MOST_FRICTION / max(rubbed, 1e-300),
+            MAX_FRICTION_SHARE,
+            MAX_FRICTION_SHARE / max(rubbed, 1e-300),
             "train with it",
         ),
     )
@@ -394,7 +394,7 @@ def _unknown_rotor(drive: Drive, demand: Demand, continuous: float | None) -> li
         heavier = drive.replaced({"motor.rotor_inertia": inertia})
         asked = operation(demand, heavier)
         return margin(heavier, asked, continuous) >= 0.0 and (
-            demand.exact or asked.own_share <= MOST_SHARE
+            demand.exact or asked.own_share <= MAX_ROTOR_SHARE
         )
 
     low, high = 1e-12, 1.0
@@ -415,12 +415,12 @@ def _swinging(drive: Drive, swing: Swing) -> list[Bound]:
     """What a swing-up needs: energy from every swing."""
     bounds = []
     for name, formula, energy, unmet in (
-        ("pumping", "energy from a swing, least", least_pumped, TRY_IT),
-        ("swing", "energy from rest to rest, least", least_gain, SURELY_NOT),
+        ("pumping", "energy from a swing, least", min_pumped_energy, TRY_IT),
+        ("swing", "energy from rest to rest, least", min_energy_gain, SURELY_NOT),
     ):
         gained, remedy = energy(swing, drive), ""
         if gained <= 0.0:
-            volts = least_voltage(swing, drive, energy)
+            volts = min_supply_voltage(swing, drive, energy)
             remedy = (
                 f"raise the supply to {volts:.3g} V"
                 if math.isfinite(volts)

@@ -19,7 +19,7 @@ from codrl_mj.actuators.sampled import designed_gains
 from codrl_mj.actuators.sampled_loop import DEFAULT_BANDWIDTH
 from codrl_mj.fields import check_memory
 
-Looped = Drive | DCMotorActuator
+CurrentLoopActuator = Drive | DCMotorActuator
 _SAMPLE_SIZE = (
     500  # memory [bytes] of a sample in the responses to a step, with each kind of anti-windup
 )
@@ -27,7 +27,7 @@ RATES = (10e3, 20e3, 40e3)
 """Sample rates [Hz] that drives commonly have."""
 
 
-def is_closed(one: Looped) -> bool:
+def is_closed(one: CurrentLoopActuator) -> bool:
     """Whether there is a loop: a gain on the error."""
     return isinstance(one, Drive) or any((one.controller.kp, one.controller.ki, one.controller.kd))
 
@@ -42,7 +42,7 @@ def gains(drive: Drive) -> tuple[float, float]:
     return kp, ki * loop.sample_rate
 
 
-def sampled_too_seldom(drive: Drive) -> str:
+def undersampling_warning(drive: Drive) -> str:
     """What to say of less than a sample in three L/R, within which 95 % of a current's change happen; else empty."""
     rate, constant = drive.controller.sample_rate, drive.motor.electrical_time_constant
     text = (
@@ -67,7 +67,7 @@ class _Sampled(NamedTuple):
     delayed: bool = False  # whether the voltage comes a sample late
 
 
-def _sampled(one: Looped, timestep: float | None) -> _Sampled:
+def _sampled(one: CurrentLoopActuator, timestep: float | None) -> _Sampled:
     """The loop of a drive, or of an `DCMotorActuator` at a mechanical step [s]."""
     resistance, inductance = one.winding
     constant = inductance / resistance
@@ -115,7 +115,7 @@ def _sampled(one: Looped, timestep: float | None) -> _Sampled:
     return _Sampled(rate, (loop.kp, loop.ki), over, under, forward, at_once, constant)
 
 
-def open_loop(one: Looped, timestep: float | None = None) -> Any:
+def open_loop(one: CurrentLoopActuator, timestep: float | None = None) -> Any:
     """The loop from error to sampled current, a `control.TransferFunction` in z."""
     import control
 
@@ -123,7 +123,7 @@ def open_loop(one: Looped, timestep: float | None = None) -> Any:
     return control.TransferFunction(loop.over, loop.under, 1.0 / loop.rate)
 
 
-def closed_loop(one: Looped, timestep: float | None = None) -> Any:
+def closed_loop(one: CurrentLoopActuator, timestep: float | None = None) -> Any:
     """The loop from reference to sampled current, a `control.TransferFunction` in z."""
     import control
 
@@ -171,8 +171,8 @@ class Response(NamedTuple):
         )
 
 
-def respond(
-    one: Looped, references: Any, speed: float = 0.0, timestep: float | None = None
+def simulate_loop(
+    one: CurrentLoopActuator, references: Any, speed: float = 0.0, timestep: float | None = None
 ) -> Response:
     """Step a loop one sample at a time, through its own `advance`, from where it has held a current of 0 at its speed.
 
@@ -204,7 +204,7 @@ def respond(
     return Response(time * np.arange(len(rows)), *np.array(rows).T)
 
 
-def small_step(one: Looped, timestep: float | None = None) -> Response:
+def small_step_response(one: CurrentLoopActuator, timestep: float | None = None) -> Response:
     """The step from rest to a current that does not saturate.
 
     It is a tenth of V/R, or what half the voltage makes at once, or `max_current`, whichever is
@@ -214,7 +214,7 @@ def small_step(one: Looped, timestep: float | None = None) -> Response:
     loop, limit = _sampled(one, timestep), one.voltage_limit
     amplitude = min(0.1 * limit / one.winding[0], 0.5 * limit / loop.at_once, loop.most)
     samples = min(max(math.ceil(20.0 * loop.constant * loop.rate), 100), 20_000)
-    return respond(
+    return simulate_loop(
         one, np.full(samples, amplitude if math.isfinite(amplitude) else 1.0), timestep=timestep
     )
 
@@ -247,7 +247,7 @@ class LoopDesign:
     """Of a small step, as a share of it."""
 
 
-def design(one: Looped, timestep: float | None = None) -> LoopDesign:
+def design(one: CurrentLoopActuator, timestep: float | None = None) -> LoopDesign:
     """Judge a current loop: margins of its transfer function, a step of its own.
 
     Raises:
@@ -258,7 +258,7 @@ def design(one: Looped, timestep: float | None = None) -> LoopDesign:
     opened, closed, step = (
         open_loop(one, timestep),
         closed_loop(one, timestep),
-        small_step(one, timestep),
+        small_step_response(one, timestep),
     )
     # margins are searched for on the unit circle, which slow loops and the pole at z = 1 leave
     # exact; python-control's, by the roots of polynomials, are not. At half the sample rate, z =
@@ -325,7 +325,7 @@ _AFTER = 0.1
 """How long the recovery is looked at [s]."""
 
 
-class Steps(NamedTuple):
+class StepResponses(NamedTuple):
     """Step responses of a drive."""
 
     small: Response
@@ -340,10 +340,10 @@ class Steps(NamedTuple):
     """By kind of anti-windup: what it makes of a current that cannot be reached, and of one that can."""
 
 
-def step(drive: Drive) -> Steps:
+def step_responses(drive: Drive) -> StepResponses:
     """Step a drive's current: small, and out of saturation with each kind of anti-windup.
 
-    In saturation 1.8 times of what the voltage can make at `Steps.speed` is asked for, then 0.4
+    In saturation 1.8 times of what the voltage can make at `StepResponses.speed` is asked for, then 0.4
     times of it.
 
     Raises:
@@ -371,7 +371,7 @@ def step(drive: Drive) -> Steps:
         [np.full(round(time * loop.sample_rate), current) for time, current in spans]
     )
     recoveries = {
-        kind: respond(drive.replaced({"controller.anti_windup": kind}), references, speed)
+        kind: simulate_loop(drive.replaced({"controller.anti_windup": kind}), references, speed)
         for kind in ANTI_WINDUPS
     }
-    return Steps(small_step(drive), speed, unreachable, reachable, recoveries)
+    return StepResponses(small_step_response(drive), speed, unreachable, reachable, recoveries)

@@ -47,7 +47,7 @@ def balance(states: np.ndarray) -> np.ndarray:
     return np.inf * (states @ np.array([0.1, 0.4, 5.0, 1.5]))
 
 
-def pumping(task: Task) -> Law:
+def energy_pumping(task: Task) -> Law:
     """Full force in the direction in which the actuated joint moves; at rest in one drawn at random."""
     generator = np.random.default_rng(0)
 
@@ -69,7 +69,7 @@ class Scripted:
             "furuta": ("scripted swing-up and balance", swing_up_and_balance),
         }
         self.description, self._law = laws.get(
-            task.name, ("scripted energy pumping", pumping(task))
+            task.name, ("scripted energy pumping", energy_pumping(task))
         )
         self._task = task
 
@@ -86,6 +86,6 @@ class Scripted:
         return np.abs(np.array(self._task.forces) - force[:, np.newaxis]).argmin(axis=1), None
 
 
-def state_observed(env: Any) -> Any:
+def observe_state(env: Any) -> Any:
     """An environment that shows its mechanical state, in the task's order."""
     return gymnasium.wrappers.TransformObservation(env, lambda _: env.unwrapped.physics.state, None)

@@ -55,7 +55,7 @@ class Swing(NamedTuple):
         return torque - self.friction - added.friction - (self.damping + added.damping) * speed
 
 
-def least_pumped(swing: Swing, drive: Drive) -> float:
+def min_pumped_energy(swing: Swing, drive: Drive) -> float:
     """The energy [J] that full force brings in during a swing, where that is least on the way up: an estimate.
 
     min over E of the integral of push(omega) over theta, with omega = sqrt(2 (E - potential(theta))
@@ -69,7 +69,7 @@ def least_pumped(swing: Swing, drive: Drive) -> float:
     return float(net.sum(axis=1).min() * _STEP)
 
 
-def least_gain(swing: Swing, drive: Drive) -> float:
+def min_energy_gain(swing: Swing, drive: Drive) -> float:
     """The energy [J] that a pendulum gains from rest to rest in a swing, where that is least: the most that there is.
 
     dE/dtheta = push(omega(E - potential(theta))) from each turning point. Whatever else a
@@ -101,8 +101,8 @@ def least_gain(swing: Swing, drive: Drive) -> float:
     )
 
 
-def least_voltage(swing: Swing, drive: Drive, energy: Callable[[Swing, Drive], float]) -> float:
-    """The supply [V] from which `least_pumped` or `least_gain` is positive; infinite where no supply makes it so."""
+def min_supply_voltage(swing: Swing, drive: Drive, energy: Callable[[Swing, Drive], float]) -> float:
+    """The supply [V] from which `min_pumped_energy` or `min_energy_gain` is positive; infinite where no supply makes it so."""
 
     def enough(voltage: float) -> bool:
         return energy(swing, dataclasses.replace(drive, supply=Supply(voltage, drive.sag))) > 0.0

@@ -22,8 +22,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 
-from codrl_mj.runs import checkpoints
-from codrl_mj.runs.files import below, writing
+from codrl_mj.runs import find_checkpoints
+from codrl_mj.runs.files import select_prefix, atomic_write
 
 KEPT = 2
 """Checkpoints that are kept: the last, and the one before in case the last is damaged."""
@@ -121,7 +121,7 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
         for name in tensors:
             with torch.no_grad():
                 operator.attrgetter(name)(model).copy_(torch.tensor(arrays[f"tensor.{name}"]))
-        begun = envs.restore(below("env.", arrays))
+        begun = envs.restore(select_prefix("env.", arrays))
         model._last_obs = arrays["last_obs"].copy() if begun is None else begun
         model._last_episode_starts = arrays["last_episode_starts"].copy()
         if begun is not None:  # environments whose state nobody can set
@@ -136,7 +136,7 @@ def restore(model: BaseAlgorithm, envs: Any, state: State) -> None:
             for name in _DRAWN:
                 setattr(distribution, name, torch.tensor(arrays[f"noise.{name}"]))
         if hasattr(model, "restore"):
-            model.restore(below("model.", arrays))
+            model.restore(select_prefix("model.", arrays))
         numpy_state = facts["random.numpy"]
         np.random.set_state(
             numpy_state | {"state": numpy_state["state"] | {"key": arrays["random.numpy.key"]}}
@@ -173,11 +173,11 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
     content = save(state.arrays, metadata={"run": run, "facts": json.dumps(state.facts)})
     step = f"{state.facts['num_timesteps']:012d}"
     path = folder / f"step-{step}-{_digest(content)}.safetensors"
-    with writing(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())  # on the disk before the last but one is deleted
-    there = checkpoints(folder)
+    there = find_checkpoints(folder)
     before = [other for other, named in there.items() if named["step"] < step]
     # the rest is of the same step or, damaged, of a later one, from which the run fell back
     for superfluous in there.keys() - {path, *before[1 - KEPT :]}:
@@ -187,7 +187,7 @@ def save_checkpoint(folder: Path, state: State, run: str) -> Path:
 
 def load_checkpoint(folder: Path, run: str) -> State | None:
     """The last checkpoint of a run that is intact; None if there is none. Of damaged ones it warns."""
-    for left, (path, named) in reversed(list(enumerate(checkpoints(folder).items()))):
+    for left, (path, named) in reversed(list(enumerate(find_checkpoints(folder).items()))):
         try:
             return _read(path, named["digest"], run)
         except (ValueError, OSError) as error:

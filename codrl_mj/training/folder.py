@@ -28,10 +28,10 @@ from codrl_mj.runs import (
     PROGRESS,
     RESULT,
     TENSORBOARD,
-    checkpoints,
+    find_checkpoints,
     finished,
 )
-from codrl_mj.runs.files import check_writable, leftovers, read_json
+from codrl_mj.runs.files import check_writable, temporary_files, read_json
 from codrl_mj.training.config import TrainConfig
 
 _FILES = {CONFIG, RESULT, EVALUATION, PROGRESS, EPISODES, CURVE, *POLICY_FILES}
@@ -123,7 +123,7 @@ def resuming(run: Path) -> str:
 
 def standing(run: Path) -> str:
     """What there is to go on from in the folder of a training that was broken off, and how."""
-    if kept := checkpoints(run / CHECKPOINTS):
+    if kept := find_checkpoints(run / CHECKPOINTS):
         step = max(int(named["step"]) for named in kept.values())
         return f"Its last checkpoint is of step {step:,}: continue with {resuming(run)}"
     if (run / BEST / EVALUATION).exists():
@@ -136,7 +136,7 @@ def standing(run: Path) -> str:
 
 def _leftovers(place: Path) -> list[Path]:
     """Half-written files of a training."""
-    return [path for path, name in leftovers(place) if name in _FILES or CHECKPOINT.fullmatch(name)]
+    return [path for path, name in temporary_files(place) if name in _FILES or CHECKPOINT.fullmatch(name)]
 
 
 def _sweep(run: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from codrl_mj.evaluation import check_episodes
 from codrl_mj.runs import CONFIG, finished
-from codrl_mj.runs.files import sealed, write_json
+from codrl_mj.runs.files import with_digest, write_json
 from codrl_mj.training import folder
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.training.history import Progress
@@ -83,7 +83,7 @@ def train(
             with contextlib.closing(watcher), watcher.explaining():
                 if record is not None:
                     write_json(
-                        out / CONFIG, sealed(record)
+                        out / CONFIG, with_digest(record)
                     )  # before anything else is in the folder
                 steps = config.total_steps
                 if steps is None:  # those of the longest possible episodes where these are counted

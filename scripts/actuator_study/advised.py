@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from actuator_study import arms
-from codrl_mj.study.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, Prospect, advise, decide
-from codrl_mj.study.doses import AXES, SECONDS, posed
+from codrl_mj.study.advice import BUY, IDEAL, LOOP, MEASURE, THROUGH, LossBounds, advise, decide
+from codrl_mj.study.axes import AXES, SECONDS, study_env
 from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.questions import MARGIN
 
@@ -18,13 +18,13 @@ def tested(task: str) -> dict[str, tuple[str, Any]]:
         {"marginal motor": arms.MARGINAL[task]} if task in arms.MARGINAL else {}
     )
     called = {
-        test: (motor_name(motor), posed(task, motor).actuator) for test, motor in found.items()
+        test: (motor_name(motor), study_env(task, motor).actuator) for test, motor in found.items()
     }
     if task not in arms.LOOPED:
         return called
     loops = {loop: arms.designed(task) if loop == "designed" else loop for loop in LOOPS}
     return called | {
-        loop: (f"paper's motor, {loop} loop", posed(task, one).actuator)
+        loop: (f"paper's motor, {loop} loop", study_env(task, one).actuator)
         for loop, one in loops.items()
     }
 
@@ -39,7 +39,7 @@ def motor_name(motor: Mapping[str, Any]) -> str:
     return f"{motor['name']}, {motor['motor']['gear_ratio']:g}:1{volts}"
 
 
-def measured(evidence: Evidence, task: str, test: str) -> dict[str, Prospect]:
+def measured(evidence: Evidence, task: str, test: str) -> dict[str, LossBounds]:
     """What policies lost on an actuator, by what was done."""
     trained = {IDEAL: ("ideal", test), THROUGH: (test, test)}
     if test in ("weaker", "paper"):
@@ -49,13 +49,13 @@ def measured(evidence: Evidence, task: str, test: str) -> dict[str, Prospect]:
         for name, (arm, there) in trained.items()
     }
     return {
-        name: Prospect(outcome, outcome)
+        name: LossBounds(outcome, outcome)
         for name, outcome in outcomes.items()
         if outcome is not None
     }
 
 
-def judged(said: str, options: Mapping[str, Prospect]) -> str:
+def judged(said: str, options: Mapping[str, LossBounds]) -> str:
     """Whether a verdict is right: what it says to do loses nothing, or surely less than doing nothing."""
     if said == MEASURE:
         return "says nothing"
@@ -74,20 +74,20 @@ def rows(evidence: Evidence) -> Iterator[dict[str, Any]]:
             found = advise(actuator, task, evidence.without(test))
             if IDEAL not in options or not found.options:
                 continue
-            predicted, seen = found.options[IDEAL].least, options[IDEAL].least
+            predicted, seen = found.options[IDEAL].lower, options[IDEAL].lower
             assert predicted is not None
             assert seen is not None
             yield {
                 "task": task,
                 "actuator": name,
-                "beyond": found.options[IDEAL].most is None,
+                "beyond": found.options[IDEAL].upper is None,
                 **{f"predicted_{key}": value for key, value in predicted.loss._asdict().items()},
                 **{f"measured_{key}": value for key, value in seen.loss._asdict().items()},
                 "measured_failed": seen.failed,
                 "measured_success_lost": seen.success_lost.mean,
                 "said": found.verdict,
                 "measured": (
-                    decide(options) if THROUGH in options or seen.spared else "not trained through"
+                    decide(options) if THROUGH in options or seen.is_negligible else "not trained through"
                 ),
                 "judged": judged(found.verdict or MEASURE, options),
             }
@@ -98,12 +98,12 @@ def left_out(evidence: Evidence) -> dict[str, float]:
     errors, flips = [], 0
     for task in SECONDS:
         for axis, known in AXES.items():
-            for dose in known.doses[1:-1]:
+            for dose in known.severities[1:-1]:
                 seen = evidence.loss(task, axis, dose)
                 expected = evidence.without(f"{axis} {dose:g}").loss(task, axis, dose)
                 if seen is not None and expected is not None:
                     errors.append(abs(seen.outcome.loss.mean - expected.outcome.loss.mean))
-                    flips += seen.outcome.spared != expected.outcome.spared
+                    flips += seen.outcome.is_negligible != expected.outcome.is_negligible
     return {
         "doses": len(errors),
         "mean_error": float(np.mean(errors or [0.0])),

@@ -6,8 +6,8 @@ from typing import Any
 
 from codrl_mj.actuators import Drive
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.bench import redesigned
-from codrl_mj.study.doses import AXES, REAL, arm, at_home
+from codrl_mj.study.bench import drive_with_designed_loop
+from codrl_mj.study.axes import AXES, REAL, arm, ideal_trial
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import named_actuator
 
@@ -47,10 +47,10 @@ def drawn(task: str, axis: str, trained: float | None = None) -> Arm:
 
     `trained` is the dose that others are trained through, where it is not the axis' own.
     """
-    most = AXES[axis].at(
-        task, drawn_up_to(axis, AXES[axis].trained[task] if trained is None else trained)
+    most = AXES[axis].make_env(
+        task, drawn_up_to(axis, AXES[axis].training_severity[task] if trained is None else trained)
     )
-    none, actuator = AXES[axis].at(task, 0.0).actuator, most.actuator
+    none, actuator = AXES[axis].make_env(task, 0.0).actuator, most.actuator
     text = {
         "lag": lambda: f"time_constant=uniform(0, {actuator.time_constant:g})",
         "weakness": lambda: f"gain=uniform({actuator.gain:g}, 1)",
@@ -66,25 +66,25 @@ def drawn(task: str, axis: str, trained: float | None = None) -> Arm:
 
 def drawn_up_to(axis: str, trained: float) -> float:
     """The largest dose that is drawn: twice the one that others are trained through, or the largest that is tested."""
-    return min(2.0 * trained, AXES[axis].doses[-1])
+    return min(2.0 * trained, AXES[axis].severities[-1])
 
 
 def designed(task: str) -> Drive:
     """The paper's motor and supply under a designed loop."""
-    return redesigned(named_actuator("paper", task), task)
+    return drive_with_designed_loop(named_actuator("paper", task), task)
 
 
 @functools.cache
 def matched(task: str, axis: str) -> Arm:
     """Trained through one dose of one thing."""
-    return arm(task, axis, AXES[axis].at(task, AXES[axis].trained[task]))
+    return arm(task, axis, AXES[axis].make_env(task, AXES[axis].training_severity[task]))
 
 
 def dosed(arm: Arm, axis: str, dose: float) -> Trial:
     """Policies tested on a dose."""
-    return Trial(arm, f"{axis} {dose:g}", AXES[axis].at(arm.task, dose))
+    return Trial(arm, f"{axis} {dose:g}", AXES[axis].make_env(arm.task, dose))
 
 
 def undosed(arm: Arm, axis: str) -> Trial:
     """Policies tested on none of it: on ideal forces, or on the axis' motor."""
-    return dosed(arm, axis, 0.0) if AXES[axis].own_motor else at_home(arm)
+    return dosed(arm, axis, 0.0) if AXES[axis].motor_at_zero else ideal_trial(arm)

@@ -13,22 +13,22 @@ from codrl_mj.study.advice import (
     BUY,
     IDEAL,
     MEASURE,
-    RANDOMISE,
+    RANDOMIZE,
     THROUGH,
     decide,
     known,
-    tests_through,
+    tested_points,
 )
-from codrl_mj.study.doses import AXES, SECONDS
+from codrl_mj.study.axes import AXES, SECONDS
 from codrl_mj.study.evidence import Evidence
-from codrl_mj.study.pages import COLOURS, MARKERS, TITLES, legend, save
+from codrl_mj.study.pages import COLORS, MARKERS, TITLES, add_legend, save_figure
 from codrl_mj.study.questions import Scores
 from codrl_mj.study.trials import Trial
 
 _LOWEST = -0.1  # of the span; what is worse is as lost
 _REGIONS = {
     IDEAL: "#d9f0e3",
-    RANDOMISE: "#dbe9f6",
+    RANDOMIZE: "#dbe9f6",
     THROUGH: "#fdebc8",
     BUY: "#f6d5cc",
     MEASURE: "#eeeeee",
@@ -38,7 +38,7 @@ _REGIONS = {
 def losses(path: Path, evidence: Evidence) -> bool:
     """Draw what ideal-trained policies lose, a panel for each axis, a row for each task, a column for each dose.
 
-    A cell has the mean loss, and below it how many policies lose more than `FAILED`, where any
+    A cell has the mean loss, and below it how many policies lose more than `FAILURE_MARGIN`, where any
     does.
 
     Returns:
@@ -50,9 +50,9 @@ def losses(path: Path, evidence: Evidence) -> bool:
     panels: Any = figure.subplots(2, 3).ravel()
     drawn = False
     for number, (panel, (name, axis)) in enumerate(zip(panels, AXES.items(), strict=True)):
-        means = np.full((len(SECONDS), len(axis.doses) - 1), np.nan)
+        means = np.full((len(SECONDS), len(axis.severities) - 1), np.nan)
         for row, task in enumerate(SECONDS):
-            for column, dose in enumerate(axis.doses[1:]):
+            for column, dose in enumerate(axis.severities[1:]):
                 if (found := evidence.loss(task, name, dose)) is None:
                     continue
                 outcome, drawn = found.outcome, True
@@ -65,12 +65,12 @@ def losses(path: Path, evidence: Evidence) -> bool:
         shown = panel.imshow(
             np.clip(means, 0.0, 1.0), cmap="YlOrBr", vmin=0.0, vmax=1.0, aspect="auto"
         )
-        panel.set_xticks(range(len(axis.doses) - 1), [f"{dose:g}" for dose in axis.doses[1:]])
+        panel.set_xticks(range(len(axis.severities) - 1), [f"{dose:g}" for dose in axis.severities[1:]])
         named = [f"{TITLES[task]}\n{size(task)}" for task in SECONDS]
         panel.set_yticks(range(len(SECONDS)), named if number % 3 == 0 else [], fontsize=8)
         panel.set(xlabel=axis.unit, title=THINGS[name].capitalize())
     figure.colorbar(shown, ax=panels, label="lost [share of the span]", shrink=0.6)
-    save(figure, path)
+    save_figure(figure, path)
     return drawn
 
 
@@ -96,7 +96,7 @@ def insured(path: Path, evidence: Evidence) -> bool:
             trained = {"drawn": f"{name}, drawn", "matched": name}
             for number, (kind, label) in enumerate(kinds.items()):
                 found = evidence.outcome(
-                    task, trained.get(kind, kind), f"{name} {axis.trained[task]:g}"
+                    task, trained.get(kind, kind), f"{name} {axis.training_severity[task]:g}"
                 )
                 if found is not None:
                     drawn = True
@@ -104,11 +104,11 @@ def insured(path: Path, evidence: Evidence) -> bool:
                         panel,
                         place + 0.19 * (number - 1.5),
                         1.0 - found.lost,
-                        COLOURS[number],
+                        COLORS[number],
                         label,
                     )
         named = [
-            f"{thing} {dose_text(task, name, AXES[name].trained[task])}"
+            f"{thing} {dose_text(task, name, AXES[name].training_severity[task])}"
             for name, thing in THINGS.items()
         ]
         panel.set_xticks(range(len(AXES)), named)
@@ -116,8 +116,8 @@ def insured(path: Path, evidence: Evidence) -> bool:
         panel.grid(axis="y", color="0.9")
         panel.set_axisbelow(True)
     if drawn:
-        legend(figure, 4)
-    save(figure, path)
+        add_legend(figure, 4)
+    save_figure(figure, path)
     return drawn
 
 
@@ -153,7 +153,7 @@ def bars(
             if values.size:
                 at = place + 0.8 * ((number + 0.5) / len(each) - 0.5)
                 kind = labels.index(label)
-                colour, marker = COLOURS[kind % len(COLOURS)], MARKERS[kind % len(MARKERS)]
+                colour, marker = COLORS[kind % len(COLORS)], MARKERS[kind % len(MARKERS)]
                 seen = np.maximum(values, _LOWEST)
                 axes.plot(
                     np.full(len(seen), at + 0.06), seen, ".", color=colour, markersize=3, alpha=0.6
@@ -163,8 +163,8 @@ def bars(
     axes.set(ylabel="score [share of the span]", title=title, xlim=(-0.5, len(groups) - 0.5))
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
-    legend(figure, 3)
-    save(figure, path)
+    add_legend(figure, 3)
+    save_figure(figure, path)
 
 
 def chart(path: Path, evidence: Evidence) -> bool:
@@ -191,7 +191,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
     panels: Any = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
     none, seen = dict.fromkeys(AXES, 0.0), set[int]()
     for panel, task in zip(panels, tasks, strict=False):
-        points = tests_through(evidence, task)
+        points = tested_points(evidence, task)
         regions = np.array(
             [
                 [
@@ -238,12 +238,12 @@ def chart(path: Path, evidence: Evidence) -> bool:
         )
     )
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize="small")
-    save(figure, path)
+    save_figure(figure, path)
     return True
 
 
 def _values(scores: Scores, trial: Trial) -> np.ndarray:
-    return np.array(list(scores.of(trial).values()))
+    return np.array(list(scores.by_seed(trial).values()))
 
 
 def _bars(

@@ -20,13 +20,13 @@ from actuator_study.questions import (
 )
 from actuator_study.units import THINGS, dose_text, scale, short, size
 from codrl_mj.runs.files import write_json
-from codrl_mj.study.advice import BUY, IDEAL, RANDOMISE, THROUGH
-from codrl_mj.study.doses import AXES, FLOORS, SECONDS, at_home, ideal
+from codrl_mj.study.advice import BUY, IDEAL, RANDOMIZE, THROUGH
+from codrl_mj.study.axes import AXES, FLOORS, SECONDS, ideal_trial, ideal
 from codrl_mj.study.evidence import STUDIES, Evidence, Outcome
-from codrl_mj.study.inference import detectable
-from codrl_mj.study.pages import TITLES, conclusions, markdown_table, write_csv, write_page
+from codrl_mj.study.inference import detectable_difference
+from codrl_mj.study.pages import TITLES, read_conclusions, markdown_table, write_csv, write_page
 from codrl_mj.study.questions import LEVEL, MARGIN, Scores, Verdict, judge
-from codrl_mj.study.trials import FAILED, RUNS, TOTALS, Collected, Trial, run_rows, trial_rows
+from codrl_mj.study.trials import FAILURE_MARGIN, RUNS, TOTALS, Collected, Trial, run_rows, trial_rows
 
 PAGE, FOLDER = "actuators.md", "actuators"
 """The page, and the folder beside it with its figures and tables."""
@@ -54,7 +54,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
     """
     folder, scores = (
         out / FOLDER,
-        Scores(collected, FLOORS, [at_home(ideal(task)) for task in SECONDS]),
+        Scores(collected, FLOORS, [ideal_trial(ideal(task)) for task in SECONDS]),
     )
     first, others = judge(scores, primary(), primary=True), judge(scores, secondary())
     tables = write_tables(folder, collected, scores, first, others)
@@ -64,7 +64,7 @@ def write(collected: Collected, out: Path) -> list[Path]:
     drawn = _draw(scores, evidence, folder)
     parts = [
         "# What does an actuator cost?\n",
-        conclusions(out / PAGE),
+        read_conclusions(out / PAGE),
         _borne(evidence, drawn),
         _insured(drawn),
         _motors(evidence, drawn),
@@ -87,8 +87,8 @@ def write_tables(
 ) -> list[Path]:
     """Write a row for every policy and test, for every trial and for every question, and what the trainings took."""
     tables = {
-        RUNS: run_rows(collected, scores.of),
-        TRIALS: trial_rows(collected, scores.of),
+        RUNS: run_rows(collected, scores.by_seed),
+        TRIALS: trial_rows(collected, scores.by_seed),
         HYPOTHESES: (verdict.row(len(first)) for verdict in (*first, *others)),
     }
     for name, table in tables.items():
@@ -117,7 +117,7 @@ def _draw(scores: Scores, evidence: Evidence, folder: Path) -> dict[str, Path]:
     for task in SECONDS:
         home = ideal(task)
         motors[TITLES[task].replace("Continuous ", "Continuous\n")] = [
-            ("ideal-trained, on ideal forces", at_home(home)),
+            ("ideal-trained, on ideal forces", ideal_trial(home)),
             ("ideal-trained, on the good motor", on_motor(home, "good")),
             *(
                 [
@@ -147,17 +147,17 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
         for name, axis in AXES.items():
             known = [
                 (dose, one.outcome)
-                for dose in axis.doses[1:]
+                for dose in axis.severities[1:]
                 if (one := evidence.loss(task, name, dose))
             ]
-            borne = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].spared, known)]
-            hurt = next(((dose, one) for dose, one in known if one.hurt), None)
+            borne = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].is_negligible, known)]
+            is_harmful = next(((dose, one) for dose, one in known if one.is_harmful), None)
             factor, of = scale(task, name)
             text = f"≤{short(factor * borne[-1] if borne else 0.0)}"
-            if hurt is not None:
+            if is_harmful is not None:
                 text += (
-                    f", ≥{short(factor * hurt[0])} {of}"
-                    f" ({round(hurt[1].failed * len(hurt[1].lost))})"
+                    f", ≥{short(factor * is_harmful[0])} {of}"
+                    f" ({round(is_harmful[1].failed * len(is_harmful[1].lost))})"
                 )
             else:
                 text += f" {of}"
@@ -165,8 +165,8 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
     return f"""## What policies bear
 
 Up to the first number it is harmless: ideal-trained policies lose at most {MARGIN:g} of the score on the mean, surely
-at most {FAILED:g}, and a tenth of their success. From the second on it hurts: they surely lose more than {FAILED:g},
-or a tenth of their success. In brackets: how many of 20 fail there, by losing more than {FAILED:g}. Between the two,
+at most {FAILURE_MARGIN:g}, and a tenth of their success. From the second on it hurts: they surely lose more than {FAILURE_MARGIN:g},
+or a tenth of their success. In brackets: how many of 20 fail there, by losing more than {FAILURE_MARGIN:g}. Between the two,
 measure.
 
 *Lag* is a time constant: a loop of bandwidth f has 1/(2 π f). *Missing force* is the share that a gear loses,
@@ -181,7 +181,7 @@ def _insured(drawn: Mapping[str, Path]) -> str:
     if "insured" not in drawn:
         return ""
     rows = [
-        [TITLES[task], *(dose_text(task, name, axis.trained[task]) for name, axis in AXES.items())]
+        [TITLES[task], *(dose_text(task, name, axis.training_severity[task]) for name, axis in AXES.items())]
         for task in arms.TRAINED
     ]
     return f"""## Train through it, or randomise?
@@ -204,7 +204,7 @@ def _motors(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
             if test.endswith("motor"):
                 told = advised.measured(evidence, task, test)
                 cells = [
-                    _lost(told[kind].most) if kind in told else "–" for kind in (IDEAL, THROUGH)
+                    _lost(told[kind].upper) if kind in told else "–" for kind in (IDEAL, THROUGH)
                 ]
                 rows.append([TITLES[task], name, test.removesuffix(" motor"), *cells])
     header = ["task", "motor, gear", "", "trained on ideal forces", "trained through it"]
@@ -257,7 +257,7 @@ def _advised(
     right = collections.Counter(one["said"] for one in said if one["judged"] == "right")
     never = [
         f"*{verdict}*"
-        for verdict in (RANDOMISE, THROUGH, BUY)
+        for verdict in (RANDOMIZE, THROUGH, BUY)
         if verdict not in {one["said"] for one in said}
     ]
     left = advised.left_out(evidence)
@@ -297,7 +297,7 @@ def _verdicts(verdicts: Sequence[Verdict], others: Sequence[Verdict]) -> str:
                 verdict.question.name,
                 verdict.outcome,
                 effect_text(verdict),
-                p_text(verdict.corrected),
+                p_text(verdict.corrected_p),
                 says,
             ]
         )
@@ -345,7 +345,7 @@ def decided_table(verdicts: Sequence[Verdict], titles: Mapping[str, str]) -> str
         beyond = sum(one.effect.low > MARGIN or one.effect.high < -MARGIN for one in decided)
         rows.append([title, *map(str, (len(mine), len(decided), beyond))])
     return markdown_table(
-        ["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"], rows, numbers=3
+        ["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"], rows, numeric_columns=3
     )
 
 
@@ -401,10 +401,10 @@ page, [hypotheses]({FOLDER}/{HYPOTHESES}), [trials]({FOLDER}/{TRIALS}), [runs]({
     text = f"""A score is the mean return over {grid.episodes} test episodes in shares of the span: 0 is what random
 actions get on ideal forces, 1 what ideal-trained policies get there on the mean ({"; ".join(known) or "none yet"}).
 CartPole's return is the paper's: steps within 0.1 m of the centre. In {TRIALS} *failed* is the share of policies that
-score below {1 - FAILED:g}. Effects are differences of mean scores; policies
+score below {1 - FAILURE_MARGIN:g}. Effects are differences of mean scores; policies
 count once on every task. Intervals are by Student's t, p of permutation tests, of equivalence by two one-sided ones
 with a margin of {MARGIN:g}; primary ones are corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds
-a difference of {detectable(runs, LEVEL / 12):.2f} standard deviations is found with a chance of 80 % at the strictest
+a difference of {detectable_difference(runs, LEVEL / 12):.2f} standard deviations is found with a chance of 80 % at the strictest
 level."""
     wrapped = (
         textwrap.fill(" ".join(each.split()), 120, break_long_words=False) for each in (about, text)

@@ -19,14 +19,14 @@ from actuator_study.arms import (
 )
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.doses import AXES, SECONDS, arm, at_home, generic, ideal, posed
+from codrl_mj.study.axes import AXES, SECONDS, arm, ideal_trial, generic, ideal, study_env
 from codrl_mj.study.questions import Contrast, Question
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
 
 
 def _trained_dose(arm: Arm, axis: str) -> Trial:
-    return dosed(arm, axis, AXES[axis].trained[arm.task])
+    return dosed(arm, axis, AXES[axis].training_severity[arm.task])
 
 
 def _contrasts(axis: str, one: Any, other: Any) -> tuple[Contrast, ...]:
@@ -45,25 +45,25 @@ def _generic(task: str) -> Arm:
 def on_loop(arm: Arm, loop: str) -> Trial:
     """Policies tested on the paper's motor under a loop."""
     return Trial(
-        arm, loop, posed(arm.task, arms.designed(arm.task) if loop == "designed" else loop)
+        arm, loop, study_env(arm.task, arms.designed(arm.task) if loop == "designed" else loop)
     )
 
 
 def through_loop(task: str, loop: str) -> Arm:
     """Trained on the paper's motor under a loop."""
-    return arm(task, loop, posed(task, arms.designed(task) if loop == "designed" else loop))
+    return arm(task, loop, study_env(task, arms.designed(task) if loop == "designed" else loop))
 
 
 def on_motor(arm: Arm, kind: str) -> Trial:
     """Policies tested on a motor of the catalogue."""
     chosen = {"good": GOOD, "marginal": MARGINAL}[kind]
-    return Trial(arm, f"{kind} motor", posed(arm.task, chosen[arm.task]))
+    return Trial(arm, f"{kind} motor", study_env(arm.task, chosen[arm.task]))
 
 
 def through_motor(task: str, otherwise: str = "", **changes: Any) -> Arm:
     """Trained through the marginal motor of the catalogue, with changes that have a name."""
     named = ", ".join(filter(None, ["marginal motor", otherwise]))
-    return arm(task, named, posed(task, MARGINAL[task], **changes))
+    return arm(task, named, study_env(task, MARGINAL[task], **changes))
 
 
 WRONG: dict[str, tuple[str, float]] = {
@@ -79,7 +79,7 @@ does not know of is an axis of its own, `weakness`.
 def wrong_motors(task: str) -> dict[str, EnvConfig]:
     """The actuator `weaker`, otherwise than trained through, by name: `WRONG`, and shares of the largest force."""
     nominal, step, force = (
-        posed(task, "weaker"),
+        study_env(task, "weaker"),
         find_task(task).step_duration,
         find_task(task).max_force,
     )
@@ -109,7 +109,7 @@ def wrong_motors(task: str) -> dict[str, EnvConfig]:
 
 def identified(task: str) -> Arm:
     """Trained on what an identification leaves open: R within 2 %, L within 10 %, for every episode anew."""
-    nominal = posed(task, "weaker")
+    nominal = study_env(task, "weaker")
     motor = nominal.actuator.motor
 
     def around(name: str, share: float) -> str:
@@ -197,7 +197,7 @@ def primary() -> list[Question]:
             "motors",
             "On a good motor that exists, ideal-trained policies score as high as on ideal forces",
             tuple(
-                Contrast(on_motor(ideal(task), "good"), at_home(ideal(task))) for task in SECONDS
+                Contrast(on_motor(ideal(task), "good"), ideal_trial(ideal(task))) for task in SECONDS
             ),
             "equivalent",
         ),
@@ -223,7 +223,7 @@ def secondary() -> list[Question]:
     for task in SECONDS:
         home = ideal(task)
         for axis, described in AXES.items():
-            for dose in described.doses[1:]:
+            for dose in described.severities[1:]:
                 says = f"{task}, ideal-trained: {axis} {dose:g} over none"
                 found.append(("matters", says, dosed(home, axis, dose), undosed(home, axis)))
     for task in TRAINED:
@@ -258,11 +258,11 @@ def secondary() -> list[Question]:
     for task in SECONDS:
         home = ideal(task)
         found.append(
-            ("motors", f"{task}: good motor over ideal", on_motor(home, "good"), at_home(home))
+            ("motors", f"{task}: good motor over ideal", on_motor(home, "good"), ideal_trial(home))
         )
     for task in MARGINAL:
         there = on_motor(ideal(task), "marginal")
-        found.append(("motors", f"{task}: marginal motor over ideal", there, at_home(ideal(task))))
+        found.append(("motors", f"{task}: marginal motor over ideal", there, ideal_trial(ideal(task))))
         says = f"{task}, marginal motor: trained through it over ideal-trained"
         found.append(("motors", says, on_motor(through_motor(task), "marginal"), there))
     told = [

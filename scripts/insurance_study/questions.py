@@ -8,7 +8,7 @@ from actuator_study.arms import DRAWN
 from actuator_study.arms import drawn as drawn_doses
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.doses import AXES, arm, at_home, ideal, posed, timestep
+from codrl_mj.study.axes import AXES, arm, ideal_trial, ideal, study_env, timestep
 from codrl_mj.study.questions import Contrast, Question
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
@@ -16,7 +16,7 @@ from insurance_study.late import Late
 
 TASKS = ("pendulum", "furuta", "acrobot")
 DOSES: Mapping[str, Mapping[str, float]] = {
-    task: {axis: one.trained[task] for axis, one in AXES.items()} for task in TASKS
+    task: {axis: one.training_severity[task] for axis, one in AXES.items()} for task in TASKS
 }
 """Task -> axis -> the dose that is trained through and tested: on Acrobot the smallest that surely
 hurts ideal-trained policies, or, where none does, the largest.
@@ -33,7 +33,7 @@ REMEMBERED = ("lag", "delay")
 
 def reach(task: str, axis: str) -> float:
     """The largest dose that random actuators have: twice the harmless one, or the smallest that was tested."""
-    return max(2.0 * HARMLESS[task][axis], AXES[axis].doses[1])
+    return max(2.0 * HARMLESS[task][axis], AXES[axis].severities[1])
 
 
 def late(task: str, **fields: float) -> Late:
@@ -63,7 +63,7 @@ def generic(
         pulse_force=0.25 * share * force, pulse_duration=step, pulse_interval=10 * step
     )
     fields: dict[str, Any] = {"disturbances": pushes} if pushed else {}
-    return arm(task, named, posed(task, late(task), randomize=drawn, **fields))
+    return arm(task, named, study_env(task, late(task), randomize=drawn, **fields))
 
 
 @functools.cache
@@ -71,7 +71,7 @@ def pushes(task: str) -> Arm:
     """Trained on random pushes and nothing else."""
     step, force = find_task(task).step_duration, find_task(task).max_force
     pushed = Disturbances(pulse_force=0.25 * force, pulse_duration=step, pulse_interval=10 * step)
-    return arm(task, "random pushes alone", posed(task, disturbances=pushed))
+    return arm(task, "random pushes alone", study_env(task, disturbances=pushed))
 
 
 def strength(task: str) -> Arm:
@@ -92,7 +92,7 @@ def double(task: str) -> Arm:
 @functools.cache
 def through(task: str, axis: str) -> Arm:
     """Trained through the dose of one thing."""
-    return arm(task, axis, AXES[axis].at(task, DOSES[task][axis]))
+    return arm(task, axis, AXES[axis].make_env(task, DOSES[task][axis]))
 
 
 @functools.cache
@@ -104,7 +104,7 @@ def drawn(task: str, axis: str) -> Arm:
 def remembered(task: str, axis: str, dose: float) -> EnvConfig:
     """A lag or a delay under a policy that sees its last four commands."""
     seconds = dose * find_task(task).step_duration
-    return posed(
+    return study_env(
         task,
         late(task, **{{"lag": "time_constant"}.get(axis, axis): seconds}),
         observe_actuator=True,
@@ -122,19 +122,19 @@ def under(arm: Arm, axis: str, dose: float | None = None) -> Trial:
     dose = DOSES[arm.task][axis] if dose is None else dose
     if arm.config.env.observe_actuator:
         return Trial(arm, f"{axis} {dose:g}, remembering", remembered(arm.task, axis, dose))
-    return Trial(arm, f"{axis} {dose:g}", AXES[axis].at(arm.task, dose))
+    return Trial(arm, f"{axis} {dose:g}", AXES[axis].make_env(arm.task, dose))
 
 
 def home(arm: Arm) -> Trial:
     """Policies on ideal forces."""
     if arm.config.env.observe_actuator:
         return Trial(arm, "ideal, remembering", remembered(arm.task, "lag", 0.0))
-    return at_home(arm)
+    return ideal_trial(arm)
 
 
 def neighbours(task: str, axis: str) -> dict[str, float]:
     """The doses below and above the trained one, of those that the first study tested; none is no dose."""
-    doses, at = AXES[axis].doses, AXES[axis].doses.index(DOSES[task][axis])
+    doses, at = AXES[axis].severities, AXES[axis].severities.index(DOSES[task][axis])
     found = {"less": doses[at - 1], "more": doses[at + 1] if at + 1 < len(doses) else 0.0}
     return {which: dose for which, dose in found.items() if dose}
 
@@ -281,7 +281,7 @@ def secondary() -> list[Question]:
 def trials() -> tuple[Trial, ...]:
     """Every trial of the study once, those of the first study's arms among them."""
     both = [pair for question in (*primary(), *secondary()) for pair in question.contrasts]
-    homes = [Contrast(at_home(ideal(task)), at_home(ideal(task))) for task in TASKS]
+    homes = [Contrast(ideal_trial(ideal(task)), ideal_trial(ideal(task))) for task in TASKS]
     return tuple({trial.name: trial for pair in (*both, *homes) for trial in pair}.values())
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from codrl_mj.study.doses import CENTRE_RADIUS
-from codrl_mj.study.pages import COLOURS, legend, save
+from codrl_mj.study.axes import CENTER_RADIUS
+from codrl_mj.study.pages import COLORS, add_legend, save_figure
 from codrl_mj.tasks import (
     acrobot,
     cartpole,
@@ -23,9 +23,9 @@ from reproduction.rows import LAST
 from reproduction.value_iteration import Optimum
 
 STYLES = {
-    "ideal": (COLOURS[0], "--"),
-    "paper gains": (COLOURS[2], "-"),
-    "fast gains": (COLOURS[1], "-."),
+    "ideal": (COLORS[0], "--"),
+    "paper gains": (COLORS[2], "-"),
+    "fast gains": (COLORS[1], "-."),
 }
 """Of an arm, by its motor: colour and dashes."""
 SETTINGS = {"paper": "as printed", "repaired": "repaired"}
@@ -36,7 +36,7 @@ LEARNED = {
     "counts": "number of\nepisodes",
 }
 """What learning curves are called."""
-_ERROR = COLOURS[3]
+_ERROR = COLORS[3]
 _WIDTH = 8.0  # in
 
 
@@ -90,7 +90,7 @@ CURVES: dict[str, list[StateCurve]] = {
     ],
     "cartpole": _entries(
         "cartpole",
-        {0: (-CENTRE_RADIUS, CENTRE_RADIUS), 2: (-cartpole.ANGLE_LIMIT, cartpole.ANGLE_LIMIT)},
+        {0: (-CENTER_RADIUS, CENTER_RADIUS), 2: (-cartpole.ANGLE_LIMIT, cartpole.ANGLE_LIMIT)},
     ),
 }
 """What is drawn of each task's states: the paper's curves, and every entry of the state."""
@@ -145,8 +145,8 @@ def draw_learning(path: Path, task: str, curves: Table) -> bool:
     all_axes[-1, 0].set_xlabel("training episode" if len(names) == 1 else "epoch of 4000 steps")
     if len(names) == 1:
         all_axes[0, 0].set_ylabel(f"return, mean of last {LAST}")
-    legend(figure, 2 if repaired else 3)
-    save(figure, path)
+    add_legend(figure, 2 if repaired else 3)
+    save_figure(figure, path)
     return True
 
 
@@ -183,8 +183,8 @@ def draw_torque(path: Path, task: str, torques: Table) -> bool:
         )
         axes.set(ylabel=f"torque [N·m],\n{motor}")
     all_axes[-1, 0].set_xlabel("time [s]")
-    legend(figure, 3)
-    save(figure, path)
+    add_legend(figure, 3)
+    save_figure(figure, path)
     return True
 
 
@@ -219,8 +219,8 @@ def draw_states(path: Path, task: str, states: Table) -> bool:
             )
         axes.set_ylabel(curve.label.replace("_dot", "'"), fontsize="small")
     all_axes[-1, 0].set_xlabel("time [s]")
-    legend(figure, 3)
-    save(figure, path)
+    add_legend(figure, 3)
+    save_figure(figure, path)
     return True
 
 
@@ -240,7 +240,7 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
     """
     figure, ((worth, drive),) = _panels(1, 2)
     discounts = np.array(list(values))
-    worth.plot(1 - discounts, list(values.values()), color=COLOURS[0], marker=".")
+    worth.plot(1 - discounts, list(values.values()), color=COLORS[0], marker=".")
     worth.set_xscale("log")
     worth.invert_xaxis()
     marked = [one.discount for one in optima]
@@ -248,7 +248,7 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
         [1 - discount for discount in marked], [f"{discount:g}" for discount in marked], rotation=45
     )
     worth.set_xticks([], minor=True)
-    worth.axvline(1 - marked[0], color=COLOURS[2], linestyle="--", linewidth=1)
+    worth.axvline(1 - marked[0], color=COLORS[2], linestyle="--", linewidth=1)
     worth.annotate(
         "the paper's",
         (1 - marked[0], 0.5 * max(values.values())),
@@ -264,7 +264,7 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
         drive.plot(
             times,
             one.episode.state[:, 0],
-            color=COLOURS[index],
+            color=COLORS[index],
             linestyle=style,
             label=f"{one.discount:g}",
         )
@@ -272,8 +272,8 @@ def draw_discounts(path: Path, values: Mapping[float, float], optima: Sequence[O
     drive.set(
         xlabel="time [s]", ylabel="x [m]", xlim=(0, 120), title="best policy at discount factor"
     )
-    legend(figure, 5)
-    save(figure, path)
+    add_legend(figure, 5)
+    save_figure(figure, path)
 
 
 def _panels(rows: int, columns: int, row_height: float = 2.6, sharey: bool = False) -> Any:

@@ -16,7 +16,7 @@ from codrl_mj.sizing import (
     explain,
     find_drive,
     find_entry,
-    respond,
+    simulate_loop,
     torque_limits,
 )
 
@@ -50,7 +50,7 @@ def test_the_limits_are_where_the_drive_ends_up(most, sag):
     drive = Drive(GearMotor(gear_ratio=3.0), SampledLoop(max_current=most), Supply(24.0, sag))
     speeds = np.linspace(-1.3, 1.3, 14) * 24.0 / 0.042
     for bound, ask in zip(torque_limits(drive, speeds / 3.0, most), (-1e3, 1e3), strict=True):
-        ends = [respond(drive, np.full(100, ask), speed).current[-1] for speed in speeds]
+        ends = [simulate_loop(drive, np.full(100, ask), speed).current[-1] for speed in speeds]
         np.testing.assert_allclose(bound, 3.0 * 0.042 * np.array(ends), rtol=1e-6, atol=1e-9)
 
 

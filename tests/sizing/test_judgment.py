@@ -24,11 +24,11 @@ from codrl_mj.sizing import (
     choose,
     demand_of,
     demands_of,
-    equal_gears,
+    equivalent_gears,
     feasibility,
     find_drive,
-    geared,
-    recorded,
+    with_best_gear,
+    demand_from_arrays,
 )
 from codrl_mj.training import TrainConfig
 from tests.external_envs.models import ARM, ArmEnv
@@ -68,7 +68,7 @@ def pololu(tmp_path):
 def swinging(torque=0.1, amplitude=1.0, omega=4.0, **changes):
     """A task's demand over one period: a torque with the angle's shape, at the joint."""
     time = np.linspace(0.0, 2.0 * math.pi / omega, 2001)
-    found = recorded(time, torque * np.cos(omega * time), amplitude * omega * np.cos(omega * time))
+    found = demand_from_arrays(time, torque * np.cos(omega * time), amplitude * omega * np.cos(omega * time))
     return dataclasses.replace(found, exact=False, **changes)
 
 
@@ -164,18 +164,18 @@ def test_the_shares_of_rotor_and_friction_are_part_of_the_judgment():
     for inertia, verdict in ((0.98 * limit, SURELY), (1.02 * limit, TRY_IT)):
         assert feasibility(drive(rotor_inertia=inertia), demand, COOL).verdict == verdict
     heavy = feasibility(drive(rotor_inertia=4.0 * limit, gear_ratio=3.0), demand, COOL)
-    (rotor,) = heavy.in_the_way
+    (rotor,) = heavy.failed_bounds
     assert (rotor.name, rotor.available) == ("rotor", 50.0)
     assert rotor.needed == pytest.approx(50.0 * 36.0, rel=1e-3)
     assert "lower the gear to" not in rotor.remedy  # it would be 0.5
     within = feasibility(drive(rotor_inertia=limit / 4.0, gear_ratio=3.0), demand, COOL)
-    assert "lower the gear to 2, or let policies command voltage" in within.why
+    assert "lower the gear to 2, or let policies command voltage" in within.reason
     for friction, verdict in ((0.00249, SURELY), (0.00251, TRY_IT)):
         rubbing = drive(rotor_inertia=LIGHT, coulomb_friction=friction, gear_ratio=2.0)
         assert feasibility(rubbing, demand, COOL).verdict == verdict
     (rubs,) = feasibility(
         drive(rotor_inertia=LIGHT, coulomb_friction=0.01, gear_ratio=4.0), demand, COOL
-    ).in_the_way
+    ).failed_bounds
     assert rubs.needed == pytest.approx(40.0)
     assert "take a smaller motor, or train with it" in rubs.remedy
 
@@ -190,7 +190,7 @@ def test_a_motor_of_which_policies_failed_is_not_sure_and_its_gears_are_told_apa
     assert shares == sorted(shares)
     assert shares[0] < 0.5 < 1.0 < shares[1] < 3.0 < shares[2]
     assert all(
-        "friction: Coulomb friction, share of the largest load" in one.lacks for one in choices
+        "friction: Coulomb friction, share of the largest load" in one.rejection_reason for one in choices
     )
 
 
@@ -201,11 +201,11 @@ def test_without_a_rotor_inertia_it_depends_on_one_that_is_said():
     demand = swinging()
     unknown = feasibility(drive(rotor_inertia=0.0), demand, COOL)
     assert unknown.verdict == DEPENDS
-    (rotor,) = unknown.in_the_way
+    (rotor,) = unknown.failed_bounds
     assert rotor.available == pytest.approx(0.5 * 0.1 / 16.0, rel=2e-3)
     assert (
         "its inertia is not known: give rotor_inertia, must be at most 0.00312 kg*m^2 at the motor"
-        in unknown.why
+        in unknown.reason
     )
     for share, verdict in ((0.99, SURELY), (1.01, TRY_IT)):
         assert (
@@ -213,7 +213,7 @@ def test_without_a_rotor_inertia_it_depends_on_one_that_is_said():
             == verdict
         )
     steady = dataclasses.replace(
-        recorded(np.arange(3.0), np.full(3, 0.1), np.full(3, 1.0)), exact=False
+        demand_from_arrays(np.arange(3.0), np.full(3, 0.1), np.full(3, 1.0)), exact=False
     )
     assert (
         feasibility(drive(rotor_inertia=0.0), steady, COOL).verdict == SURELY
@@ -224,7 +224,7 @@ def test_without_a_continuous_current_it_depends_on_the_heat():
     found = feasibility(drive(rotor_inertia=LIGHT), swinging())
     assert found.verdict == DEPENDS
     rms = 0.1 / 0.05 / math.sqrt(2.0)
-    assert f"heat: its continuous current is not known, must be at least {rms:.3g} A" in found.why
+    assert f"heat: its continuous current is not known, must be at least {rms:.3g} A" in found.reason
 
 
 # one judgment
@@ -234,28 +234,28 @@ def test_feasible_and_choose_judge_alike_and_in_the_same_words(furuta, pololu, c
     monkeypatch.setattr("codrl_mj.sizing.demand_of", lambda *_, **__: furuta)
     for name in (*map(str, pololu), "quanser-qube-servo-2", "maxon-re65"):
         (choice,) = choose(furuta, [name])
-        assert choice.feasibility.why in choice.lacks
+        assert choice.feasibility.reason in choice.rejection_reason
         assert (
             main(["motor", "feasible", name, "furuta", "--gear-ratio", f"{choice.ratio:.9g}"]) == 0
         )
         printed = " ".join(capsys.readouterr().out.split())
         assert printed.endswith(f" {choice.feasibility.verdict}")
-        for bound in choice.feasibility.in_the_way:
+        for bound in choice.feasibility.failed_bounds:
             assert str(bound) in printed
-            assert str(bound) in choice.lacks
+            assert str(bound) in choice.rejection_reason
 
 
 def test_the_best_gear_is_the_same_for_both_and_gears_nothing_up(furuta):
     ec45, re65 = (find_drive(name) for name in ("maxon-ec45-flat-50w", "maxon-re65"))
     for motor in (ec45, re65):
-        assert geared(motor, furuta).motor.gear_ratio >= 1.0
+        assert with_best_gear(motor, furuta).motor.gear_ratio >= 1.0
     (choice,) = choose(furuta, ["maxon-ec45-flat-50w"])
-    assert choice.ratio == pytest.approx(geared(ec45, furuta, 2.52).motor.gear_ratio, rel=0.02)
+    assert choice.ratio == pytest.approx(with_best_gear(ec45, furuta, 2.52).motor.gear_ratio, rel=0.02)
     best, demand = (
-        geared(find_drive("quanser-qube-servo-3"), swinging(1.0, 2.0)),
+        with_best_gear(find_drive("quanser-qube-servo-3"), swinging(1.0, 2.0)),
         swinging(1.0, 2.0),
     )
-    low, high = equal_gears(best, demand)
+    low, high = equivalent_gears(best, demand)
     verdict = feasibility(best, demand).verdict
     assert low < 1.0 / best.arm_radius < high
     for ratio, same in (
@@ -273,7 +273,7 @@ def test_a_largest_current_counts_in_both(furuta, capsys, monkeypatch):
     monkeypatch.setattr("codrl_mj.sizing.demand_of", lambda *_, **__: furuta)
     (choice,) = choose(furuta, ["quanser-qube-servo-3"], max_current=0.2)
     assert choice.drive.controller.max_current == 0.2
-    assert "current: |i|, largest" in choice.lacks
+    assert "current: |i|, largest" in choice.rejection_reason
     assert (
         main(["motor", "feasible", "quanser-qube-servo-3", "furuta", "--max-current", "0.2"]) == 0
     )
@@ -316,7 +316,7 @@ def test_a_peak_is_not_hopeless_and_what_lasts_is():
         torque = np.full(1000, 0.01)
         torque[: int(1000 * share)] = 10.0  # 20 V of 24 at 0.01 N*m would be 0.2; here 200 V
         asked = dataclasses.replace(
-            recorded(1e-2 * np.arange(1000), torque, np.full(1000, 1.0)), exact=False
+            demand_from_arrays(1e-2 * np.arange(1000), torque, np.full(1000, 1.0)), exact=False
         )
         assert feasibility(drive(12.0, rotor_inertia=LIGHT), asked, COOL).verdict == verdict
 
@@ -330,7 +330,7 @@ def test_a_servo_that_gets_there_later_is_never_hopeless():
     assert slower.verdict == TRY_IT
     assert (
         "its servo asks for less where the motor is slower: evaluate the run on this motor"
-        in slower.why
+        in slower.reason
     )
 
 

@@ -16,9 +16,9 @@ from codrl_mj.sizing import (
     gains,
     is_closed,
     open_loop,
-    respond,
-    small_step,
-    step,
+    simulate_loop,
+    small_step_response,
+    step_responses,
 )
 from codrl_mj.sizing.loop import ANTI_WINDUPS
 from codrl_mj.validation import motor_loops
@@ -37,7 +37,7 @@ def measured(drive, frequency, samples=400):
     amplitude = 1e-3 * drive.voltage_limit / drive.motor.resistance
     late = slice(samples // 2, None)
     basis = np.stack([np.sin(angle), np.cos(angle)], axis=1)[late]
-    current = respond(drive, amplitude * np.sin(angle)).current[late] / amplitude
+    current = simulate_loop(drive, amplitude * np.sin(angle)).current[late] / amplitude
     return complex(*np.linalg.lstsq(basis, current, rcond=None)[0])
 
 
@@ -90,7 +90,7 @@ def test_the_simulated_loop_has_the_bandwidth_and_the_margins_that_are_computed(
 )
 def test_the_simulated_step_is_python_control_s(delayed, own):
     drive = Drive(controller=SampledLoop(delayed=delayed, **own))
-    response = respond(drive, np.full(200, 0.01))
+    response = simulate_loop(drive, np.full(200, 0.01))
     _, currents = control.step_response(closed_loop(drive), response.time)
     np.testing.assert_allclose(response.current, 0.01 * currents, atol=1e-9)
     found = design(drive)
@@ -131,7 +131,7 @@ def test_an_actuators_loop_is_the_one_that_python_control_joins(loop):
     other = motor_loops.closed_loop(actuator, dt)
     at = np.exp(1j * np.linspace(0.01, 3.1, 40))
     np.testing.assert_allclose(closed_loop(actuator, timestep)(at), other(at), rtol=1e-9)
-    response = respond(actuator, np.full(200, 0.01), timestep=timestep)
+    response = simulate_loop(actuator, np.full(200, 0.01), timestep=timestep)
     np.testing.assert_allclose(
         response.current, 0.01 * control.step_response(other, response.time)[1], atol=1e-9
     )
@@ -164,11 +164,11 @@ def test_a_slow_loop_has_a_bandwidth_too_and_does_not_settle_within_sight():
     assert found.bandwidth == pytest.approx(0.1, rel=1e-3)
     assert math.isnan(found.settling_time)
     with pytest.raises(ValueError, match=r"sample_rate = 500: must be >= 1000 Hz"):
-        step(find_drive("quanser-qube-servo-2", sample_rate=500.0))
+        step_responses(find_drive("quanser-qube-servo-2", sample_rate=500.0))
 
 
 def test_an_unstable_loop_is_refused():
-    for judge in (design, step):
+    for judge in (design, step_responses):
         with pytest.raises(
             ValueError, match=r"unstable: spectral radius .* Lower controller\.kp = 500"
         ):
@@ -179,7 +179,7 @@ def test_an_unstable_loop_is_refused():
 def test_anti_windup_is_what_makes_it_come_back(name):
     """Also where the largest current is within reach at half the no-load speed: then the speed is a higher one."""
     drive = find_drive(name)
-    steps = step(drive)
+    steps = step_responses(drive)
     within = (
         drive.voltage_limit - drive.motor.back_emf_constant * steps.speed
     ) / drive.motor.resistance
@@ -203,18 +203,18 @@ def test_anti_windup_is_what_makes_it_come_back(name):
 @with_and_without_delay
 def test_it_starts_from_a_current_of_zero_at_speed(compensated, delayed):
     drive = Drive(controller=SampledLoop(delayed=delayed, bemf_compensation=compensated))
-    np.testing.assert_allclose(respond(drive, np.zeros(20), 300.0).current, 0.0, atol=1e-12)
+    np.testing.assert_allclose(simulate_loop(drive, np.zeros(20), 300.0).current, 0.0, atol=1e-12)
 
 
 @every_motor
 def test_the_small_step_does_not_saturate(name):
     for delayed in (False, True):
-        small = small_step(find_drive(name, delayed=delayed))
+        small = small_step_response(find_drive(name, delayed=delayed))
         assert np.abs(small.voltage).max() < 0.9 * find_drive(name).voltage_limit
         assert np.isfinite(small.settling_time())
 
 
 def test_without_back_emf_more_than_the_stall_current_is_out_of_reach():
     motor = dataclasses.replace(Drive().motor, back_emf_constant=0.0)
-    steps = step(Drive(motor))
+    steps = step_responses(Drive(motor))
     assert (steps.speed, steps.unreachable) == (0.0, pytest.approx(1.8 * 24.0 / 8.4))

@@ -24,14 +24,14 @@ from codrl_mj.sizing import (
     demand_of,
     feasibility,
     find_drive,
-    least_gain,
-    least_pumped,
-    least_voltage,
+    min_energy_gain,
+    min_pumped_energy,
+    min_supply_voltage,
     operation,
-    recorded,
+    demand_from_arrays,
 )
-from codrl_mj.sizing.abilities import most_power
-from codrl_mj.sizing.scripted import Scripted, state_observed
+from codrl_mj.sizing.abilities import max_power
+from codrl_mj.sizing.scripted import Scripted, observe_state
 from codrl_mj.tasks import TASKS
 from tests.matrix import but
 
@@ -54,7 +54,7 @@ def drive(motor=PAPER, voltage=24.0, **loop):
 
 
 def steady(torque, speed, count=11):
-    return recorded(0.1 * np.arange(count), np.full(count, torque), np.full(count, speed))
+    return demand_from_arrays(0.1 * np.arange(count), np.full(count, torque), np.full(count, speed))
 
 
 def bounds(found):
@@ -104,7 +104,7 @@ def test_a_steady_load_takes_what_the_motor_equation_says():
 def test_rotor_and_gear_are_part_of_the_load():
     time = np.linspace(0.0, 2.0, 2001)
     motor = dataclasses.replace(MOTOR, gear_ratio=30.0, gear_efficiency=0.8)
-    asked = operation(recorded(time, np.zeros_like(time), 5.0 * np.sin(4.0 * time)), drive(motor))
+    asked = operation(demand_from_arrays(time, np.zeros_like(time), 5.0 * np.sin(4.0 * time)), drive(motor))
     driving = np.cos(4.0 * time) * np.sin(4.0 * time) > 0.0
     expected = 1e-5 * 30.0 * 20.0 * np.cos(4.0 * time) / np.where(driving, 0.8, 1.0)
     assert asked.torque[1:-1] == pytest.approx(expected[1:-1], abs=1e-7)
@@ -114,7 +114,7 @@ def test_a_change_of_the_torque_takes_l_di_dt_within_its_step():
     """Steps of 1.5 N*m in 0.1 s at 8 rad/s: up it takes more voltage, down less than the back-EMF, or the reverse."""
     slow = dataclasses.replace(MOTOR, inductance=0.05, rotor_inertia=0.0)
     torque = np.array([0.0, 1.5, 1.5, 0.0])
-    asked = operation(recorded(0.1 * np.arange(4), torque, np.full(4, 8.0)), drive(slow))
+    asked = operation(demand_from_arrays(0.1 * np.arange(4), torque, np.full(4, 8.0)), drive(slow))
     current, rise, back_emf = 1.5 / 0.05, 0.05 * 30.0 / 0.1, 0.04 * 8.0
     expected = [
         back_emf,
@@ -204,9 +204,9 @@ def test_the_scripted_swing_up_reaches_upright_and_says_so(pendulum):
 
 def test_the_supply_that_a_swing_up_takes_is_predicted_and_found(pendulum):
     """5.17 V at least for any controller, 5.59 V by the energy of swings; the slower the winding, the more."""
-    least = least_voltage(pendulum.swing, drive(), least_gain)
+    least = min_supply_voltage(pendulum.swing, drive(), min_energy_gain)
     assert least == pytest.approx(5.17, abs=0.02)
-    assert least_voltage(pendulum.swing, drive(), least_pumped) == pytest.approx(5.59, abs=0.02)
+    assert min_supply_voltage(pendulum.swing, drive(), min_pumped_energy) == pytest.approx(5.59, abs=0.02)
     assert feasibility(drive(voltage=5.1), pendulum).verdict == SURELY_NOT
     assert feasibility(drive(voltage=5.5), pendulum).verdict == TRY_IT
     slow = dataclasses.replace(PAPER, inductance=0.1)
@@ -218,7 +218,7 @@ def test_the_supply_that_a_swing_up_takes_is_predicted_and_found(pendulum):
 
 def test_a_motor_that_one_can_buy_swings_up_a_little_above_the_supply_that_is_predicted(pendulum):
     motor = find_drive("faulhaber-1331-006", 160.0)
-    least = least_voltage(pendulum.swing, motor, least_gain)
+    least = min_supply_voltage(pendulum.swing, motor, min_energy_gain)
     assert not swings_up(dataclasses.replace(motor, supply=Supply(0.97 * least)))
     assert swings_up(dataclasses.replace(motor, supply=Supply(1.1 * least)))
 
@@ -231,17 +231,17 @@ def test_behind_a_supply_that_sags_a_motor_can_what_one_of_more_resistance_can(p
     for name in ("voltage", "stall", "power", "pumping", "swing"):
         assert ours[name].available == pytest.approx(theirs[name].available, rel=1e-12)
         assert ours[name].needed == pytest.approx(theirs[name].needed, rel=1e-12)
-    least = least_voltage(pendulum.swing, sagging, least_gain)
+    least = min_supply_voltage(pendulum.swing, sagging, min_energy_gain)
     assert not swings_up(dataclasses.replace(sagging, supply=Supply(0.97 * least, 0.5)))
     assert swings_up(dataclasses.replace(sagging, supply=Supply(1.1 * least, 0.5)))
 
 
 def test_friction_and_damping_make_a_swing_up_harder(pendulum):
-    light = least_gain(pendulum.swing, drive(voltage=5.5))
+    light = min_energy_gain(pendulum.swing, drive(voltage=5.5))
     rough = dataclasses.replace(PAPER, coulomb_friction=0.1)
-    assert least_gain(pendulum.swing, drive(rough, 5.5)) < light
-    assert least_gain(pendulum.swing._replace(damping=0.05), drive(voltage=5.5)) < light
-    assert least_pumped(pendulum.swing._replace(largest=6.0), drive()) == math.inf
+    assert min_energy_gain(pendulum.swing, drive(rough, 5.5)) < light
+    assert min_energy_gain(pendulum.swing._replace(damping=0.05), drive(voltage=5.5)) < light
+    assert min_pumped_energy(pendulum.swing._replace(largest=6.0), drive()) == math.inf
 
 
 def test_what_is_surely_enough_changes_nothing(pendulum):
@@ -275,7 +275,7 @@ def test_the_smallest_motor_that_does_it_with_a_margin_comes_first_and_the_other
     pendulum,
 ):
     choices = choose(pendulum)
-    good = [one for one in choices if not one.lacks]
+    good = [one for one in choices if not one.rejection_reason]
     assert choices[: len(good)] == good
     assert [one.power for one in good] == sorted(one.power for one in good)
     assert min(one.feasibility.margin for one in good) >= 0.2
@@ -283,14 +283,14 @@ def test_the_smallest_motor_that_does_it_with_a_margin_comes_first_and_the_other
     assert {one.feasibility.verdict for one in good} == {SURELY}
     assert not any("continuous current" in one.unknown for one in good)
     others = {one.name: one for one in choices[len(good) :]}
-    assert "no gear helps: raise the supply to 15.01 V" in others["dynamixel-mx-64"].lacks
+    assert "no gear helps: raise the supply to 15.01 V" in others["dynamixel-mx-64"].rejection_reason
     assert others["dynamixel-mx-64"].ratio == 200.0
     assert "motor.rotor_inertia = 0" in others["pololu-37d-30"].drive.assumed
     assert others["kraken-x60"].feasibility.verdict == DEPENDS
-    assert "heat: its continuous current is not known" in others["kraken-x60"].lacks
-    assert "rotor: its inertia is not known" in others["kraken-x60"].lacks
-    assert "with a margin of 9%, must be 20%" in others["quanser-qube-servo-3"].lacks
-    wide = [one.name for one in choose(pendulum, least_margin=0.6) if not one.lacks]
+    assert "heat: its continuous current is not known" in others["kraken-x60"].rejection_reason
+    assert "rotor: its inertia is not known" in others["kraken-x60"].rejection_reason
+    assert "with a margin of 9%, must be 20%" in others["quanser-qube-servo-3"].rejection_reason
+    wide = [one.name for one in choose(pendulum, min_margin=0.6) if not one.rejection_reason]
     assert wide == [one.name for one in good if one.feasibility.margin >= 0.6]
 
 
@@ -299,7 +299,7 @@ def test_the_power_of_a_motor_is_what_it_makes_at_its_best():
     for most in (math.inf, 2.0):
         one = drive(MOTOR, max_current=most)
         currents = np.linspace(0.0, min(most, 12.0), 100_001)
-        assert most_power(one) == pytest.approx(
+        assert max_power(one) == pytest.approx(
             np.max(currents * (24.0 - 2.0 * currents) * 0.05 / 0.04), rel=1e-8
         )
 
@@ -307,18 +307,18 @@ def test_the_power_of_a_motor_is_what_it_makes_at_its_best():
 def test_a_motor_that_moves_itself_is_none_for_a_policy_and_any_for_a_recording():
     """A rotor whose reflected inertia takes twice the load's torque."""
     time = np.linspace(0.0, 2.0, 2001)
-    swinging = recorded(time, 0.02 * np.cos(4.0 * time), 10.0 * np.sin(4.0 * time))
+    swinging = demand_from_arrays(time, 0.02 * np.cos(4.0 * time), 10.0 * np.sin(4.0 * time))
     name = ["cubemars-ak80-6"]  # has a gear of its own: 6.07e-5 * 36 * 40 = 0.087 N*m
     assert (
         "needs 437.2 %, has 50 %"
-        in choose(dataclasses.replace(swinging, exact=False), name)[0].lacks
+        in choose(dataclasses.replace(swinging, exact=False), name)[0].rejection_reason
     )
-    assert choose(swinging, name)[0].lacks == ""
+    assert choose(swinging, name)[0].rejection_reason == ""
 
 
 def test_the_gear_leaves_a_policy_its_load_and_a_recording_the_largest_margin():
     time = np.linspace(0.0, 2.0, 2001)
-    recording = recorded(time, 0.1 * np.cos(4.0 * time), 10.0 * np.sin(4.0 * time))
+    recording = demand_from_arrays(time, 0.1 * np.cos(4.0 * time), 10.0 * np.sin(4.0 * time))
     free, bound = (
         choose(one, ["maxon-ec45-flat-50w"])[0].feasibility
         for one in (recording, dataclasses.replace(recording, exact=False))
@@ -331,7 +331,7 @@ def arrivals(task, actuator, episodes=5):
     """How many scripted episodes of a task end at the goal."""
     env = EnvConfig(task, actuator, inner_steps=TASKS[task].motor_inner_steps)
     policy = Scripted(TASKS[task])
-    ran = run_episodes(policy, lambda: state_observed(env.make()), episodes, 0)
+    ran = run_episodes(policy, lambda: observe_state(env.make()), episodes, 0)
     return sum(
         not one.terminated if task == "cartpole" else bool(TASKS[task].goal(one.state[-1]))
         for one in ran
@@ -376,12 +376,12 @@ def test_on_a_slide_a_geared_motor_gets_a_wheel():
         (lambda: find_drive("frc-cim", voltage=-1.0), "voltage = -1"),
         (lambda: find_drive("lag"), "no motor behind a drive"),
         (
-            lambda: choose(steady(1.0, 1.0), ["frc-cim"], least_margin=1.0),
+            lambda: choose(steady(1.0, 1.0), ["frc-cim"], min_margin=1.0),
             r"least_margin = 1: must be >= 0 and < 1",
         ),
-        (lambda: recorded([0.0, 1.0], [1.0], [1.0, 1.0]), "torque: shape"),
-        (lambda: recorded([0.0, 0.0], [1.0, 1.0], [1.0, 1.0]), r"time\[1\] = 0 s"),
-        (lambda: recorded([0.0, 1.0], [1.0, math.nan], [1.0, 1.0]), r"torque\[1\] = nan"),
+        (lambda: demand_from_arrays([0.0, 1.0], [1.0], [1.0, 1.0]), "torque: shape"),
+        (lambda: demand_from_arrays([0.0, 0.0], [1.0, 1.0], [1.0, 1.0]), r"time\[1\] = 0 s"),
+        (lambda: demand_from_arrays([0.0, 1.0], [1.0, math.nan], [1.0, 1.0]), r"torque\[1\] = nan"),
         (lambda: feasibility(Ideal(), steady(1.0, 1.0)), "must be a codrl_mj.actuators.Drive"),
     ],
 )

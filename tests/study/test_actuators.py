@@ -19,7 +19,7 @@ from actuator_study.questions import primary, secondary, trials, wrong_motors
 from actuator_study.study import ActuatorStudy
 from codrl_mj.actuators import Lag
 from codrl_mj.evaluation.measures import Interval
-from codrl_mj.study.doses import AXES, FLOORS, SECONDS, at_home, ideal, needed_voltage, posed
+from codrl_mj.study.axes import AXES, FLOORS, SECONDS, ideal_trial, ideal, needed_voltage, study_env
 from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.program import main
 from codrl_mj.study.questions import Scores, Verdict, judge
@@ -51,7 +51,7 @@ def alone(root, **options):
 def judged(grid):
     """The verdicts of the primary questions."""
     return judge(
-        Scores(grid.collect(), FLOORS, [at_home(ideal(task)) for task in SECONDS]),
+        Scores(grid.collect(), FLOORS, [ideal_trial(ideal(task)) for task in SECONDS]),
         primary(),
         primary=True,
     )
@@ -62,9 +62,9 @@ def study(tmp_path_factory):
     """Matched training is worth 0.3 everywhere; every motor costs ideal-trained policies half of the span."""
 
     def level(trial):
-        at_home = trial.test in ("ideal", "designed", "good motor", "supply 0", "noise 0")
+        ideal_trial = trial.test in ("ideal", "designed", "good motor", "supply 0", "noise 0")
         if trial.arm.name.endswith(": ideal"):
-            return 1.0 if at_home else 0.5
+            return 1.0 if ideal_trial else 0.5
         return 0.8
 
     grid = alone(tmp_path_factory.mktemp("runs"), seeds=6).grid
@@ -78,8 +78,8 @@ def study(tmp_path_factory):
 )
 @pytest.mark.parametrize("axis", AXES)
 def test_every_dose_is_an_environment_that_can_be_stepped(task, axis):
-    for dose in AXES[axis].doses:
-        env = AXES[axis].at(task, dose).make()
+    for dose in AXES[axis].severities:
+        env = AXES[axis].make_env(task, dose).make()
         env.reset(seed=0)
         for _ in range(3):
             observation, *_ = env.step(env.action_space.sample())
@@ -90,14 +90,14 @@ def test_every_dose_is_an_environment_that_can_be_stepped(task, axis):
 def test_doses_are_in_steps_of_the_policy_and_shares_of_the_force():
     for task in SECONDS:
         definition = find_task(task)
-        assert AXES["lag"].at(task, 2.0).actuator == Lag(2.0 * definition.step_duration)
+        assert AXES["lag"].make_env(task, 2.0).actuator == Lag(2.0 * definition.step_duration)
         assert (
-            AXES["delay"].at(task, 3.0).disturbances.command_delay == 3.0 * definition.step_duration
+            AXES["delay"].make_env(task, 3.0).disturbances.command_delay == 3.0 * definition.step_duration
         )
-        assert AXES["friction"].at(task, 0.1).joint.friction == pytest.approx(
+        assert AXES["friction"].make_env(task, 0.1).joint.friction == pytest.approx(
             0.1 * definition.max_force
         )
-        supply = AXES["supply"].at(task, 0.35).actuator
+        supply = AXES["supply"].make_env(task, 0.35).actuator
         assert supply.supply.voltage == pytest.approx(0.65 * needed_voltage(task))
         stall = supply.motor.torque_constant * supply.controller.max_current
         assert stall == pytest.approx(definition.max_force)
@@ -106,14 +106,14 @@ def test_doses_are_in_steps_of_the_policy_and_shares_of_the_force():
 def test_where_half_the_voltage_is_missing_the_stall_torque_is_just_the_largest():
     """U = 2*sqrt(F*w) of which half is R*F/k: what the motor of 1 ohm takes to hold the largest force."""
     for task in SECONDS:
-        drive = AXES["supply"].at(task, 0.5).actuator
+        drive = AXES["supply"].make_env(task, 0.5).actuator
         stall = drive.motor.torque_constant * drive.supply.voltage / drive.motor.resistance
         assert stall == pytest.approx(find_task(task).max_force)
 
 
 @pytest.mark.matrix
 def test_no_dose_of_a_lag_is_ideal():
-    env, same = posed("pendulum").make(), AXES["lag"].at("pendulum", 0.0).make()
+    env, same = study_env("pendulum").make(), AXES["lag"].make_env("pendulum", 0.0).make()
     for one in (env, same):
         one.reset(seed=3)
     for _ in range(20):
@@ -140,15 +140,15 @@ def test_the_plan_is_what_is_computed():
         f"P{number}" for number in range(1, 13)
     ]
     for name, axis in AXES.items():
-        doses = ", ".join(f"{dose:g}" for dose in axis.doses)
-        trained = ", ".join(f"{axis.trained[task]:g}" for task in arms.TRAINED)
+        doses = ", ".join(f"{dose:g}" for dose in axis.severities)
+        trained = ", ".join(f"{axis.training_severity[task]:g}" for task in arms.TRAINED)
         assert f"| {doses} | {trained} |" in next(
             line for line in plan.splitlines() if line.startswith(f"| {name} |")
         )
 
 
 def test_wrong_motors_differ_from_the_nominal_by_what_they_are_called():
-    nominal = posed("pendulum", "weaker")
+    nominal = study_env("pendulum", "weaker")
     motors = wrong_motors("pendulum")
     assert (
         motors["resistance -25 %"].actuator.motor.resistance
@@ -167,14 +167,14 @@ def test_drawn_doses_end_at_the_dose_that_they_are_said_to(task, axis):
     assert not rest
     of = operator.attrgetter(name)
     ends = [
-        of(AXES[axis].at(task, dose).actuator)
-        for dose in (0.0, arms.drawn_up_to(axis, AXES[axis].trained[task]))
+        of(AXES[axis].make_env(task, dose).actuator)
+        for dose in (0.0, arms.drawn_up_to(axis, AXES[axis].training_severity[task]))
     ]
     assert [distribution.low, distribution.high] == pytest.approx(sorted(ends), rel=1e-5)
     assert (
-        AXES[axis].trained[task]
-        < arms.drawn_up_to(axis, AXES[axis].trained[task])
-        <= AXES[axis].doses[-1]
+        AXES[axis].training_severity[task]
+        < arms.drawn_up_to(axis, AXES[axis].training_severity[task])
+        <= AXES[axis].severities[-1]
     )
 
 
@@ -187,7 +187,7 @@ def test_what_is_explored_is_one_thing_otherwise():
             assert dataclasses.replace(drive, controller=tracking) == planned.env.actuator
             assert (wound.arm.name, planned.env.timestep) == (f"{task}: ideal", wound.env.timestep)
     for task in arms.LOOPED:
-        nominal = posed(task, "paper")
+        nominal = study_env(task, "paper")
         flat = {name: flattened(env.as_mapping()) for name, env in paper_loops(task).items()}
         changed = {
             name: {
@@ -325,7 +325,7 @@ def test_the_page_has_every_number_in_a_file(study, tmp_path):
     evidence = Evidence.read(files["runs.csv"])
     for task in SECONDS:
         for axis, described in AXES.items():
-            assert evidence.loss(task, axis, described.doses[3]).outcome.loss.mean == pytest.approx(
+            assert evidence.loss(task, axis, described.severities[3]).outcome.loss.mean == pytest.approx(
                 0.5
             )
     written = {name: file.read_bytes() for name, file in files.items()}

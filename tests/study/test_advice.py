@@ -20,15 +20,15 @@ from codrl_mj.study.advice import (
     IDEAL,
     LOOP,
     MEASURE,
-    RANDOMISE,
+    RANDOMIZE,
     THROUGH,
-    Prospect,
+    LossBounds,
     advise,
     decide,
-    measurement,
+    plan_measurement,
 )
-from codrl_mj.study.bench import delivered, doses, redesign
-from codrl_mj.study.doses import AXES, FLOORS, REAL, REFERENCE_SPEEDS, posed, supplied, timestep
+from codrl_mj.study.bench import measure_on_task, severities, redesign_loop
+from codrl_mj.study.axes import AXES, FLOORS, REAL, REFERENCE_SPEEDS, study_env, drive_on_supply, timestep
 from codrl_mj.study.evidence import Evidence, Outcome
 from codrl_mj.tasks import find_task, named_actuator
 from codrl_mj.training import TrainConfig
@@ -44,8 +44,8 @@ samples a step; and half of what is left in each step, 1/2 + 1/4 + ...
 @pytest.mark.parametrize("task", but(["furuta"], REFERENCE_SPEEDS))
 @pytest.mark.parametrize("axis", ["lag", "weakness", "supply", "noise"])
 def test_the_bench_finds_every_dose_of_the_study_and_nothing_else(task, axis):
-    for dose in AXES[axis].doses:
-        found = doses(delivered(AXES[axis].at(task, dose).actuator, task), task)
+    for dose in AXES[axis].severities:
+        found = severities(measure_on_task(AXES[axis].make_env(task, dose).actuator, task), task)
         finest = timestep(task) / find_task(task).step_duration  # policy steps
         expected = dict.fromkeys(AXES, 0.0) | {axis: dose}
         if axis == "lag":
@@ -65,7 +65,7 @@ def test_the_bench_finds_every_dose_of_the_study_and_nothing_else(task, axis):
 
 def test_a_delay_is_found_beside_a_lag():
     step = find_task("pendulum").step_duration
-    found = doses(delivered(Lag(step, delay=0.6 * step), "pendulum"), "pendulum")
+    found = severities(measure_on_task(Lag(step, delay=0.6 * step), "pendulum"), "pendulum")
     assert found["delay"] == pytest.approx(0.6)
     assert found["lag"] == pytest.approx(0.95, abs=0.01)  # half an integration step less
 
@@ -81,17 +81,17 @@ def test_a_delay_is_found_beside_a_lag():
     ],
 )
 def test_friction_is_the_gearmotor_s_at_the_output(task, kinds, expected):
-    drive = supplied(task, 100.0)
+    drive = drive_on_supply(task, 100.0)
     rubbed = dataclasses.replace(drive.motor, arm_radius=0.1, rotor_inertia=0.0, **kinds)
-    found = doses(delivered(dataclasses.replace(drive, motor=rubbed), task), task)["friction"]
+    found = severities(measure_on_task(dataclasses.replace(drive, motor=rubbed), task), task)["friction"]
     at_the_rotor = expected(REFERENCE_SPEEDS[task] / 0.1)
     assert found == pytest.approx(at_the_rotor / 0.1 / find_task(task).max_force, rel=1e-3)
 
 
 def test_a_current_limit_is_weakness():
-    drive = supplied("pendulum", 100.0)
+    drive = drive_on_supply("pendulum", 100.0)
     limited = dataclasses.replace(drive.controller, max_current=0.25 * drive.controller.max_current)
-    found = doses(delivered(dataclasses.replace(drive, controller=limited), "pendulum"), "pendulum")
+    found = severities(measure_on_task(dataclasses.replace(drive, controller=limited), "pendulum"), "pendulum")
     assert found["weakness"] == pytest.approx(0.75, abs=1e-3)
     assert found["supply"] == pytest.approx(0.0, abs=1e-3)
 
@@ -100,7 +100,7 @@ def test_what_creeps_to_its_end_counts_as_missing():
     """A PI loop that is at kp/(kp + R) with (L/R)/(1 + kp/R), and at the rest with (1 + kp)/ki."""
     step, dt = find_task("pendulum").step_duration, timestep("pendulum")
     loop = CurrentLoop(kp=1.0, ki=2.0 / (1000 * step), max_voltage=1e3)
-    found = delivered(DCMotorActuator(Motor(1.0, 10 * dt, 1.0, 1.0), loop), "pendulum")
+    found = measure_on_task(DCMotorActuator(Motor(1.0, 10 * dt, 1.0, 1.0), loop), "pendulum")
     assert found.at_rest == pytest.approx(1.0 - 0.5 * math.exp(-0.02), abs=2e-3)
     # of what is there in the 20th step: the quick half, by a fifth in each of ten integration
     # steps, and what creeps
@@ -134,17 +134,17 @@ def results(lost, matched=0.02, generic=None):
     for task in REFERENCE_SPEEDS:
         yield from row(task, "ideal", "ideal", 0.0)
         for axis, known in AXES.items():
-            for dose in known.doses:
+            for dose in known.severities:
                 yield from row(task, "ideal", f"{axis} {dose:g}", lost(axis, dose))
-            if task in known.trained:
-                yield from row(task, axis, f"{axis} {known.trained[task]:g}", matched)
+            if task in known.training_severity:
+                yield from row(task, axis, f"{axis} {known.training_severity[task]:g}", matched)
                 if generic is not None:
-                    yield from row(task, "generic", f"{axis} {known.trained[task]:g}", generic)
+                    yield from row(task, "generic", f"{axis} {known.training_severity[task]:g}", generic)
 
 
 def proportional(axis, dose):
     """Half of the span at the largest dose."""
-    return 0.5 * dose / AXES[axis].doses[-1]
+    return 0.5 * dose / AXES[axis].severities[-1]
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +160,7 @@ def evidence(rows):
 @pytest.mark.parametrize("axis", AXES)
 def test_a_loss_is_interpolated_policy_by_policy_and_says_between_which_tests(axis):
     """Policy 0 loses twice as much as policy 1, at every dose."""
-    tested = AXES[axis].doses
+    tested = AXES[axis].severities
     rows = [
         {
             **row,
@@ -173,10 +173,10 @@ def test_a_loss_is_interpolated_policy_by_policy_and_says_between_which_tests(ax
         and row["seed"] in "01"
         and row["trained"] == "ideal"
     ]
-    home = [row for row in results(proportional) if row["tested"] == "ideal"]
+    baseline = [row for row in results(proportional) if row["tested"] == "ideal"]
     middle = (tested[1] + tested[2]) / 2
-    loss = Evidence([*home, *rows]).loss("acrobot", axis, middle)
-    extra = 0.0 if AXES[axis].own_motor else 0.001  # of the test without it
+    loss = Evidence([*baseline, *rows]).loss("acrobot", axis, middle)
+    extra = 0.0 if AXES[axis].motor_at_zero else 0.001  # of the test without it
     expected = [2 * proportional(axis, middle), proportional(axis, middle)]
     assert loss.outcome.lost == pytest.approx(
         np.array(expected) + np.array([extra, -extra]), abs=1e-12
@@ -187,7 +187,7 @@ def test_a_loss_is_interpolated_policy_by_policy_and_says_between_which_tests(ax
 
 @pytest.mark.parametrize("axis", AXES)
 def test_of_more_than_was_tested_the_largest_loss_is_the_least(evidence, axis):
-    tested = AXES[axis].doses
+    tested = AXES[axis].severities
     beyond = evidence.loss("acrobot", axis, 2 * tested[-1])
     assert beyond.beyond
     assert beyond.outcome.loss.mean == pytest.approx(0.5)
@@ -203,12 +203,12 @@ def test_an_outcome_s_interval_is_student_s_and_failures_are_counted():
     assert outcome.failed == 0.25
     assert outcome.summary()["median"] == pytest.approx(0.01)
     assert outcome.summary()["worst"] == 0.4
-    assert not outcome.spared
-    assert not outcome.hurt
+    assert not outcome.is_negligible
+    assert not outcome.is_harmful
 
 
 @pytest.mark.parametrize(
-    ("lost", "missed", "spared", "hurt"),
+    ("lost", "missed", "is_negligible", "is_harmful"),
     [
         ([0.04] * 20, 0.0, True, False),
         ([0.06] * 20, 0.0, False, False),
@@ -220,7 +220,7 @@ def test_an_outcome_s_interval_is_student_s_and_failures_are_counted():
 )
 def test_means_intervals_failures_and_success_decide(lost, missed, spared, hurt):
     outcome = Outcome(np.array(lost), np.full(20, missed))
-    assert (outcome.spared, outcome.hurt) == (spared, hurt)
+    assert (outcome.is_negligible, outcome.is_harmful) == (is_negligible, is_harmful)
 
 
 # verdicts
@@ -228,10 +228,10 @@ def test_means_intervals_failures_and_success_decide(lost, missed, spared, hurt)
 
 def known(loss, policies=20):
     outcome = Outcome(loss + 0.001 * (-1.0) ** np.arange(policies), np.zeros(policies))
-    return Prospect(outcome, outcome)
+    return LossBounds(outcome, outcome)
 
 
-UNKNOWN = Prospect(None, None)
+UNKNOWN = LossBounds(None, None)
 
 
 @pytest.mark.parametrize(
@@ -239,22 +239,22 @@ UNKNOWN = Prospect(None, None)
     [
         ({IDEAL: known(0.03)}, IDEAL),
         ({IDEAL: known(0.5), LOOP: known(0.04), THROUGH: known(0.0)}, LOOP),
-        ({IDEAL: known(0.5), RANDOMISE: known(0.04), THROUGH: known(0.0)}, RANDOMISE),
-        ({IDEAL: known(0.5), RANDOMISE: known(0.2), THROUGH: known(0.04)}, THROUGH),
+        ({IDEAL: known(0.5), RANDOMIZE: known(0.04), THROUGH: known(0.0)}, RANDOMIZE),
+        ({IDEAL: known(0.5), RANDOMIZE: known(0.2), THROUGH: known(0.04)}, THROUGH),
         (
-            {IDEAL: known(0.5), RANDOMISE: known(0.24), THROUGH: known(0.2)},
-            RANDOMISE,
+            {IDEAL: known(0.5), RANDOMIZE: known(0.24), THROUGH: known(0.2)},
+            RANDOMIZE,
         ),  # as good, and takes less
-        ({IDEAL: known(0.5), RANDOMISE: known(0.3), THROUGH: known(0.2)}, THROUGH),  # in part
-        ({IDEAL: known(0.5), RANDOMISE: known(0.48), THROUGH: known(0.47)}, BUY),
-        ({IDEAL: known(0.5), RANDOMISE: UNKNOWN, THROUGH: known(0.47)}, MEASURE),
+        ({IDEAL: known(0.5), RANDOMIZE: known(0.3), THROUGH: known(0.2)}, THROUGH),  # in part
+        ({IDEAL: known(0.5), RANDOMIZE: known(0.48), THROUGH: known(0.47)}, BUY),
+        ({IDEAL: known(0.5), RANDOMIZE: UNKNOWN, THROUGH: known(0.47)}, MEASURE),
         ({IDEAL: known(0.5), THROUGH: UNKNOWN}, MEASURE),
         (
-            {IDEAL: known(0.5), THROUGH: Prospect(None, known(0.2).least)},
+            {IDEAL: known(0.5), THROUGH: LossBounds(None, known(0.2).lower)},
             MEASURE,
         ),  # 0.2 at least, which would win
         (
-            {IDEAL: Prospect(None, known(0.0).least), THROUGH: UNKNOWN},
+            {IDEAL: LossBounds(None, known(0.0).lower), THROUGH: UNKNOWN},
             MEASURE,
         ),  # beyond tests, which cost nothing
     ],
@@ -284,39 +284,39 @@ def test_verdicts(evidence):
         "cartpole",
         Evidence([*evidence.rows, *random]),
     )
-    assert known_of.verdict == RANDOMISE  # no less lag was tested, and cost 0.01
-    assert known_of.options[RANDOMISE].most.loss.mean == pytest.approx(0.01, abs=2e-3)
+    assert known_of.verdict == RANDOMIZE  # no less lag was tested, and cost 0.01
+    assert known_of.options[RANDOMIZE].upper.loss.mean == pytest.approx(0.01, abs=2e-3)
     late = advise(named_actuator("weaker", "pendulum"), "pendulum", evidence)
     assert late.verdict == LOOP
-    assert late.options[LOOP].most.loss.mean < 0.05
+    assert late.options[LOOP].upper.loss.mean < 0.05
     assert "with that 0.0" in late.reason
 
 
 def test_randomising_comes_first_where_it_was_as_good():
     found = Evidence(list(results(proportional, generic=0.03)))
     lag = Lag(2 * find_task("pendulum").step_duration)
-    assert advise(lag, "pendulum", found).verdict == RANDOMISE
+    assert advise(lag, "pendulum", found).verdict == RANDOMIZE
 
 
 def test_buying_takes_that_all_that_was_tried_with_no_more_of_it_failed():
     hopeless = Evidence(list(results(proportional, matched=0.4, generic=0.42)))
 
     def at_most(share):
-        drive = supplied("pendulum", 100.0)
+        drive = drive_on_supply("pendulum", 100.0)
         limited = dataclasses.replace(
             drive.controller, max_current=share * drive.controller.max_current
         )
         return advise(dataclasses.replace(drive, controller=limited), "pendulum", hopeless)
 
     assert at_most(0.45).verdict == BUY
-    assert at_most(0.45).options[THROUGH].least.loss.mean == pytest.approx(0.4)
+    assert at_most(0.45).options[THROUGH].lower.loss.mean == pytest.approx(0.4)
     assert at_most(0.8).verdict == MEASURE  # less is missing than was trained through
 
 
 def test_several_things_cost_their_sum(evidence):
     step = find_task("pendulum").step_duration
     lag, weak, both = (
-        advise(one, "pendulum", evidence).options[IDEAL].most.loss.mean
+        advise(one, "pendulum", evidence).options[IDEAL].upper.loss.mean
         for one in (Lag(step), Lag(0.0, gain=0.9), Lag(step, gain=0.9))
     )
     assert both == pytest.approx(lag + weak, abs=2e-3)
@@ -337,9 +337,9 @@ def test_a_tested_drive_is_known_by_its_own_tests_and_not_without_them():
         for trained, score in (("ideal", "0.5"), ("marginal motor", "0.98"))
         for seed in SEEDS
     ]
-    actuator = posed("pendulum", REAL["pendulum"]["marginal motor"]).actuator
+    actuator = study_env("pendulum", REAL["pendulum"]["marginal motor"]).actuator
     tested = Evidence([*rows, *motor])
-    assert advise(actuator, "pendulum", tested).options[THROUGH].most.loss.mean == pytest.approx(
+    assert advise(actuator, "pendulum", tested).options[THROUGH].upper.loss.mean == pytest.approx(
         0.02
     )
     assert advise(actuator, "pendulum", tested).verdict == THROUGH
@@ -348,18 +348,18 @@ def test_a_tested_drive_is_known_by_its_own_tests_and_not_without_them():
 
 def test_commanding_more_makes_up_for_what_a_gear_loses(evidence):
     """A gear that passes on 80 % under a motor that has current to spare, asked for 1.25 times the force."""
-    drive = supplied("pendulum", 100.0)
+    drive = drive_on_supply("pendulum", 100.0)
     limit = dataclasses.replace(drive.controller, max_current=2.0 * drive.controller.max_current)
     lossy = dataclasses.replace(
         drive, motor=dataclasses.replace(drive.motor, gear_efficiency=0.8), controller=limit
     )
     found = advise(lossy, "pendulum", evidence)
-    assert found.found.at_rest == pytest.approx(0.8, abs=1e-3)
+    assert found.delivery.at_rest == pytest.approx(0.8, abs=1e-3)
     assert (found.verdict, "by 1.25" in found.reason) == (COMMAND, True)
     short = dataclasses.replace(lossy, controller=drive.controller)  # no current to spare
     found = advise(short, "pendulum", evidence)
-    assert found.options[COMMAND].least.loss.mean == pytest.approx(
-        found.options[IDEAL].least.loss.mean, abs=0.01
+    assert found.options[COMMAND].lower.loss.mean == pytest.approx(
+        found.options[IDEAL].lower.loss.mean, abs=0.01
     )
 
 
@@ -367,10 +367,10 @@ def test_more_than_was_tested_is_no_reason_to_buy_where_it_cost_nothing():
     harmless = Evidence(
         list(results(lambda axis, dose: 0.0 if axis == "weakness" else proportional(axis, dose)))
     )
-    drive = supplied("acrobot", 100.0)
+    drive = drive_on_supply("acrobot", 100.0)
     limited = dataclasses.replace(drive.controller, max_current=0.1 * drive.controller.max_current)
     found = advise(dataclasses.replace(drive, controller=limited), "acrobot", harmless)
-    assert (found.verdict, found.options[IDEAL].most) == (MEASURE, None)
+    assert (found.verdict, found.options[IDEAL].upper) == (MEASURE, None)
     assert "at least 0.00" in found.reason
 
 
@@ -389,12 +389,12 @@ def test_a_force_that_nobody_asked_for_is_not_called_harmless(evidence):
     share = (
         0.1 * paper.motor.torque_constant / paper.motor.arm_radius / find_task("pendulum").max_force
     )
-    assert found.found.unasked == pytest.approx(share, rel=0.05)
+    assert found.delivery.unasked == pytest.approx(share, rel=0.05)
 
 
 def test_the_largest_dose_is_not_beyond_it(evidence):
     found = advise(
-        AXES["supply"].at("acrobot", AXES["supply"].doses[-1]).actuator, "acrobot", evidence
+        AXES["supply"].make_env("acrobot", AXES["supply"].severities[-1]).actuator, "acrobot", evidence
     )
     assert not any(loss.beyond for loss in found.losses)
 
@@ -404,12 +404,12 @@ def test_a_ringing_loop_is_late(evidence):
     speed = 0.9 / find_task("pendulum").step_duration
     loop = CurrentLoop(kp=0.0, ki=speed**2, max_voltage=1e6, substeps=100)
     found = advise(DCMotorActuator(Motor(0.2 * speed, 1.0, 1.0, 1.0), loop), "pendulum", evidence)
-    assert found.found.lag > 1.0
+    assert found.delivery.lag > 1.0
     assert found.verdict != IDEAL
 
 
 def test_a_detuned_drive_is_told_to_design_its_loop(evidence):
-    drive = supplied("pendulum", 100.0)
+    drive = drive_on_supply("pendulum", 100.0)
     slow = dataclasses.replace(drive.controller, bandwidth=0.3)
     assert advise(dataclasses.replace(drive, controller=slow), "pendulum", evidence).verdict == LOOP
     well = advise(drive, "pendulum", evidence)
@@ -419,11 +419,11 @@ def test_a_detuned_drive_is_told_to_design_its_loop(evidence):
 def test_a_designed_loop_keeps_the_supply_and_does_not_cure_a_sensor(evidence):
     paper = named_actuator("paper", "pendulum")
     sagging = dataclasses.replace(paper, supply=Supply(5.0, 0.3))
-    assert redesign(sagging, "pendulum").supply == Supply(5.0, 0.3)
+    assert redesign_loop(sagging, "pendulum").supply == Supply(5.0, 0.3)
     noisy = dataclasses.replace(
         paper, controller=dataclasses.replace(paper.controller, current_noise=0.1)
     )
-    assert redesign(noisy, "pendulum") is None
+    assert redesign_loop(noisy, "pendulum") is None
     assert LOOP not in advise(noisy, "pendulum", evidence).options
 
 
@@ -441,7 +441,7 @@ def test_without_results_there_is_no_verdict():
     [
         (0.97, 1.0, 1.0, 1.0, IDEAL),
         (0.5, 0.96, 1.0, 1.0, LOOP),
-        (0.5, 0.6, 0.96, 0.97, RANDOMISE),
+        (0.5, 0.6, 0.96, 0.97, RANDOMIZE),
         (0.5, 0.6, 0.6, 0.96, THROUGH),
         (0.5, 0.6, 0.6, 0.7, THROUGH),
         (0.5, 0.6, 0.52, 0.52, LOOP),
@@ -449,7 +449,7 @@ def test_without_results_there_is_no_verdict():
     ],
 )
 def test_the_verdict_of_a_measurement(tmp_path, ideal, designed, randomised, through, verdict):
-    asked = measurement(named_actuator("weaker", "cartpole"), "cartpole", 4, tmp_path)
+    asked = plan_measurement(named_actuator("weaker", "cartpole"), "cartpole", 4, tmp_path)
 
     def score(trial, seed):
         level = {"cartpole: through it": through, "cartpole: generic": randomised}.get(
@@ -461,31 +461,31 @@ def test_the_verdict_of_a_measurement(tmp_path, ideal, designed, randomised, thr
         return FLOORS["cartpole"] + 200.0 * (level + 0.001 * (-1) ** seed)
 
     pretend(asked.grid, score)
-    found = asked.judged(asked.grid.collect())
+    found = asked.loss_bounds(asked.grid.collect())
     assert decide(found) == verdict
-    kept = [1.0 - found[name].most.loss.mean for name in (IDEAL, LOOP, RANDOMISE, THROUGH)]
+    kept = [1.0 - found[name].upper.loss.mean for name in (IDEAL, LOOP, RANDOMIZE, THROUGH)]
     assert kept == pytest.approx([ideal, designed, randomised, through])
     # of four policies +-0.001 around the mean: Student's t of three degrees of freedom
-    mean, low, _ = found[LOOP].most.loss
+    mean, low, _ = found[LOOP].upper.loss
     assert mean - low == pytest.approx(3.18245 * 0.001 * math.sqrt(4 / 3) / 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("task", ["cartpole", "pendulum"])
 def test_the_study_s_tasks_are_measured_as_the_study_has_them(task, tmp_path):
     """By the reward that its floors are of: on CartPole the paper's."""
-    asked = measurement("weaker", task, 2, tmp_path)
-    assert asked.home.env == posed(task)
+    asked = plan_measurement("weaker", task, 2, tmp_path)
+    assert asked.baseline.env == study_env(task)
     assert {trial.env for trial in asked.options.values()} == {
-        posed(task, "weaker"),
-        posed(task, redesign(named_actuator("weaker", task), task)),
+        study_env(task, "weaker"),
+        study_env(task, redesign_loop(named_actuator("weaker", task), task)),
     }
 
 
 def test_a_measurement_that_is_not_finished_says_so(tmp_path):
-    asked = measurement(named_actuator("weaker", "cartpole"), "cartpole", 2, tmp_path)
+    asked = plan_measurement(named_actuator("weaker", "cartpole"), "cartpole", 2, tmp_path)
     pretend(asked.grid, lambda *_: 100.0, leaving_out=[("cartpole: through it", 1)])
     with pytest.raises(ValueError, match=r"1 of its trainings and tests are missing"):
-        asked.judged(asked.grid.collect())
+        asked.loss_bounds(asked.grid.collect())
 
 
 def test_a_run_is_measured_with_its_own_environment_agent_and_budget(tmp_path):
@@ -493,10 +493,10 @@ def test_a_run_is_measured_with_its_own_environment_agent_and_budget(tmp_path):
         "cartpole", "ppo", total_steps=3000, env={"inner_steps": 20, "actuator": "weak"}
     )
     write_json(tmp_path / "run" / "config.json", {"train": config.as_mapping()})
-    asked = measurement("weaker", str(tmp_path / "run"), 2, tmp_path)
+    asked = plan_measurement("weaker", str(tmp_path / "run"), 2, tmp_path)
     for arm in asked.grid.arms:
         assert (arm.config.total_steps, arm.config.env.inner_steps) == (3000, 20)
-    assert asked.home.env.actuator == IDEAL_ACTUATOR
+    assert asked.baseline.env.actuator == IDEAL_ACTUATOR
     assert asked.options[THROUGH].env.actuator == named_actuator("weaker", "cartpole")
 
 
@@ -535,7 +535,7 @@ def file(tmp_path, rows):
 
 
 def test_on_the_command_line_with_results_and_runs(tmp_path, file, capsys):
-    asked = measurement("weaker", "cartpole", 2, tmp_path / "runs")
+    asked = plan_measurement("weaker", "cartpole", 2, tmp_path / "runs")
     pretend(asked.grid, lambda _, seed: 100.0 + seed)
     words = ["advise", "weaker", "cartpole", "--evidence", str(file), "--measure", "2"]
     words += ["--root", str(tmp_path / "runs")]

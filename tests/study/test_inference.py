@@ -8,10 +8,10 @@ from scipy import stats
 
 from codrl_mj.study.inference import (
     Stratum,
-    detectable,
+    detectable_difference,
     effect,
     equivalence_p,
-    false_discovery,
+    benjamini_hochberg,
     holm,
     permutation_p,
     power,
@@ -101,10 +101,10 @@ def test_under_no_difference_p_is_uniform():
 def test_equivalence_needs_a_difference_within_the_margin_and_enough_runs():
     close = Stratum(RANDOM.normal(0.0, 0.1, 20), RANDOM.normal(0.0, 0.1, 20))
     assert equivalence_p([close], 0.2) < 0.001
-    assert equivalence_p([Stratum(close.one[:3], close.other[:3])], 0.1) > 0.05
-    assert equivalence_p([Stratum(close.one + 0.2, close.other)], 0.2) > 0.2
+    assert equivalence_p([Stratum(close.treatment[:3], close.control[:3])], 0.1) > 0.05
+    assert equivalence_p([Stratum(close.treatment + 0.2, close.control)], 0.2) > 0.2
     assert equivalence_p([close], 0.2) == pytest.approx(
-        equivalence_p([Stratum(close.other, close.one)], 0.2), abs=0.001
+        equivalence_p([Stratum(close.control, close.treatment)], 0.2), abs=0.001
     )
 
 
@@ -123,8 +123,8 @@ def test_holm_as_in_his_example():
 
 
 def test_false_discoveries_are_scipy_s():
-    assert false_discovery([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.04, 0.04])
-    assert len(false_discovery([])) == 0
+    assert benjamini_hochberg([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.04, 0.04])
+    assert len(benjamini_hochberg([])) == 0
 
 
 def test_power_is_the_share_of_simulated_tests_that_find_it():
@@ -136,7 +136,7 @@ def test_power_is_the_share_of_simulated_tests_that_find_it():
 
 def test_runs_and_differences_belong_together():
     assert runs_needed(1.0) == 17  # the textbook's, for 80 % at 5 %
-    assert power(20, detectable(20)) == pytest.approx(0.8, abs=1e-6)
-    assert runs_needed(detectable(20, 0.05 / 12), 0.05 / 12) == 20
+    assert power(20, detectable_difference(20)) == pytest.approx(0.8, abs=1e-6)
+    assert runs_needed(detectable_difference(20, 0.05 / 12), 0.05 / 12) == 20
     assert runs_needed(0.0) is None
     assert runs_needed(1e-3) is None

@@ -10,7 +10,7 @@ import pytest
 from actuator_study.arms import DRAWN
 from codrl_mj.actuators import Lag
 from codrl_mj.disturbances import Disturbances
-from codrl_mj.study.doses import AXES, FLOORS, posed, timestep
+from codrl_mj.study.axes import AXES, FLOORS, study_env, timestep
 from codrl_mj.study.evidence import Evidence
 from codrl_mj.study.pages import read_csv, write_csv
 from codrl_mj.tasks import find_task
@@ -51,9 +51,9 @@ def played(config, actions):
 @pytest.mark.parametrize("lag", [0.0, 0.7])
 def test_late_is_lag_where_lag_remembers_enough(task, steps, lag):
     step, gain = find_task(task).step_duration, 0.8
-    actions = [posed(task).make().action_space.sample() for _ in range(40)]
-    ours = posed(task, late(task, time_constant=lag * step, delay=steps * step, gain=gain))
-    theirs = posed(task, Lag(lag * step, steps * step, gain))
+    actions = [study_env(task).make().action_space.sample() for _ in range(40)]
+    ours = study_env(task, late(task, time_constant=lag * step, delay=steps * step, gain=gain))
+    theirs = study_env(task, Lag(lag * step, steps * step, gain))
     np.testing.assert_allclose(played(ours, actions), played(theirs, actions), rtol=0, atol=1e-12)
 
 
@@ -61,18 +61,18 @@ def test_late_is_lag_where_lag_remembers_enough(task, steps, lag):
 @pytest.mark.parametrize("steps", [0.5, 1.0, 1.25, 2.0, 3.3, 4.0])
 def test_a_longer_delay_is_that_of_the_environment(task, steps):
     step = find_task(task).step_duration
-    actions = [posed(task).make().action_space.sample() for _ in range(40)]
-    ours = posed(task, late(task, delay=steps * step))
-    theirs = posed(task, disturbances=Disturbances(command_delay=steps * step))
+    actions = [study_env(task).make().action_space.sample() for _ in range(40)]
+    ours = study_env(task, late(task, delay=steps * step))
+    theirs = study_env(task, disturbances=Disturbances(command_delay=steps * step))
     np.testing.assert_allclose(played(ours, actions), played(theirs, actions), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_what_is_shown_is_the_last_four_commands(task):
-    config = posed(
+    config = study_env(
         task, late(task, delay=1.3 * find_task(task).step_duration), observe_actuator=True
     )
-    space = posed(task).make().action_space
+    space = study_env(task).make().action_space
     actions = [space.sample() for _ in range(12)]
     shown = played(config, actions)[:, -4:]
     given = [0.0, 0.0, 0.0, 0.0, *(float(np.ravel(action)[0]) for action in actions)]
@@ -86,7 +86,7 @@ def test_what_is_shown_is_the_last_four_commands(task):
 def test_a_delay_that_is_not_remembered_is_refused():
     step = find_task("pendulum").step_duration
     with pytest.raises(ValueError, match=r"Late\.delay"):
-        posed("pendulum", late("pendulum", delay=4.1 * step)).make()
+        study_env("pendulum", late("pendulum", delay=4.1 * step)).make()
     assert timestep("pendulum") == pytest.approx(step / 10)
 
 
@@ -95,14 +95,14 @@ def test_doses_and_reaches_follow_from_the_first_study_by_the_rules_of_the_plan(
     for task in TASKS:
         for axis, harmless in HARMLESS[task].items():
             known = [
-                (dose, evidence.loss(task, axis, dose).outcome) for dose in AXES[axis].doses[1:]
+                (dose, evidence.loss(task, axis, dose).outcome) for dose in AXES[axis].severities[1:]
             ]
-            spared = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].spared, known)]
-            assert harmless == (spared[-1] if spared else 0.0)
-            assert reach(task, axis) == (2 * harmless or AXES[axis].doses[1])
+            is_negligible = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].is_negligible, known)]
+            assert harmless == (is_negligible[-1] if is_negligible else 0.0)
+            assert reach(task, axis) == (2 * harmless or AXES[axis].severities[1])
     for axis, dose in DOSES["acrobot"].items():
-        hurt = [d for d in AXES[axis].doses[1:] if evidence.loss("acrobot", axis, d).outcome.hurt]
-        assert dose == (hurt[0] if hurt else AXES[axis].doses[-1])
+        is_harmful = [d for d in AXES[axis].severities[1:] if evidence.loss("acrobot", axis, d).outcome.is_harmful]
+        assert dose == (is_harmful[0] if is_harmful else AXES[axis].severities[-1])
 
 
 def test_the_plan_is_what_is_computed():

@@ -11,7 +11,7 @@ from pathlib import Path
 from codrl_mj.agents import DDPGConfig, DQNConfig, PPOConfig, SACConfig, SARSAConfig, TD3Config
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.runs.files import sealed, write_json
+from codrl_mj.runs.files import with_digest, write_json
 from codrl_mj.training import TrainConfig, TrainingStoppedError, train
 from codrl_mj.training.folder import admit
 from codrl_mj.training.watcher import Watcher
@@ -32,7 +32,7 @@ outcome, differing = kill_test.outcome, kill_test.differing
 
 def begin(run, config):
     """Leave a run folder in which a training has begun, and nothing is learned."""
-    write_json(run / "config.json", sealed(admit(run, config, resume=False, accept_changes=False)))
+    write_json(run / "config.json", with_digest(admit(run, config, resume=False, accept_changes=False)))
 
 
 def tiny(task, agent, num_envs=1, actuator="paper", total_episodes=None, **env):

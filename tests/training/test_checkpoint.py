@@ -16,7 +16,7 @@ import pytest
 from safetensors.numpy import save
 
 from codrl_mj.cli import main
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 from codrl_mj.training import TrainConfig, history, watcher
 from codrl_mj.training.checkpoint import State, load_checkpoint, save_checkpoint
 from tests.damage import Bomb, damage
@@ -184,11 +184,11 @@ def test_however_a_few_bytes_are_damaged_the_one_before_is_loaded_whole(tmp_path
 
 @pytest.fixture
 def leave_half_written():
-    """Leaves what `writing` leaves if the process is killed within its block, whose end is not reached."""
+    """Leaves what `atomic_write` leaves if the process is killed within its block, whose end is not reached."""
     entered = []
 
     def leave(path):
-        entered.append(writing(path))
+        entered.append(atomic_write(path))
         temporary = entered[-1].__enter__()
         temporary.write_bytes(b"half")
         return temporary

@@ -19,16 +19,16 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.sizing import (
     LoopDesign,
-    Looped,
+    CurrentLoopActuator,
     Response,
     abilities,
     closed_loop,
     design,
     open_loop,
-    small_step,
+    small_step_response,
 )
 from codrl_mj.sizing.abilities import diagram_limits, highest_current, torque_limits
-from codrl_mj.sizing.loop import Steps
+from codrl_mj.sizing.loop import StepResponses
 from codrl_mj.viz.pages.plots import Curve, Plot
 
 TORQUE_SPEED = "speed of the output [rad/s]", "torque of the output [N·m]"
@@ -36,7 +36,7 @@ TORQUE_SPEED = "speed of the output [rad/s]", "torque of the output [N·m]"
 _SHOWN, _CLOSE = (0.0, 60.0), (19.5, 24.0)
 """Of a step out of saturation, what is shown, and what of it closely [ms]."""
 
-Loops = Mapping[str, tuple[Looped, float | None]]
+Loops = Mapping[str, tuple[CurrentLoopActuator, float | None]]
 """Current loops by their names, with the mechanical step [s] of those that are no drives."""
 
 
@@ -270,7 +270,7 @@ def small_steps(loops: Loops) -> list[Plot]:
     """Small steps of the current, the shaft held, as shares of what is asked for; of one alone with its voltage."""
     curves = []
     for place, (name, loop) in enumerate(loops.items()):
-        step = small_step(*loop)
+        step = small_step_response(*loop)
         settled, asked = step.settling_time(), float(step.reference[-1])
         shown = max(int(3.0 * np.searchsorted(step.time, settled)), 20)
         step = Response(*(column[:shown] for column in step))
@@ -292,7 +292,7 @@ def small_steps(loops: Loops) -> list[Plot]:
     ]
 
 
-def recoveries(drive: Drive, steps: Steps) -> list[Plot]:
+def recoveries(drive: Drive, steps: StepResponses) -> list[Plot]:
     """Current and voltage out of a demand that the voltage cannot meet, by kind of anti-windup; and the same close."""
     told = {}
     for kind, one in steps.recoveries.items():
@@ -325,7 +325,7 @@ def _responses(
     ]
 
 
-def _voltages(loop: Looped, responses: Mapping[str, Response]) -> Plot:
+def _voltages(loop: CurrentLoopActuator, responses: Mapping[str, Response]) -> Plot:
     """Voltage of responses, within a supply."""
     colour = None if len(responses) > 1 else 1
     curves = [

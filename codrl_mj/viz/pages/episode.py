@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Ideal
 from codrl_mj.evaluation import run_episodes
-from codrl_mj.evaluation.evaluate import Driven, driven_in
+from codrl_mj.evaluation.evaluate import MotorTrace, motor_traces
 from codrl_mj.viz.films.film import Clip, clip, record
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.diagrams import episode_diagram
@@ -67,7 +67,7 @@ def show(name: str, env: Any, policy: Any, seed: int, filmed: bool = True) -> Sh
 
 
 @dataclasses.dataclass(frozen=True)
-class _MotorLine(Driven):
+class _MotorLine(MotorTrace):
     """What one motor of one run did; what its curves are called, and when they are shown."""
 
     before: str
@@ -174,7 +174,7 @@ def _caption(one: Shown, named: bool) -> str:
 def _lines(shown: Sequence[Shown], motors: list[str]) -> list[_MotorLine]:
     """Every motor of every run; by the names of all."""
     pairs = [
-        (one, number, motor) for one in shown for number, motor in enumerate(driven_in(one.episode))
+        (one, number, motor) for one in shown for number, motor in enumerate(motor_traces(one.episode))
     ]
     most = max(POINTS // 4, _BUDGET // (10 * len(pairs)))
     stride = max(-(-len(one.episode.trace["speed"]) // most) for one in shown)
@@ -212,7 +212,7 @@ def _motor_plots(lines: Sequence[_MotorLine]) -> list[Plot]:
     torque, error, current, voltage, power, warmth = ([] for _ in range(6))  # type: ignore[var-annotated]
     for line in lines:
         torque.append(line.curve("actual", line.actual, 1))
-        if line.tracks:
+        if line.is_torque_controlled:
             torque.append(line.curve("desired", line.desired, 0, dashed=True))
             error.append(line.curve("desired less actual", line.desired - line.actual, 4))
         if line.has("current"):

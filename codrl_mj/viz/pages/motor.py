@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import MotorEntry
-from codrl_mj.sizing import LoopDesign, design, designs, explain, step, unknown_in_words
+from codrl_mj.sizing import LoopDesign, design, designs, explain, step_responses, describe_unknown
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.diagrams import Loops, bode, recoveries, small_steps, torque_speed_diagram
 
@@ -105,7 +105,7 @@ def _loop(name: str, drive: Drive) -> Markup:
     try:
         parts += [
             page.heading("Out of saturation, by kind of anti-windup"),
-            page.plots(recoveries(drive, step(drive))),
+            page.plots(recoveries(drive, step_responses(drive))),
         ]
     except ValueError as error:
         parts = [parts[0], page.note(str(error))]
@@ -149,5 +149,5 @@ def _numbers(known: Mapping[str, Any]) -> Markup:
     if known["estimated"]:
         parts += [page.heading("Estimated"), page.definitions(known["estimated"].items())]
     if known["unknown"]:
-        parts.append(page.paragraph(unknown_in_words(known["unknown"]), "soft"))
+        parts.append(page.paragraph(describe_unknown(known["unknown"]), "soft"))
     return page.joined(parts)

@@ -16,7 +16,7 @@ import jinja2
 from markupsafe import Markup
 
 from codrl_mj import __version__
-from codrl_mj.runs.files import check_page, writing
+from codrl_mj.runs.files import check_page, atomic_write
 from codrl_mj.viz.pages.plots import Plot, as_json, description, still
 
 _HERE = Path(__file__).parent
@@ -84,7 +84,7 @@ def page(title: str, kicker: str, top: Markup, sections: Sequence[Section]) -> s
 def write(path: Path, text: str) -> Path:
     """Write a page, whole or not at all, to a file with the suffix of one."""
     check_page(path)
-    with writing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
 

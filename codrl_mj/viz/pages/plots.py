@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 
 POINTS = 6000
 """Most points of a line: more than there are pixels on a zoomed screen show nothing."""
@@ -240,7 +240,7 @@ def save(
             fontsize="small",
             frameon=False,
         )
-    with writing(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=150)
 
 

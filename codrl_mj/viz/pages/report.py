@@ -12,19 +12,19 @@ from markupsafe import Markup
 from codrl_mj.actuators import ActuatorModel, DCMotorActuator, Drive, Ideal
 from codrl_mj.evaluation import Episode
 from codrl_mj.evaluation.evaluate import MEASURES
-from codrl_mj.runs import BEST, EPISODES, PROGRESS, finished, told_apart
+from codrl_mj.runs import BEST, EPISODES, PROGRESS, finished, unique_names
 from codrl_mj.runs.files import check_page, read_json
 from codrl_mj.runs.policies import load_policy
 from codrl_mj.runs.summaries import (
     RunSummary,
     compare,
-    rank,
+    describe_rank,
     read_evaluation,
     read_reports,
     read_run,
-    typical_seed,
+    median_seed,
 )
-from codrl_mj.sizing import Looped, is_closed
+from codrl_mj.sizing import CurrentLoopActuator, is_closed
 from codrl_mj.training.folder import load_config
 from codrl_mj.training.history import learning_curves, read_episodes
 from codrl_mj.viz.pages import certificate as certificates
@@ -84,7 +84,7 @@ def report(
     summaries = [read_run(path) for path in runs]
     found = [
         _run(one, name, which, seed, trust, filmed, on_part)
-        for one, name in zip(summaries, told_apart([one.path for one in summaries]), strict=True)
+        for one, name in zip(summaries, unique_names([one.path for one in summaries]), strict=True)
     ]
     on_part("page")
     shown = [run for run in found if run.episode is not None]
@@ -124,7 +124,7 @@ def _run(
     """A run with an episode, as far as there is one."""
     best = which == "best" or not finished(summary.path)
     evaluation = read_evaluation(summary.path, best)
-    seed = given if given is not None else typical_seed(evaluation) or 0
+    seed = given if given is not None else median_seed(evaluation) or 0
     try:
         config = load_config(summary.path, trust)
     except (ValueError, OSError, ImportError) as error:
@@ -146,7 +146,7 @@ def _run(
         on_part(f"{name}: episode")
         shown = show(name, env, load_policy(policy, trust), seed, filmed)
         return shown._replace(
-            best=best, summary=summary, rank=rank(evaluation, shown.episode.total)
+            best=best, summary=summary, rank=describe_rank(evaluation, shown.episode.total)
         )
     except Exception as error:  # environments and actuators of others raise what they like
         return Shown(
@@ -349,7 +349,7 @@ def replays(shown: Sequence[Shown]) -> list[Markup]:
 
 def _loop(runs: Sequence[Shown]) -> Markup:
     """Current loops, and steps of actuators without one; each different one once."""
-    loops: dict[str, tuple[Looped, float | None]] = {}
+    loops: dict[str, tuple[CurrentLoopActuator, float | None]] = {}
     others: dict[str, tuple[ActuatorModel, float, float]] = {}
     without: dict[str, None] = {}
     seen: list[Any] = []

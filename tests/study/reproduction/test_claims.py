@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codrl_mj.actuators import IDEAL, CurrentLoop, Motor
-from codrl_mj.study.trials import numbers_as_text
+from codrl_mj.study.trials import format_ranges
 from codrl_mj.tasks import named_actuator
 from codrl_mj.training import TrainConfig
 from reproduction.arms import ARMS, TASKS
@@ -269,5 +269,5 @@ def test_the_band_is_the_bootstraps():
 
 
 def test_seeds_as_text():
-    assert numbers_as_text([7, 1, 0, 2, 5, 6, 9]) == "0 to 2, 5 to 7, 9"
-    assert numbers_as_text([]) == ""
+    assert format_ranges([7, 1, 0, 2, 5, 6, 9]) == "0 to 2, 5 to 7, 9"
+    assert format_ranges([]) == ""

@@ -295,9 +295,9 @@ def test_costs_are_those_of_finished_runs_or_estimates(done):
     by_arm = {cost.arm.name: cost for cost in plan.grid.costs()}
     half = by_arm[HILL[0].name]  # the first seed's row is published
     assert (half.finished, half.missing) == ((), (1,))
-    assert (half.tests, half.left) == (1, HILL[0].seconds + TEST_SECONDS)
+    assert (half.tests, half.remaining_seconds) == (1, HILL[0].seconds + TEST_SECONDS)
     none = by_arm[BLOCKED.name]
-    assert (none.finished, none.missing, none.left) == (
+    assert (none.finished, none.missing, none.remaining_seconds) == (
         (),
         (0, 1),
         2 * (BLOCKED.seconds + TEST_SECONDS),
@@ -308,7 +308,7 @@ def test_costs_are_those_of_finished_runs_or_estimates(done):
 
 def test_the_whole_is_estimated_at_less_than_four_hours_of_two_cores(tmp_path):
     grid = Reproduction(root=tmp_path, out=tmp_path).grid
-    assert sum(cost.left for cost in grid.costs()) < 2 * 4 * 3600
+    assert sum(cost.remaining_seconds for cost in grid.costs()) < 2 * 4 * 3600
     assert len(grid.cells) == sum(30 if arm.task == "mountain_car" else 5 for arm in ARMS)
 
 
