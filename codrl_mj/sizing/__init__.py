@@ -1,18 +1,25 @@
-"""Drives on paper: what they can do, their current loops, and which does a task; docs/motors.md."""
+"""Sizing of drives: limits, current loops, demands and choice; docs/motors.md."""
 
 from codrl_mj.sizing.abilities import (
     Abilities,
     abilities,
     catalogue_rows,
+    describe_unknown,
     explain,
     find_drive,
     find_entry,
     find_loop,
     torque_limits,
-    describe_unknown,
 )
-from codrl_mj.sizing.choice import Candidate, actuators_of, choose, equivalent_gears, with_best_gear, ignored_quantities
-from codrl_mj.sizing.demand import Demand, demand_of, demands_of, demand_from_arrays
+from codrl_mj.sizing.choice import (
+    Candidate,
+    actuators_of,
+    choose,
+    equivalent_gears,
+    ignored_quantities,
+    with_best_gear,
+)
+from codrl_mj.sizing.demand import Demand, demand_from_arrays, demand_of, demands_of
 from codrl_mj.sizing.feasibility import (
     DEPENDS,
     HOPELESS,
@@ -27,8 +34,8 @@ from codrl_mj.sizing.feasibility import (
     operation,
 )
 from codrl_mj.sizing.loop import (
-    LoopDesign,
     CurrentLoopActuator,
+    LoopDesign,
     Response,
     StepResponses,
     closed_loop,
@@ -38,9 +45,9 @@ from codrl_mj.sizing.loop import (
     is_closed,
     open_loop,
     simulate_loop,
-    undersampling_warning,
     small_step_response,
     step_responses,
+    undersampling_warning,
 )
 from codrl_mj.sizing.swing import Swing, min_energy_gain, min_pumped_energy, min_supply_voltage
 

@@ -1,4 +1,4 @@
-"""Studies: arms trained with many seeds, trials that test them, judged questions and a result page."""
+"""Studies: arms trained with many seeds, trials, judged questions and a result page."""
 
 from codrl_mj.study.inference import (
     Stratum,

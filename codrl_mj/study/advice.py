@@ -46,7 +46,7 @@ class LossBounds(NamedTuple):
     upper: Outcome | None
     """Largest possible loss; None if unknown."""
     lower: Outcome | None
-    """Smallest possible loss; None if unknown. The same object as `upper` if it was tested or interpolated."""
+    """Smallest possible loss; None if unknown. Identical to `upper` if tested or interpolated."""
 
     def summary(self) -> dict[str, Any]:
         """Return the bounds under the keys of the command line's JSON output."""
@@ -64,8 +64,8 @@ def decide(options: Mapping[str, LossBounds]) -> str:
     """Return the recommended option, for predicted and for measured losses alike.
 
     1. The first of `OPTIONS` whose loss is negligible.
-    2. Otherwise consider the options that are certainly better, by more than `MARGIN`, than training
-       on ideal forces, and return the first whose mean is within `MARGIN` of the best of them.
+    2. Otherwise consider the options that are certainly better than training on ideal forces, by
+       more than `MARGIN`, and return the first whose mean is within `MARGIN` of the best of them.
     3. Otherwise `BUY` if every option is certainly harmful and has a known upper bound (the first
        option needs none).
     4. Otherwise `MEASURE`.
@@ -139,6 +139,8 @@ def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
             options[name] = _bounds_of_losses(
                 predict_losses(evidence, task, severities(improved, task))
             )
+    # The study has no axis for excess force or for an offset, so that no loss is predicted for
+    # them.
     untested = ""
     if max(delivery.at_rest, delivery.at_speed) > 1.0 + MARGIN:
         untested = "it delivers more than is asked for"
@@ -199,6 +201,7 @@ def option_bounds(
                 for axis, severity in requested.items()
                 if severity > 1.005 * tested.get(axis, 0.0) + 1e-9
             }
+            # Axes on which the test had less than requested are added as for untrained policies.
             extra = predict_losses(evidence, task, exceeding)
             if not any(loss.beyond for loss in extra):
                 clipped = (
@@ -217,7 +220,7 @@ def option_bounds(
 
 
 def tested_points(evidence: Evidence, task: str) -> TestedPoints:
-    """Return tested severities and losses of policies trained on random or on the tested actuators."""
+    """Return tested severities and losses of policies that were not trained on ideal forces."""
     all_tests = [
         (f"{axis} {severity:g}", {axis: severity})
         for axis, definition in AXES.items()
@@ -253,7 +256,7 @@ def tested_points(evidence: Evidence, task: str) -> TestedPoints:
     }
 
 
-# -- text -----------------------------------------------------------------------------------------------------
+# -- text ------------------------------------------------------------------------------------------
 
 
 def _reason(verdict: str, options: Mapping[str, LossBounds], delivery: Delivery) -> str:
@@ -294,7 +297,7 @@ def describe(option: LossBounds) -> str:
     return f"{option.bound}{mean:z.2f} of the span ({low:z.2f} to {high:z.2f}; {failed})"
 
 
-# -- measured ---------------------------------------------------------------------------------------------------
+# -- measured --------------------------------------------------------------------------------------
 
 RANDOM_EPISODES = 100
 """Episodes of random actions that give the span's lower end for a task outside the study."""
@@ -405,6 +408,7 @@ def _ideal_arm(subject: str, trust: bool = False) -> Arm:
     else:
         env = EnvConfig(subject)
         config = TrainConfig.preset(subject, env.world.default_agent(env))
+    # Evaluations and checkpoints during training would only cost time.
     never = max(config.total_steps or 10**9, 10**9)
     env = dataclasses.replace(
         config.env, actuator=IDEAL_ACTUATOR, randomize=None, allow_unstable=False

@@ -66,8 +66,8 @@ def study_env(task: str, actuator: Any = IDEAL, **fields: Any) -> EnvConfig:
 
     Ideal and real actuators share the integration step, so that only the actuator differs.
     """
-    # CartPole uses the paper's reward: with Gymnasium's, nearly every policy reaches the maximum and
-    # differences disappear.
+    # CartPole uses the paper's reward: with Gymnasium's, nearly every policy reaches the maximum
+    # and differences disappear.
     options = {"center_radius": CENTER_RADIUS} if task == "cartpole" else {}
     return EnvConfig(task, actuator, timestep=timestep(task), options=options, **fields)
 
@@ -100,7 +100,7 @@ def friction(task: str, severity: float) -> EnvConfig:
 
 
 def motor_constant(task: str) -> float:
-    """Return the torque constant [N*m/A] of a 1 ohm motor that needs the lowest voltage for the task.
+    """Return the torque constant [N*m/A] of the 1 ohm motor with the lowest voltage for a task.
 
     For the largest force F at the reference speed w, u = F/k + k*w is minimal at k = sqrt(F/w),
     where both terms are equal.
@@ -163,8 +163,8 @@ REAL: Mapping[str, Mapping[str, Any]] = {
         }
     },
 }
-"""Task -> name of arm and test -> drive: a motor that `codrl-mj motor choose` judges `try it`, because
-some bound is not met (the cars have none), and the paper's motor with two current loops.
+"""Task -> name of arm and test -> drive: a motor that `codrl-mj motor choose` judges `try it`,
+because some bound is not met (the cars have none), and the paper's motor with two current loops.
 """
 
 

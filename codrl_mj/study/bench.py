@@ -29,8 +29,8 @@ def make_bench(actuator: Any, timestep: float, inertia: float) -> Callable[..., 
     """
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.compiler.boundmass = timestep, 0.0
-    # The solver's tolerance is relative to the inertia: with a huge one the solver would stop before
-    # it has resolved the friction.
+    # The solver's tolerance is relative to the inertia: with a huge one the solver would stop
+    # before it has resolved the friction.
     spec.option.tolerance = 0.0
     body = spec.worldbody.add_body(explicitinertial=True, mass=1.0, inertia=[inertia] * 3)
     body.add_joint(name="hinge", axis=[0.0, 0.0, 1.0])
@@ -77,7 +77,8 @@ class Delivery(NamedTuple):
     """Final force while driving at the reference speed [largest force]."""
     friction: float
     """Braking force at zero command [largest force]: the larger of the total at a twentieth of the
-    reference speed, and of the mechanical losses at the reference speed, which exclude the back-EMF.
+    reference speed, and of the mechanical losses at the reference speed, which exclude the
+    back-EMF.
     """
     noise: float
     """Standard deviation of the force [largest force] from one integration step to the next."""
@@ -105,6 +106,7 @@ def measure_delivery(
     def delivered_torque(joint_speed: float) -> np.ndarray:
         return (blocked(force, duration, joint_speed)[:, 0] - unasked) / force
 
+    # The inertia is so large that friction hardly slows the hinge within the measurement.
     def braking(joint_speed: float) -> tuple[float, float]:
         turned = _end(
             make_bench(actuator, timestep, 1e4 * force * duration / joint_speed)(
@@ -114,6 +116,7 @@ def measure_delivery(
         driven, moved, _ = np.mean(turned, axis=0)
         return float(np.mean(_end(unasked)) - moved) / force, float(driven - moved) / force
 
+    # The area between the step response and its final value is the average residence time.
     torques = delivered_torque(0.0)
     last = float(np.mean(_end(torques)))
     started = np.flatnonzero(np.abs(torques) > 1e-3 * abs(last))
@@ -136,7 +139,7 @@ def _end(rows: np.ndarray) -> np.ndarray:
     return rows[-max(round(len(rows) / HORIZON_STEPS), 1) :]
 
 
-# -- on a task of the study ---------------------------------------------------------------------------------------
+# -- on a task of the study ------------------------------------------------------------------------
 
 
 def measure_on_task(actuator: Any, task: str, share: float = 1.0) -> Delivery:

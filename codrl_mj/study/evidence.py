@@ -30,7 +30,7 @@ class Outcome(NamedTuple):
     lost: np.ndarray
     """Lost share of the task's span, shape (policies,)."""
     missed: np.ndarray
-    """Lost share of successful episodes, shape (policies,); 0 if the task does not define success."""
+    """Lost share of successful episodes, shape (policies,); 0 if the task has no success."""
 
     @property
     def loss(self) -> Interval:
@@ -52,8 +52,8 @@ class Outcome(NamedTuple):
         """True if the loss is negligible.
 
         All of these hold: the mean loss is at most `MARGIN`, its interval ends at or below
-        `FAILURE_MARGIN`, at most a tenth of the policies fail, and at most a tenth of the success is
-        lost.
+        `FAILURE_MARGIN`, at most a tenth of the policies fail, and at most a tenth of the success
+        is lost.
         """
         within = self.loss.mean <= MARGIN and self.loss.high <= FAILURE_MARGIN
         return (
@@ -64,7 +64,7 @@ class Outcome(NamedTuple):
 
     @property
     def is_harmful(self) -> bool:
-        """True if the 95 % intervals exclude a loss below `FAILURE_MARGIN` or a tenth of the success."""
+        """True if a 95 % interval lies above `FAILURE_MARGIN` or above a tenth of the success."""
         return self.loss.low > FAILURE_MARGIN or self.success_lost.low > MAX_FAILED_SHARE
 
     def summary(self) -> dict[str, Any]:
@@ -232,6 +232,8 @@ class Evidence:
         if not available:
             return {}
         count = min(len(outcome.lost) for outcome in available.values())
+        # Losses are interpolated policy by policy, so every severity needs the same policies: seeds
+        # that some test lacks are cut off.
         cut = {
             severity: Outcome(outcome.lost[:count], outcome.missed[:count])
             for severity, outcome in available.items()

@@ -136,7 +136,7 @@ def _compute(
     workers: Workers,
     on_cell: Callable[[Any], None],
 ) -> dict[Any, str]:
-    """Call `_attempt` for each cell with work and return the errors by cell; failures stop no cell."""
+    """Call `_attempt` for each cell with work; return the errors by cell."""
     for cell in cells:
         if cell not in work:
             on_cell(cell)
@@ -157,7 +157,7 @@ def _attempt(
     function: Callable[..., None],
     *arguments: Any,
 ) -> tuple[Any, str | None]:
-    """Call a function; return the name and its error in a line, which is also recorded in a file."""
+    """Call a function; return the name and its error in a line, which a file records."""
     record = failure_record(cell)
     try:
         function(*arguments)

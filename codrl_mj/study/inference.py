@@ -165,7 +165,10 @@ def detectable_difference(runs: int, level: float = 0.05, probability: float = 0
 def runs_needed(
     difference: float, level: float = 0.05, probability: float = 0.8, max_runs: int = 10_000
 ) -> int | None:
-    """Return the runs per group that detect a difference [standard deviations]; None if > `max_runs`."""
+    """Return the runs per group that detect a difference; None if more than `max_runs`.
+
+    The difference is in standard deviations of a run.
+    """
     if difference == 0 or power(max_runs, difference, level) < probability:
         return None
     return bisect.bisect_left(

@@ -1,4 +1,4 @@
-"""Parallel calls in processes of this machine or on a Ray cluster; the only module that starts any."""
+"""Parallel calls in processes of this machine or on a Ray cluster."""
 
 import contextlib
 import dataclasses

@@ -57,7 +57,7 @@ class Program(Checked, abc.ABC):
         """Write the page of all available results; return the files and the errors by name."""
 
     def publish(self) -> None:
-        """Write the available results after each completed seed, since run folders may be temporary.
+        """Write the available results after each completed seed: run folders may be temporary.
 
         An error is only printed: the page is written again at the end, and raises it there.
         """
@@ -72,8 +72,8 @@ class Program(Checked, abc.ABC):
         if self.dry_run:
             core_hours = _print_costs(grid)
             print(
-                f"about {core_hours:.2f} core hours are left: {core_hours / workers.cores:.2f} hours with"
-                f" {workers.cores} jobs"
+                f"about {core_hours:.2f} core hours are left:"
+                f" {core_hours / workers.cores:.2f} hours with {workers.cores} jobs"
             )
             return 0
         check_writable(self.root)

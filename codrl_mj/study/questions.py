@@ -66,8 +66,8 @@ class Question:
 class Scores:
     """Scores of policies in shares of their task's span.
 
-    0 is the mean return of random actions on ideal forces, and 1 the mean return of policies trained
-    and tested there.
+    0 is the mean return of random actions on ideal forces, and 1 the mean return of policies
+    trained and tested there.
     """
 
     def __init__(
@@ -84,8 +84,8 @@ class Scores:
         returns = {trial.arm.task: list(collected.scores(trial).values()) for trial in ideal_trials}
         means = {task: float(np.mean(values)) for task, values in returns.items() if values}
         self.ceilings = {task: mean for task, mean in means.items() if mean > floors[task]}
-        """Task -> upper end of its span; omits tasks whose ideal-trained policies are untested or no
-        better than random actions.
+        """Task -> upper end of its span; omits tasks whose ideal-trained policies are untested or
+        no better than random actions.
         """
 
     def by_seed(self, trial: Trial) -> dict[int, float]:
@@ -131,9 +131,9 @@ class Verdict(NamedTuple):
     strata: tuple[int, int]
     """Number of testable contrasts, and of all contrasts."""
     effect: Interval
-    """Mean difference of scores [share of the span], with its 95 % interval; NaN without contrasts."""
+    """Mean difference of scores [share of the span], with interval; NaN without contrasts."""
     p: float
-    """Uncorrected p of no difference (`better`) or of the margin (`equivalent`); NaN if not judged."""
+    """Uncorrected p of no difference, or of the margin (`equivalent`); NaN if not judged."""
     corrected_p: float
     """p after correction for the questions that are judged together."""
 

@@ -422,7 +422,7 @@ def run_rows(
 def trial_rows(
     collected: Collected, score: Callable[[Trial], Mapping[int, float]]
 ) -> Iterable[dict[str, Any]]:
-    """Yield a row for every trial: mean score with bootstrap interval, and means of the measures."""
+    """Yield a row for every trial: mean score with bootstrap interval, means of the measures."""
     for trial in collected.grid.trials:
         scores = np.array(list(score(trial).values()))
         if not scores.size:

@@ -101,8 +101,8 @@ def test_doses_and_reaches_follow_from_the_first_study_by_the_rules_of_the_plan(
             assert harmless == (is_negligible[-1] if is_negligible else 0.0)
             assert reach(task, axis) == (2 * harmless or AXES[axis].severities[1])
     for axis, dose in DOSES["acrobot"].items():
-        is_harmful = [d for d in AXES[axis].severities[1:] if evidence.loss("acrobot", axis, d).outcome.is_harmful]
-        assert dose == (is_harmful[0] if is_harmful else AXES[axis].severities[-1])
+        harmful = [d for d in AXES[axis].severities[1:] if evidence.loss("acrobot", axis, d).outcome.is_harmful]
+        assert dose == (harmful[0] if harmful else AXES[axis].severities[-1])
 
 
 def test_the_plan_is_what_is_computed():

@@ -341,7 +341,7 @@ def test_as_many_seeds_are_trained_at_once_as_occupy_every_core(tmp_path, monkey
     ("changes", "message"),
     [
         ({"tasks": ("cartpol",)}, "unknown 'cartpol': did you mean 'cartpole'"),
-        ({"tasks": ()}, "none is named"),
+        ({"tasks": ()}, "empty"),
         ({"settings": ("repared",)}, "did you mean 'repaired'"),
         ({"seeds": 0}, "seeds = 0: must be an integer >= 1"),
         ({"sarsa_seeds": 1.5}, "sarsa_seeds = 1.5"),
