@@ -16,7 +16,7 @@ from codrl_mj.study.advice import (
     RANDOMIZE,
     THROUGH,
     decide,
-    known,
+    option_bounds,
     tested_points,
 )
 from codrl_mj.study.axes import AXES, SECONDS
@@ -196,7 +196,7 @@ def chart(path: Path, evidence: Evidence) -> bool:
             [
                 [
                     list(_REGIONS).index(
-                        decide(known(evidence, task, none | {"lag": lag, "supply": lack}, points))
+                        decide(option_bounds(evidence, task, none | {"lag": lag, "supply": lack}, points))
                     )
                     for lag in lags
                 ]

@@ -151,13 +151,13 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
                 if (one := evidence.loss(task, name, dose))
             ]
             borne = [dose for dose, _ in itertools.takewhile(lambda pair: pair[1].is_negligible, known)]
-            is_harmful = next(((dose, one) for dose, one in known if one.is_harmful), None)
+            harmful = next(((dose, one) for dose, one in known if one.is_harmful), None)
             factor, of = scale(task, name)
             text = f"≤{short(factor * borne[-1] if borne else 0.0)}"
-            if is_harmful is not None:
+            if harmful is not None:
                 text += (
-                    f", ≥{short(factor * is_harmful[0])} {of}"
-                    f" ({round(is_harmful[1].failed * len(is_harmful[1].lost))})"
+                    f", ≥{short(factor * harmful[0])} {of}"
+                    f" ({round(harmful[1].failed * len(harmful[1].lost))})"
                 )
             else:
                 text += f" {of}"
