@@ -21,11 +21,11 @@ hypothesis.settings.load_profile("deterministic")
 
 
 REPRESENTATIVES = ("pendulum", "cartpole", "mountain_car")
-"""Of products of the tasks with something else `make test` runs these: a continuous, an unbounded and a walled one."""
+"""Tasks of matrix tests in `make test`: a continuous, an unbounded and a walled one."""
 
 
 def pytest_collection_modifyitems(items):
-    """Leave the other tasks' rows of such products to `make check`."""
+    """Deselect matrix rows of other tasks, which `make check` runs."""
     for item in items:
         parameters = getattr(item, "callspec", None)
         if parameters and len(parameters.params) > 1:
@@ -35,7 +35,7 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """Spare the collector what lives as long as the process: thousands of tests, and all that they import."""
+    """Freeze collected objects, so that the garbage collector skips tests and imports."""
     gc.collect()
     gc.freeze()
 
@@ -47,7 +47,7 @@ def _remove_callbacks():
 
 @pytest.fixture
 def bare_engine():
-    """MuJoCo without any callback, before and after the test."""
+    """Remove MuJoCo's callbacks before and after the test."""
     _remove_callbacks()
     yield
     _remove_callbacks()
@@ -55,14 +55,14 @@ def bare_engine():
 
 @pytest.fixture
 def installed(bare_engine):
-    """MuJoCo with our motors' callbacks during the test, and without any after it."""
+    """Install the motors' callbacks in MuJoCo during the test."""
     engine.load_family(DCMotorActuator)
     engine.install()
 
 
 @pytest.fixture(autouse=True)
 def _only_our_tasks():
-    """Whatever task a test registers is forgotten after it: others go through all that are known."""
+    """Unregister the tasks of a test after it, because other tests iterate over all tasks."""
     yield
     for name in set(TASKS) - OURS:
         registry.pop(TASKS.pop(name).env_id, None)
@@ -70,5 +70,5 @@ def _only_our_tasks():
 
 @pytest.fixture(autouse=True, scope="session")
 def _as_wide_as_a_file():
-    """Processes of a parallel run have a COLUMNS of their own."""
+    """Remove COLUMNS, which processes of a parallel run set."""
     os.environ.pop("COLUMNS", None)

@@ -46,7 +46,7 @@ def test_a_motor_without_redundant_values_reproduces_its_datasheet_exactly():
 @pytest.mark.parametrize("max_current", [math.inf, 1.0], ids=["voltage alone", "and current"])
 @pytest.mark.parametrize("sag", [0.0, 2.0, 10.0])
 def test_the_simulated_drive_settles_at_the_limits(max_current, sag):
-    """In all four quadrants, and beyond the no-load speed, where the back-EMF drives the current."""
+    """Compare all four quadrants, and speeds beyond the no-load speed."""
     drive = Drive(
         GearMotor(gear_ratio=3.0), SampledLoop(max_current=max_current), Supply(24.0, sag)
     )

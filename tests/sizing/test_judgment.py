@@ -1,4 +1,4 @@
-"""Judgments of motors: equal in `feasible` and `choose`, and never contradicted by trained policies."""
+"""Judgments of motors: equal in `feasible` and `choose`, and consistent with trained policies."""
 
 import csv
 import dataclasses
@@ -89,7 +89,7 @@ def drive(voltage=24.0, **motor):
 
 
 def published():
-    """Return task, actuator, score and success of every published row with a motor: 20 policies each."""
+    """Return task, actuator, score and success of every published row with a motor."""
     rows = {}
     for study in ("actuators", "insurance"):
         with (DOCS / "results" / study / "trials.csv").open() as file:
@@ -162,7 +162,7 @@ def test_no_policy_trained_through_the_motor_contradicts_a_verdict(furuta):
 
 
 def test_the_shares_of_rotor_and_friction_are_part_of_the_judgment():
-    """Inertia: N^2 J alpha over tau, which scales with the gear squared; friction: N tau_c over tau."""
+    """The inertia's share is N^2 J alpha over tau, the friction's N tau_c over tau."""
     demand = swinging()  # 0.1 N*m, 16 rad/s^2
     limit = 0.5 * 0.1 / 16.0
     for inertia, verdict in ((0.98 * limit, SURELY), (1.02 * limit, TRY_IT)):
@@ -185,7 +185,7 @@ def test_the_shares_of_rotor_and_friction_are_part_of_the_judgment():
 
 
 def test_a_motor_on_which_policies_failed_is_not_judged_surely(furuta, pololu):
-    """Each gear was once judged surely; with 18.75, policies that command torques succeed in 0 %."""
+    """An earlier version judged each gear surely; with 18.75, policies succeed in 0 %."""
     gears = (50.0, 6.25, 18.75, 30.0)
     choices = choose(furuta, [str(pololu[1])], gears=gears)
     assert [choice.ratio for choice in choices] == pytest.approx(sorted(gears))

@@ -1,4 +1,4 @@
-"""Margins, bandwidth and steps, against closed forms, python-control and sweeps of the simulated loop."""
+"""Margins, bandwidth and steps, against closed forms, python-control and frequency sweeps."""
 
 import dataclasses
 import math
@@ -32,7 +32,7 @@ with_and_without_delay = pytest.mark.parametrize(
 
 
 def measured_gain(drive, frequency, samples=400):
-    """Return the simulated loop's complex gain from reference to sampled current at a frequency [Hz]."""
+    """Return the simulated complex gain from reference to sampled current at a frequency [Hz]."""
     angle = 2 * math.pi * frequency / drive.controller.sample_rate * np.arange(samples)
     amplitude = 1e-3 * drive.voltage_limit / drive.motor.resistance
     late = slice(samples // 2, None)
@@ -177,7 +177,7 @@ def test_raises_if_the_loop_is_unstable():
 
 @pytest.mark.parametrize("name", ["quanser-qube-servo-2", "heinzmann-pmg-132", "cubemars-ak80-6"])
 def test_anti_windup_shortens_the_recovery(name):
-    """The case with the largest current within reach at half the no-load speed uses a higher speed."""
+    """One largest current is within reach at half the no-load speed, so the speed is higher."""
     drive = find_drive(name)
     steps = step_responses(drive)
     within = (

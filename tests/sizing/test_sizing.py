@@ -67,7 +67,7 @@ def pendulum():
 
 
 def from_hanging(actuator, steps=400):
-    """Return the states (steps + 1, 2) of the scripted swing-up on an actuator, from almost hanging."""
+    """Return the states (steps + 1, 2) of the scripted swing-up from almost hanging."""
     env, policy = (
         EnvConfig("pendulum", actuator, max_episode_steps=steps).make(),
         Scripted(TASKS["pendulum"]),
@@ -208,7 +208,7 @@ def test_the_scripted_swing_up_reaches_and_reports_upright(pendulum):
 
 
 def test_the_predicted_supply_of_a_swing_up_agrees_with_simulation(pendulum):
-    """At least 5.17 V for any controller, 5.59 V by the energy of swings; more with a slower winding."""
+    """Any controller needs 5.17 V, and energy pumping 5.59 V; a slower winding needs more."""
     min_voltage = min_supply_voltage(pendulum.swing, drive(), min_energy_gain)
     assert min_voltage == pytest.approx(5.17, abs=0.02)
     assert min_supply_voltage(pendulum.swing, drive(), min_pumped_energy) == pytest.approx(
@@ -231,7 +231,7 @@ def test_a_catalogue_motor_swings_up_slightly_above_the_predicted_supply(pendulu
 
 
 def test_a_sagging_supply_acts_like_additional_resistance(pendulum):
-    """Compare power, stall and energy of a swing below the no-load speed, and the required supply."""
+    """Compare power, stall and swings below the no-load speed, and the required supply."""
     sagging = Drive(PAPER, SampledLoop(), Supply(7.5, 0.5))
     stiff = drive(dataclasses.replace(PAPER, resistance=1.5), 7.5)
     ours, theirs = (bounds(feasibility(drive_, pendulum)) for drive_ in (sagging, stiff))
@@ -252,7 +252,7 @@ def test_friction_and_damping_raise_the_supply_of_a_swing_up(pendulum):
 
 
 def test_a_surely_sufficient_motor_does_not_change_the_run(pendulum):
-    """At 10 V for 2 N*m at 8 rad/s, the run equals the ideal one, up to the delay of L/R = 0.1 ms."""
+    """At 10 V the run equals the ideal one, up to the delay of L/R = 0.1 ms."""
     quick = drive(dataclasses.replace(PAPER, inductance=1e-4), 10.0)
     assert operation(pendulum, quick).voltage.max() <= 10.0
     assert feasibility(quick, pendulum, COOL).verdict == SURELY

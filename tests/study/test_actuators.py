@@ -35,7 +35,7 @@ def returns(score):
 
 
 def noisy(level):
-    """Add noise by seed to a level; ideal-trained policies have a mean of exactly 1 on ideal forces."""
+    """Add noise by seed to a level; ideal-trained policies have a mean of exactly 1."""
 
     def score(trial, seed):
         return level(trial) + 0.02 * (-1.0) ** seed  # The sum over an even number of seeds is 0.
@@ -105,7 +105,7 @@ def test_severities_are_in_policy_steps_and_shares_of_the_largest_force():
 
 
 def test_half_of_the_voltage_gives_a_stall_torque_equal_to_the_largest_torque():
-    """Half of U = 2*sqrt(F*w) is R*F/k: the voltage at which the 1 ohm motor holds the largest force."""
+    """Half of U = 2*sqrt(F*w) is R*F/k, at which the 1 ohm motor holds the largest force."""
     for task in SECONDS:
         drive = AXES["supply"].make_env(task, 0.5).actuator
         stall = drive.motor.torque_constant * drive.supply.voltage / drive.motor.resistance
@@ -123,7 +123,7 @@ def test_a_lag_of_severity_zero_equals_the_ideal_actuator():
 
 
 def test_the_study_computes_what_the_plan_states():
-    """docs/results/plan.md has the numbers of arms, trainings and tests, the hypotheses and severities.
+    """docs/results/plan.md has the numbers of arms, trainings and tests, and all hypotheses.
 
     The exploration adds tests, but no trainings.
     """
@@ -262,9 +262,9 @@ def test_the_recommended_number_of_seeds_has_the_stated_power(kind, mean, seeds)
 
 
 def test_policies_in_several_contrasts_count_once(tmp_path):
-    """P7 compares the same generic policies with six arms: a sample is a policy's mean over six axes.
+    """P7 compares the same generic policies with six arms, P10 on six motors.
 
-    P10 compares the same policies on six motors: a sample is the mean of a policy's differences.
+    A sample of P7 is a policy's mean over six axes, one of P10 the mean of its differences.
     """
     random = np.random.default_rng(0)
     seed_offsets = random.normal(0.0, 0.1, 6)  # Advantage of a seed, the same in every test.
@@ -414,7 +414,7 @@ def test_raises_before_computing_if_the_output_cannot_be_written(flag, tmp_path,
 
 
 def test_the_example_recomputes_the_numbers_without_the_package():
-    """Recompute means and failures of the published trials in an interpreter without the package."""
+    """Recompute means and failures of the published trials without the package."""
     example = RESULTS.parents[1] / "examples" / "recompute.py"
     run = [sys.executable, "-I", "-S", str(example), str(RESULTS / FOLDER / "runs.csv")]
     lines = subprocess.run(run, capture_output=True, text=True, check=True).stdout.splitlines()

@@ -1,4 +1,4 @@
-"""The grid: each cell is computed once, and failures, kills and backends do not affect the others."""
+"""The grid: each cell is computed once, whatever happens to other cells or to the grid."""
 
 import dataclasses
 import json

@@ -38,7 +38,7 @@ RESULTS = Path(__file__).parents[2] / "docs/results"
 
 
 def play(config, actions):
-    """Return observations without the actuator's entries, and all observations, for given actions."""
+    """Return observations without the actuator's entries, and all of them, for given actions."""
     env = config.make()
     observations = [env.reset(seed=3)[0]]
     observations += [env.step(action)[0] for action in actions]

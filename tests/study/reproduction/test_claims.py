@@ -198,7 +198,7 @@ def test_both_kinds_of_physics_are_compared_seed_by_seed():
     assert claim.judge(rows | {claim.arms[0]: again}).reason == "no two values differ"
 
 
-# -- rows ---------------------------------------------------------------------------------------------------
+# -- rows ------------------------------------------------------------------------------------------
 
 
 def test_the_last_episodes_are_counted_from_the_end():
@@ -224,7 +224,7 @@ def test_a_row_is_replaced_by_its_training_but_not_by_one_with_other_packages():
     ("angle", "speed", "since"), [(0.19, 0.29, 0.0), (0.21, 0.0, None), (0.0, 0.31, None)]
 )
 def test_upright_is_defined_by_full_torque(angle, speed, since):
-    """Full torque holds the rod at asin(2/5) = 2*0.2 rad, and changes its speed by 0.3 rad/s in a step."""
+    """Full torque holds the rod at asin(2/5) = 2*0.2 rad and adds 0.3 rad/s in a step."""
     assert pytest.approx(np.arcsin(2 / 5) / 2, abs=0.01) == UPRIGHT_ANGLE
     assert pytest.approx(0.3) == UPRIGHT_SPEED
     time = 0.05 * np.arange(1, 201)

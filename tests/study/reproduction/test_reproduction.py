@@ -1,4 +1,4 @@
-"""The reproduction from configuration to page: short trainings, gaps, failures, figures, command line."""
+"""The reproduction: short trainings, gaps, failures, page, figures, command line."""
 
 import contextlib
 import csv
@@ -48,7 +48,7 @@ BLOCKED = HILL[-1]
 
 @pytest.fixture(scope="module")
 def reproduction(tmp_path_factory):
-    """Return a finished reproduction with one of two seeds of the mountain cars and one failed arm."""
+    """Return a finished reproduction with one of two seeds of mountain cars and a failed arm."""
     root = tmp_path_factory.mktemp("paper")
     plan = Reproduction(
         root=root,
@@ -360,7 +360,7 @@ def test_raises_if_the_plan_is_invalid(changes, message):
         Reproduction(**changes)
 
 
-# -- figures ------------------------------------------------------------------------------------------------
+# -- figures ---------------------------------------------------------------------------------------
 
 
 def random_episode(arm, steps=30, inner_steps=3):
@@ -444,7 +444,7 @@ def test_epochs_are_drawn_one_below_the_other(tmp_path):
     assert ElementTree.parse(tmp_path / "epochs.svg").getroot().tag.endswith("svg")
 
 
-# -- command line -------------------------------------------------------------------------------------------
+# -- command line ----------------------------------------------------------------------------------
 
 
 def test_a_dry_run_only_lists(tmp_path, capsys):

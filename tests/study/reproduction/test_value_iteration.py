@@ -1,4 +1,4 @@
-"""Value iteration, against a chain's closed form, Gymnasium's environment and known mountain car facts."""
+"""Value iteration, against a chain's closed form and Gymnasium's mountain car."""
 
 import gymnasium
 import numpy as np
@@ -17,7 +17,10 @@ def model():
 
 @pytest.mark.parametrize("discount", [0.0, 0.5, 0.99])
 def test_the_values_of_a_chain_agree_with_the_closed_form(discount):
-    """Actions: stay for 0, or step forward for -c. The n-th step earns 1: g^(n-1) - c (1 - g^n)/(1 - g)."""
+    """Actions are to stay for 0 or to step forward for -c; the n-th step earns 1.
+
+    The value is g^(n-1) - c (1 - g^n)/(1 - g) at discount g.
+    """
     length, cost = 5, 0.1
     stay = sparse.eye_array(length)
     step = sparse.csr_array(np.diag(np.ones(length - 1), 1))  # the last one ends the episode
