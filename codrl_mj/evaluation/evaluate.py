@@ -178,12 +178,12 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     Raises:
         ValueError: unknown task.
     """
-    world = find_world(task)
+    env_source = find_world(task)
     returns = np.array([episode.total for episode in episodes])
-    goals = [_time_to_goal(world, episode) for episode in episodes]
+    goals = [_time_to_goal(env_source, episode) for episode in episodes]
     reached = np.array([time for time in goals if time is not None])
     success = None
-    if any(world.at_goal(episode) is not None for episode in episodes):
+    if any(env_source.at_goal(episode) is not None for episode in episodes):
         success = wilson_rate(len(reached), len(episodes))
     traces_by_episode = [motor_traces(episode) for episode in episodes]
     each_motor = (
@@ -191,7 +191,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
         for motor_index, _ in enumerate(episodes[0].motors)
     )
     return Evaluation(
-        task=world.name,
+        task=env_source.name,
         episodes=len(episodes),
         terminated=sum(episode.terminated for episode in episodes),
         returns=bootstrap_mean(returns),
@@ -204,7 +204,7 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
             if success is None
             else Interval(1 - success.mean, 1 - success.high, 1 - success.low)
         ),
-        time_to_goal=quartiles(reached) if world.timed and len(reached) else None,
+        time_to_goal=quartiles(reached) if env_source.timed and len(reached) else None,
         episode_returns=tuple(returns.tolist()),
         episode_times_to_goal=() if success is None else tuple(goals),
         # A motor's energies are means over the episodes, without intervals.
@@ -219,14 +219,14 @@ def summarize(task: str, episodes: Sequence[Episode]) -> Evaluation:
     )
 
 
-def _time_to_goal(world: EnvSource, episode: Episode) -> float | None:
+def _time_to_goal(env_source: EnvSource, episode: Episode) -> float | None:
     """Return the time from which a successful episode holds the goal [s]; None if it failed."""
-    step, at_goal = float(episode.time[0]), world.at_goal(episode)
+    step, at_goal = float(episode.time[0]), env_source.at_goal(episode)
     if at_goal is None:
         return None
     since = holds_since(at_goal) * step
     # Half a step is added because times are sums of floating-point steps.
-    succeeded = since + world.goal_hold < episode.time[-1] + 0.5 * step
+    succeeded = since + env_source.goal_hold < episode.time[-1] + 0.5 * step
     return since if succeeded else None
 
 

@@ -143,13 +143,11 @@ def advise(actuator: Any, task: str, evidence: Evidence) -> Advice:
     # them.
     untested = ""
     if max(delivery.at_rest, delivery.at_speed) > 1.0 + MARGIN:
-        untested = "it delivers more than is asked for"
+        untested = "it delivers more force than commanded"
     # The mean of correlated noise samples stays below half their standard deviation, so that noise
     # alone does not count as an offset.
     if delivery.unasked > max(0.02, delivery.noise / 2.0):
-        untested = (
-            f"it pushes with {delivery.unasked:.2g} of the largest force while nothing is asked for"
-        )
+        untested = f"it delivers {delivery.unasked:.2g} of the largest force at a command of zero"
     if untested:
         return Advice(task, delivery, losses, options, MEASURE, f"{untested}, which was not tested")
     verdict = decide(options)
@@ -261,21 +259,23 @@ def tested_points(evidence: Evidence, task: str) -> TestedPoints:
 
 def _reason(verdict: str, options: Mapping[str, LossBounds], delivery: Delivery) -> str:
     untrained = options[IDEAL]
-    text = f"policies that never met it lose {describe(untrained)}"
+    text = f"policies trained on ideal forces lose {describe(untrained)}"
     if verdict in (IDEAL, BUY):
         alternatives = ", ".join(
             f"{name} {describe(option)}" for name, option in options.items() if name != IDEAL
         )
         return (
-            text if verdict == IDEAL else f"{text}, and so do all others: {alternatives or 'none'}"
+            text
+            if verdict == IDEAL
+            else f"{text}; all other options lose too much: {alternatives or 'none'}"
         )
     if verdict == MEASURE:
         untested = [
             name for name, option in options.items() if option.upper is None and name != IDEAL
         ]
         return (
-            f"{text}; {' and '.join(untested) or 'what else there is'} was not tested with as much"
-            " on this task"
+            f"{text}; {' and '.join(untested) or 'any other option'} was not tested at this"
+            " severity on this task"
         )
     factor = f" by {1.0 / delivery.at_rest:.2f}" if verdict == COMMAND else ""
     chosen = options[verdict]
@@ -284,7 +284,7 @@ def _reason(verdict: str, options: Mapping[str, LossBounds], delivery: Delivery)
         if chosen.upper is not None and chosen.upper.is_negligible
         else ": buy another if that is too much"
     )
-    return f"{text}, with that{factor} {describe(chosen)}{caveat}"
+    return f"{text}; with this option{factor} {describe(chosen)}{caveat}"
 
 
 def describe(option: LossBounds) -> str:

@@ -312,7 +312,7 @@ def test_verdicts_of_lags_and_loops(evidence):
     late = advise(named_actuator("weaker", "pendulum"), "pendulum", evidence)
     assert late.verdict == LOOP
     assert late.options[LOOP].upper.loss.mean < 0.05
-    assert "with that 0.0" in late.reason
+    assert "with this option 0.0" in late.reason
 
 
 def test_randomization_is_preferred_if_it_is_as_good():
@@ -412,7 +412,7 @@ def test_a_force_without_command_is_not_called_negligible(evidence):
         paper, controller=dataclasses.replace(paper.controller, current_bias=0.1)
     )
     advice = advise(biased, "pendulum", evidence)
-    assert (advice.verdict, "nothing is asked for" in advice.reason) == (MEASURE, True)
+    assert (advice.verdict, "at a command of zero" in advice.reason) == (MEASURE, True)
     share = (
         0.1 * paper.motor.torque_constant / paper.motor.arm_radius / find_task("pendulum").max_force
     )
@@ -570,7 +570,7 @@ def test_the_command_line_reports_evidence_and_measurement(tmp_path, file, capsy
     words += ["--root", str(tmp_path / "runs")]
     assert cli.main(words) == 0
     shown = capsys.readouterr().out
-    assert f"{LOOP}: policies that never met it lose " in shown
+    assert f"{LOOP}: policies trained on ideal forces lose " in shown
     assert f"measured: {IDEAL}" in shown
     assert cli.main([*words, "--json"]) == 0
     content = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)

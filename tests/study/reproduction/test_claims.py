@@ -261,7 +261,7 @@ def test_the_running_mean_uses_the_available_values():
 
 
 def test_the_band_is_a_bootstrap_interval():
-    """Of the resamples of two values a and b, a quarter has the mean a and a quarter b."""
+    """A quarter of the resamples of two values a and b has the mean a, and a quarter b."""
     mean, low, high = band(np.array([[0.0, 1.0], [4.0, 1.0]]))
     assert (mean.tolist(), low.tolist(), high.tolist()) == ([2.0, 1.0], [0.0, 1.0], [4.0, 1.0])
     single_seed = band(np.array([[3.0, 4.0]]))

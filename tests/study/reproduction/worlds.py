@@ -8,7 +8,7 @@ from reproduction.arms import ARMS
 from reproduction.rows import COLUMNS, Trained
 
 SPREAD = np.array([-1.0, 0.0, 1.0, 0.5, -0.5])
-"""Of five seeds around what they are said to be."""
+"""Offsets of five seeds around the given values."""
 
 
 def made_up(
@@ -111,7 +111,7 @@ PAPERS = {
         for motor in ("paper gains", "ideal")
     },
 }
-"""What the paper reports."""
+"""Values that the paper reports."""
 
 OTHERS = PAPERS | {
     ("pendulum", "paper", "paper gains"): {"last": -1400, "test": -1413, "success": 0.0},
@@ -148,4 +148,4 @@ OTHERS = PAPERS | {
     ("acrobot", "paper", "ideal"): {"last": -90, "test": -81, "time": 16.0},
     ("cartpole", "paper", "paper gains"): {"test": 500, "epoch": 40, "largest": 0.119},
 }
-"""Much of which is not so."""
+"""Values that contradict many of the claims."""
