@@ -18,7 +18,7 @@ from codrl_mj.envs.config import EnvConfig
 from codrl_mj.physics import PHYSICS
 from codrl_mj.runs.files import write_json
 from codrl_mj.runs.summaries import read_run
-from codrl_mj.study.advice import measurement
+from codrl_mj.study.advice import plan_measurement
 from codrl_mj.tasks import PAPER_TASKS, TASKS, find_task, reference_of
 from codrl_mj.tasks.attributes import Fixed
 from codrl_mj.tasks.reference_env import ReferenceStates
@@ -249,9 +249,9 @@ def test_advice_for_a_run_of_the_arm_is_measured_only_with_trust(tmp_path):
     config = TrainConfig.preset(TASK, AGENT, total_steps=64)
     write_json(tmp_path / "run" / "config.json", {"train": config.as_mapping()})
     with pytest.raises(ValueError, match="--trust"):
-        measurement("lag", str(tmp_path / "run"), 2, tmp_path)
+        plan_measurement("lag", str(tmp_path / "run"), 2, tmp_path)
     assert (
-        measurement("lag", str(tmp_path / "run"), 2, tmp_path, trust=True).home.env.task
+        plan_measurement("lag", str(tmp_path / "run"), 2, tmp_path, trust=True).baseline.env.task
         == config.task
     )
 

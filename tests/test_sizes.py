@@ -13,7 +13,7 @@ from codrl_mj.evaluation import RandomPolicy, check_episodes, run_episodes
 from codrl_mj.identify.plan import plan
 from codrl_mj.identify.synthetic import Excitation, Sampler, simulate
 from codrl_mj.sizing import find_drive
-from codrl_mj.sizing.loop import step
+from codrl_mj.sizing.loop import step_responses
 
 MOTOR = "maxon-ec45-flat-50w"
 
@@ -73,7 +73,7 @@ def test_python_calls_raise_too():
     with pytest.raises(
         ValueError, match=r"sample_rate = 1e\+12: 120,000,000,000 samples of a step: .*; lower it"
     ):
-        step(fast)
+        step_responses(fast)
 
 
 @pytest.mark.usefixtures("small")

@@ -170,7 +170,7 @@ class Show:
 
 def _print_explanation(title: str, volts: float, explanation: dict[str, Any]) -> None:
     """Print the abilities of a motor, then its numbers, then the notes on them."""
-    from codrl_mj.sizing import unknown_in_words
+    from codrl_mj.sizing import describe_unknown
 
     def show(title: str, part: str) -> None:
         rows = [
@@ -213,7 +213,7 @@ def _print_explanation(title: str, volts: float, explanation: dict[str, Any]) ->
             print_text(
                 *(f"{kind} {text}" if kind == "source" else f"{kind}: {text}" for text in texts)
             )
-        print_text(unknown_in_words(explanation["unknown"]))
+        print_text(describe_unknown(explanation["unknown"]))
 
 
 _DESIGN_COLUMNS = (
@@ -265,7 +265,7 @@ class Design:
 
     def run(self) -> tuple[int, Any]:
         """Print the table and draw the Bode plot."""
-        from codrl_mj.sizing import LoopDesign, design, designs, sampled_too_seldom
+        from codrl_mj.sizing import LoopDesign, design, designs, undersampling_warning
 
         drive = self.changes.drive(self.name)
         chosen, all_designs = design(drive), designs(drive)
@@ -305,7 +305,7 @@ class Design:
         )
         print_text(
             *(f"not possible: {why}" for why in impossible),
-            sampled_too_seldom(drive),
+            undersampling_warning(drive),
             drive.assumed,
         )
         if self.out is not None:
@@ -338,10 +338,10 @@ class Step:
 
     def run(self) -> tuple[int, Any]:
         """Print the table and draw the responses."""
-        from codrl_mj.sizing import sampled_too_seldom, step
+        from codrl_mj.sizing import undersampling_warning, step_responses
 
         drive = self.changes.drive(self.name)
-        steps = step(drive)
+        steps = step_responses(drive)
         small, constant = steps.small, drive.motor.torque_constant
         settled, amplitude = small.settling_time(), float(small.reference[-1])
         responses = steps.recoveries.items()
@@ -366,7 +366,7 @@ class Step:
             for kind, response in recoveries.items()
         ]
         print_table("", columns, rows, right=columns[1:])
-        print_text(sampled_too_seldom(drive), drive.assumed)
+        print_text(undersampling_warning(drive), drive.assumed)
         if self.out is not None:
             from codrl_mj.viz.pages import diagrams
 

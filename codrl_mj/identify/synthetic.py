@@ -17,7 +17,7 @@ from codrl_mj.actuators.shaft import resistance_at
 from codrl_mj.fields import Checked, check_memory, check_names, real
 from codrl_mj.identify.columns import COLUMN_UNITS
 from codrl_mj.identify.log import Log
-from codrl_mj.runs.files import writing
+from codrl_mj.runs.files import atomic_write
 
 
 @dataclasses.dataclass(frozen=True)
@@ -300,7 +300,7 @@ def write_log(path: Path, log: Log) -> str:
     """Write a log as CSV (.csv or .csv.gz) atomically, and return its columns for `read_log`."""
     names = ["time", *log.signals]
     table = np.column_stack([log.time, *log.signals.values()])
-    with writing(path) as temporary:
+    with atomic_write(path) as temporary:
         np.savetxt(temporary, table, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
     texts = {
         name: f"mean({name})" if log.mean_voltage and name == "voltage" else name for name in names

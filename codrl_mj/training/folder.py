@@ -28,10 +28,10 @@ from codrl_mj.runs import (
     PROGRESS,
     RESULT,
     TENSORBOARD,
-    checkpoints,
+    find_checkpoints,
     finished,
 )
-from codrl_mj.runs.files import check_writable, leftovers, read_json
+from codrl_mj.runs.files import check_writable, temporary_files, read_json
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.user_code import UntrustedCodeError
 
@@ -139,7 +139,7 @@ def resume_command(run: Path) -> str:
 
 def describe_remains(run: Path) -> str:
     """Return a sentence on how to continue a training that was interrupted."""
-    if existing := checkpoints(run / CHECKPOINTS):
+    if existing := find_checkpoints(run / CHECKPOINTS):
         step = max(int(parts["step"]) for parts in existing.values())
         return f"Its last checkpoint is that of step {step:,}: continue with {resume_command(run)}"
     if (run / BEST / EVALUATION).exists():
@@ -153,7 +153,7 @@ def describe_remains(run: Path) -> str:
 def _leftovers(folder: Path) -> list[Path]:
     """Return temporary files of a training that were not completed."""
     return [
-        path for path, name in leftovers(folder) if name in _FILES or CHECKPOINT.fullmatch(name)
+        path for path, name in temporary_files(folder) if name in _FILES or CHECKPOINT.fullmatch(name)
     ]
 
 

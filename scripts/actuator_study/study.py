@@ -8,8 +8,8 @@ from actuator_study.exploration import explored
 from actuator_study.page import FOLDER, write
 from actuator_study.questions import trials
 from codrl_mj.fields import integer
-from codrl_mj.study.doses import SECONDS
-from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.axes import SECONDS
+from codrl_mj.study.grid import check_selection
 from codrl_mj.study.program import Program
 from codrl_mj.study.trials import Grid
 
@@ -37,7 +37,7 @@ class ActuatorStudy(Program):
     def __post_init__(self) -> None:
         """Validate."""
         super().__post_init__()
-        check_chosen("tasks", self.tasks, SECONDS)
+        check_selection("tasks", self.tasks, SECONDS)
 
     @property
     def grid(self) -> Grid:

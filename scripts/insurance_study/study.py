@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from codrl_mj.fields import integer
-from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.grid import check_selection
 from codrl_mj.study.program import Program
 from codrl_mj.study.trials import Grid
 from insurance_study.page import FOLDER, write
@@ -35,7 +35,7 @@ class InsuranceStudy(Program):
     def __post_init__(self) -> None:
         """Validate."""
         super().__post_init__()
-        check_chosen("tasks", self.tasks, TASKS)
+        check_selection("tasks", self.tasks, TASKS)
 
     @property
     def grid(self) -> Grid:

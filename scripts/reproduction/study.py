@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from codrl_mj.fields import integer
-from codrl_mj.study.grid import check_chosen
+from codrl_mj.study.grid import check_selection
 from codrl_mj.study.pages import write_csv
 from codrl_mj.study.program import Program
 from codrl_mj.study.trials import Arm, Grid
@@ -56,8 +56,8 @@ class Reproduction(Program):
     def __post_init__(self) -> None:
         """Validate."""
         super().__post_init__()
-        check_chosen("tasks", self.tasks, TASKS)
-        check_chosen("settings", self.settings, ("paper", "repaired"))
+        check_selection("tasks", self.tasks, TASKS)
+        check_selection("settings", self.settings, ("paper", "repaired"))
 
     @property
     def plan(self) -> dict[str, Any]:

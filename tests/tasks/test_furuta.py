@@ -19,7 +19,7 @@ from codrl_mj.catalogue import motor_entry
 from codrl_mj.envs.config import EnvConfig
 from codrl_mj.evaluation import run_episodes, summarize
 from codrl_mj.physics import MujocoPhysics, SimulationConfig
-from codrl_mj.sizing.scripted import Scripted, state_observed
+from codrl_mj.sizing.scripted import Scripted, observe_state
 from codrl_mj.tasks import TASKS, resolve_actuators
 from codrl_mj.tasks.furuta import MAX_TORQUE, ReferenceEnv
 from tests.envs.vectors import MODES, assert_equal_episodes, batched, looped
@@ -247,7 +247,7 @@ def test_episodes_start_hanging_within_the_reset_options():
 @every_actuator
 def test_the_scripted_controller_swings_up_and_balances(actuator):
     episodes = run_episodes(
-        Scripted(TASK), lambda: state_observed(EnvConfig("furuta", actuator).make()), 10, seed=0
+        Scripted(TASK), lambda: observe_state(EnvConfig("furuta", actuator).make()), 10, seed=0
     )
     assert summarize("furuta", episodes).success.mean == 1.0
 

@@ -19,16 +19,16 @@ from codrl_mj.actuators import (
 )
 from codrl_mj.sizing import (
     LoopDesign,
-    Looped,
+    CurrentLoopActuator,
     Response,
     abilities,
     closed_loop,
     design,
     open_loop,
-    small_step,
+    small_step_response,
 )
 from codrl_mj.sizing.abilities import diagram_limits, highest_current, torque_limits
-from codrl_mj.sizing.loop import Steps
+from codrl_mj.sizing.loop import StepResponses
 from codrl_mj.viz.pages.plots import Curve, Plot
 
 TORQUE_SPEED = "speed of the output [rad/s]", "torque of the output [N·m]"
@@ -36,7 +36,7 @@ TORQUE_SPEED = "speed of the output [rad/s]", "torque of the output [N·m]"
 _RECOVERY_SPAN, _CLOSE_UP_SPAN = (0.0, 60.0), (19.5, 24.0)
 """Time spans of a step out of saturation [ms]: the whole step, and a close-up."""
 
-Loops = Mapping[str, tuple[Looped, float | None]]
+Loops = Mapping[str, tuple[CurrentLoopActuator, float | None]]
 """Name of a current loop -> the loop, and the mechanical step [s] if it is not a drive's."""
 
 
@@ -333,7 +333,7 @@ def small_step_plots(loops: Loops) -> list[Plot]:
     """
     curves = []
     for index, (name, loop) in enumerate(loops.items()):
-        step = small_step(*loop)
+        step = small_step_response(*loop)
         settled, reference = step.settling_time(), float(step.reference[-1])
         num_samples = max(int(3.0 * np.searchsorted(step.time, settled)), 20)
         step = Response(*(column[:num_samples] for column in step))
@@ -357,7 +357,7 @@ def small_step_plots(loops: Loops) -> list[Plot]:
     ]
 
 
-def recovery_plots(drive: Drive, steps: Steps) -> list[Plot]:
+def recovery_plots(drive: Drive, steps: StepResponses) -> list[Plot]:
     """Return the recovery from an unreachable reference for each anti-windup, and a close-up."""
     responses = {}
     for kind, response in steps.recoveries.items():
@@ -396,7 +396,7 @@ def _responses(
     ]
 
 
-def _voltages(loop: Looped, responses: Mapping[str, Response]) -> Plot:
+def _voltages(loop: CurrentLoopActuator, responses: Mapping[str, Response]) -> Plot:
     """Return the voltage of responses, with the limits of the supply."""
     color = None if len(responses) > 1 else 1
     curves = [
