@@ -326,7 +326,9 @@ def test_an_angle_command_has_no_tracking_measures():
         is None
     )
     plots = _motor_plots(
-        _motor_series([RunEpisode("run", current_only, episode, None, None, 3)], list(episode.motors))
+        _motor_series(
+            [RunEpisode("run", current_only, episode, None, None, 3)], list(episode.motors)
+        )
     )
     assert "Error: desired less actual" not in [plot.title for plot in plots]
 

@@ -338,7 +338,7 @@ class Step:
 
     def run(self) -> tuple[int, Any]:
         """Print the table and draw the responses."""
-        from codrl_mj.sizing import undersampling_warning, step_responses
+        from codrl_mj.sizing import step_responses, undersampling_warning
 
         drive = self.changes.drive(self.name)
         steps = step_responses(drive)

@@ -70,8 +70,8 @@ class Feasible:
             feasibility,
             find_drive,
             find_entry,
-            with_best_gear,
             ignored_quantities,
+            with_best_gear,
         )
 
         drive = find_drive(
@@ -79,7 +79,8 @@ class Feasible:
         )
         entry = find_entry(self.name)
         continuous, unknown = (
-            entry.parameters.continuous_current if entry else None, ignored_quantities(entry),
+            entry.parameters.continuous_current if entry else None,
+            ignored_quantities(entry),
         )
         demand = demand_of(self.task_or_run, trust=self.trust, motor=self.motor)
         judgment = feasibility(drive, demand, continuous)
@@ -228,7 +229,9 @@ class Choose:
         for rank, (name, choice) in enumerate(choices):
             label = f"{choice.name} at {_gear_text(choice.drive, demands[name])}"
             unknown = _unknown_text(choice.unknown, choice.rejection_reason)
-            notes = "; ".join(filter(None, (choice.rejection_reason, unknown, choice.drive.assumed)))
+            notes = "; ".join(
+                filter(None, (choice.rejection_reason, unknown, choice.drive.assumed))
+            )
             if notes and (choice.rejection_reason or rank < len(shown)):
                 print_text(f"{label}: {notes}" if only_demand else f"{name}: {label}: {notes}")
         unsuitable = [ranking[0].name for ranking in ranked.values() if ranking[0].rejection_reason]

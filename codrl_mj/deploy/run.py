@@ -75,7 +75,11 @@ def run_board(
     """
     contract = Contract.read(folder)
     rows, missed, num_consecutive, late, reason = 0, 0, 0, 0, ""
-    with _open_port(port, baud) as line, atomic_write(log) as part, part.open("w", newline="") as file:
+    with (
+        _open_port(port, baud) as line,
+        atomic_write(log) as part,
+        part.open("w", newline="") as file,
+    ):
         table = csv.writer(file)
         table.writerow(column_names(contract) + motor_column_names(contract))
         wire = Wire(contract, line.fileno(), line.fileno())

@@ -11,7 +11,7 @@ import numpy as np
 from codrl_mj.identify.estimate import Fit, best_initial_state
 from codrl_mj.identify.log import Log, Segment, gapless_stretches, initial_state
 from codrl_mj.identify.parameters import DEFAULTS, OF_MOTOR, PARAMETERS
-from codrl_mj.runs.files import write_json, atomic_write
+from codrl_mj.runs.files import atomic_write, write_json
 
 Status = Literal["identified", "rough", "given", "ratio", "unidentifiable", "refused"]
 ACTUATOR = "actuator.yaml"  # name of the file in a folder of results

@@ -92,7 +92,9 @@ def ignored_quantities(entry: MotorEntry | None) -> tuple[str, ...]:
     if entry is None:
         return ("continuous current",)
     return tuple(
-        name.replace("_", " ") for name in _OPTIONAL_NUMBERS if getattr(entry.parameters, name) is None
+        name.replace("_", " ")
+        for name in _OPTIONAL_NUMBERS
+        if getattr(entry.parameters, name) is None
     )
 
 

@@ -75,7 +75,9 @@ def compute(
     no_signals: list[int] = []
     with (
         _backend(workers) as backend,
-        collecting_signals(signal.SIGINT) if local else contextlib.nullcontext(no_signals) as stop_signals,
+        collecting_signals(signal.SIGINT)
+        if local
+        else contextlib.nullcontext(no_signals) as stop_signals,
     ):
         parallel = joblib.Parallel(
             n_jobs=workers.jobs,

@@ -24,7 +24,7 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 
 from codrl_mj.runs import find_checkpoints
-from codrl_mj.runs.files import select_prefix, atomic_write
+from codrl_mj.runs.files import atomic_write, select_prefix
 
 NUM_CHECKPOINTS = 2
 """Number of checkpoints in a folder: the last, and the previous in case the last is damaged."""

@@ -31,7 +31,7 @@ from codrl_mj.runs import (
     find_checkpoints,
     finished,
 )
-from codrl_mj.runs.files import check_writable, temporary_files, read_json
+from codrl_mj.runs.files import check_writable, read_json, temporary_files
 from codrl_mj.training.config import TrainConfig
 from codrl_mj.user_code import UntrustedCodeError
 
@@ -153,7 +153,9 @@ def describe_remains(run: Path) -> str:
 def _leftovers(folder: Path) -> list[Path]:
     """Return temporary files of a training that were not completed."""
     return [
-        path for path, name in temporary_files(folder) if name in _FILES or CHECKPOINT.fullmatch(name)
+        path
+        for path, name in temporary_files(folder)
+        if name in _FILES or CHECKPOINT.fullmatch(name)
     ]
 
 

@@ -93,7 +93,8 @@ def rows(evidence: Evidence) -> Iterator[dict[str, Any]]:
                 "said": advice.verdict,
                 "measured": (
                     decide(options)
-                    if THROUGH in options or outcome.is_negligible else "not trained through"
+                    if THROUGH in options or outcome.is_negligible
+                    else "not trained through"
                 ),
                 "judged": judged(advice.verdict or MEASURE, options),
             }

@@ -6,8 +6,8 @@ from typing import Any
 
 from codrl_mj.actuators import Drive
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.bench import drive_with_designed_loop
 from codrl_mj.study.axes import AXES, REAL, arm, ideal_trial
+from codrl_mj.study.bench import drive_with_designed_loop
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import named_actuator
 

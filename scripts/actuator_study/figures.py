@@ -205,7 +205,8 @@ def chart(path: Path, evidence: Evidence) -> bool:
             [
                 [
                     list(_REGIONS).index(
-                        decide(option_bounds(
+                        decide(
+                            option_bounds(
                                 evidence,
                                 task,
                                 zero_severities | {"lag": lag, "supply": shortfall},

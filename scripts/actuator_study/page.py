@@ -21,12 +21,20 @@ from actuator_study.questions import (
 from actuator_study.units import THINGS, scale, severity_text, short, size
 from codrl_mj.runs.files import write_json
 from codrl_mj.study.advice import BUY, IDEAL, RANDOMIZE, THROUGH
-from codrl_mj.study.axes import AXES, FLOORS, SECONDS, ideal_trial, ideal
+from codrl_mj.study.axes import AXES, FLOORS, SECONDS, ideal, ideal_trial
 from codrl_mj.study.evidence import STUDIES, Evidence, Outcome
 from codrl_mj.study.inference import detectable_difference
-from codrl_mj.study.pages import TITLES, read_conclusions, markdown_table, write_csv, write_page
+from codrl_mj.study.pages import TITLES, markdown_table, read_conclusions, write_csv, write_page
 from codrl_mj.study.questions import LEVEL, MARGIN, Scores, Verdict, judge
-from codrl_mj.study.trials import FAILURE_MARGIN, RUNS, TOTALS, Collected, Trial, run_rows, trial_rows
+from codrl_mj.study.trials import (
+    FAILURE_MARGIN,
+    RUNS,
+    TOTALS,
+    Collected,
+    Trial,
+    run_rows,
+    trial_rows,
+)
 
 PAGE, FOLDER = "actuators.md", "actuators"
 """The page, and the folder beside it with its figures and tables."""
@@ -160,9 +168,12 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
             ]
             # Only severities below the first harmful one count, whatever follows.
             harmless = [
-                severity for severity, _ in itertools.takewhile(lambda pair: pair[1].is_negligible, known)
+                severity
+                for severity, _ in itertools.takewhile(lambda pair: pair[1].is_negligible, known)
             ]
-            harmful = next(((severity, outcome) for severity, outcome in known if outcome.is_harmful), None)
+            harmful = next(
+                ((severity, outcome) for severity, outcome in known if outcome.is_harmful), None
+            )
             factor, unit_text = scale(task, name)
             text = f"≤{short(factor * harmless[-1] if harmless else 0.0)}"
             if harmful is not None:
@@ -173,11 +184,12 @@ def _borne(evidence: Evidence, drawn: Mapping[str, Path]) -> str:
             else:
                 text += f" {unit_text}"
             rows[-1].append(text if known else "–")
+    margin = FAILURE_MARGIN
     return f"""## What policies bear
 
 Up to the first number it is harmless: ideal-trained policies lose at most {MARGIN:g} of the score on the mean, surely
-at most {FAILURE_MARGIN:g}, and a tenth of their success. From the second on it hurts: they surely lose more than {FAILURE_MARGIN:g},
-or a tenth of their success. In brackets: how many of 20 fail there, by losing more than {FAILURE_MARGIN:g}. Between the two,
+at most {margin:g}, and a tenth of their success. From the second on it hurts: they surely lose more than {margin:g},
+or a tenth of their success. In brackets: how many of 20 fail there, by losing more than {margin:g}. Between the two,
 measure.
 
 *Lag* is a time constant: a loop of bandwidth f has 1/(2 π f). *Missing force* is the share that a gear loses,
@@ -194,7 +206,10 @@ def _insured(drawn: Mapping[str, Path]) -> str:
     rows = [
         [
             TITLES[task],
-            *(severity_text(task, name, axis.training_severity[task]) for name, axis in AXES.items()),
+            *(
+                severity_text(task, name, axis.training_severity[task])
+                for name, axis in AXES.items()
+            ),
         ]
         for task in arms.TRAINED
     ]
@@ -372,7 +387,9 @@ def decided_table(verdicts: Sequence[Verdict], titles: Mapping[str, str]) -> str
         )
         rows.append([title, *map(str, (len(judged), len(decided), beyond))])
     return markdown_table(
-        ["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"], rows, numeric_columns=3
+        ["secondary comparisons", "of", "decided", f"by more than {MARGIN:g}"],
+        rows,
+        numeric_columns=3,
     )
 
 
@@ -432,8 +449,8 @@ CartPole's return is the paper's: steps within 0.1 m of the centre. In {TRIALS} 
 score below {1 - FAILURE_MARGIN:g}. Effects are differences of mean scores; policies
 count once on every task. Intervals are by Student's t, p of permutation tests, of equivalence by two one-sided ones
 with a margin of {MARGIN:g}; primary ones are corrected by Holm, the others by Benjamini and Hochberg. With {runs} seeds
-a difference of {detectable_difference(runs, LEVEL / 12):.2f} standard deviations is found with a chance of 80 % at the strictest
-level."""
+a difference of {detectable_difference(runs, LEVEL / 12):.2f} standard deviations is found with a
+chance of 80 % at the strictest level."""
     # Links may be longer than a line and must not be broken.
     wrapped = (
         textwrap.fill(" ".join(paragraph.split()), 120, break_long_words=False)

@@ -19,7 +19,7 @@ from actuator_study.arms import (
 )
 from codrl_mj.disturbances import Disturbances, Joint
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.axes import AXES, SECONDS, arm, ideal_trial, generic, ideal, study_env
+from codrl_mj.study.axes import AXES, SECONDS, arm, generic, ideal, ideal_trial, study_env
 from codrl_mj.study.questions import Contrast, Question
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
@@ -201,7 +201,8 @@ def primary() -> list[Question]:
             "motors",
             "On a good motor that exists, ideal-trained policies score as high as on ideal forces",
             tuple(
-                Contrast(on_motor(ideal(task), "good"), ideal_trial(ideal(task))) for task in SECONDS
+                Contrast(on_motor(ideal(task), "good"), ideal_trial(ideal(task)))
+                for task in SECONDS
             ),
             "equivalent",
         ),
@@ -283,7 +284,12 @@ def secondary() -> list[Question]:
     for task in MARGINAL:
         marginal_trial = on_motor(ideal(task), "marginal")
         contrasts.append(
-            ("motors", f"{task}: marginal motor over ideal", marginal_trial, ideal_trial(ideal(task)))
+            (
+                "motors",
+                f"{task}: marginal motor over ideal",
+                marginal_trial,
+                ideal_trial(ideal(task)),
+            )
         )
         statement = f"{task}, marginal motor: trained through it over ideal-trained"
         contrasts.append(

@@ -18,13 +18,13 @@ from actuator_study.page import (
     write_tables,
 )
 from actuator_study.units import THINGS, severity_text
-from codrl_mj.study.axes import AXES, FLOORS, ideal_trial, ideal
+from codrl_mj.study.axes import AXES, FLOORS, ideal, ideal_trial
 from codrl_mj.study.pages import (
     COLORS,
     TITLES,
-    read_conclusions,
     add_legend,
     markdown_table,
+    read_conclusions,
     save_figure,
     write_csv,
     write_page,
@@ -104,7 +104,9 @@ def summarize(collected: Collected, scores: Scores, trials: Iterable[Trial]) -> 
     pairs: list[tuple[float, float]] = []
     for trial in trials:
         success = collected.scores(trial, "success")
-        pairs += [(score, success.get(seed, np.nan)) for seed, score in scores.by_seed(trial).items()]
+        pairs += [
+            (score, success.get(seed, np.nan)) for seed, score in scores.by_seed(trial).items()
+        ]
     values = np.reshape(pairs, (-1, 2))
     return Summary(values[:, 0], values[:, 1])
 
@@ -174,8 +176,9 @@ def _things(collected: Collected, scores: Scores) -> str:
             rows.append(cells)
         title = f"{TITLES[task]}, a step of {1000 * find_task(task).step_duration:g} ms"
         tables.append(markdown_table([title, *_SHOWN.values()], rows))
+    margin = FAILURE_MARGIN
     text = f"""Look for what is most like yours. Mean score, 1 being ideal-trained policies on ideal forces and 0 random
-actions; how many of {PLANNED} policies fail, by losing more than {FAILURE_MARGIN:g}; how often episodes succeed. The highest
+actions; how many of {PLANNED} policies fail, by losing more than {margin:g}; how often episodes succeed. The highest
 mean is bold. *Random* actuators draw strength, lag and delay for every episode, and push; they reach as far as is said
 in brackets, or twice as far. *The same dose* is what it is tested on; *drawn* is that one thing alone, from none
 to twice as much, of forces and voltages at most 70 %. Forces are shares of the largest one, or N·m; voltages are shares
@@ -289,7 +292,9 @@ def _by_task(verdict: Verdict, scores: Scores) -> str:
         ]
         stratum = scores.stratum(pairs) if pairs else None
         texts.append(
-            "–" if stratum is None else f"{np.mean(stratum.treatment) - np.mean(stratum.control):+.2f}"
+            "–"
+            if stratum is None
+            else f"{np.mean(stratum.treatment) - np.mean(stratum.control):+.2f}"
         )
     return ", ".join(texts)
 

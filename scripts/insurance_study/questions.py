@@ -8,7 +8,7 @@ from actuator_study.arms import DRAWN
 from actuator_study.arms import drawn as drawn_severities
 from codrl_mj.disturbances import Disturbances
 from codrl_mj.envs.config import EnvConfig
-from codrl_mj.study.axes import AXES, arm, ideal_trial, ideal, study_env, timestep
+from codrl_mj.study.axes import AXES, arm, ideal, ideal_trial, study_env, timestep
 from codrl_mj.study.questions import Contrast, Question
 from codrl_mj.study.trials import Arm, Trial
 from codrl_mj.tasks import find_task
@@ -16,7 +16,8 @@ from insurance_study.late import Late
 
 TASKS = ("pendulum", "furuta", "acrobot")
 SEVERITIES: Mapping[str, Mapping[str, float]] = {
-    task: {axis: description.training_severity[task] for axis, description in AXES.items()} for task in TASKS
+    task: {axis: description.training_severity[task] for axis, description in AXES.items()}
+    for task in TASKS
 }
 """Task -> axis -> severity that is trained and tested.
 

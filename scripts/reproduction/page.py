@@ -4,7 +4,7 @@ import collections
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from codrl_mj.study.pages import TITLES, read_conclusions, markdown_table, write_page
+from codrl_mj.study.pages import TITLES, markdown_table, read_conclusions, write_page
 from codrl_mj.study.trials import format_ranges
 from reproduction import figures
 from reproduction.checks import NOT_TESTABLE, OUTCOMES, Verdict, medians, number

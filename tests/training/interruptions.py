@@ -33,7 +33,8 @@ outcome, differing = kill_test.outcome, kill_test.differing
 def begin(run, config):
     """Create a run folder in which a training has started and nothing is learned."""
     write_json(
-        run / "config.json", with_digest(prepare_run(run, config, resume=False, accept_changes=False))
+        run / "config.json",
+        with_digest(prepare_run(run, config, resume=False, accept_changes=False)),
     )
 
 

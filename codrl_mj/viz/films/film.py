@@ -21,7 +21,7 @@ import numpy as np
 from codrl_mj.envs.single import ActuatedEnv
 from codrl_mj.evaluation.episodes import Episode, run_episodes
 from codrl_mj.physics.offscreen import OffscreenRenderer
-from codrl_mj.runs.files import atomic_write, atomic_folder
+from codrl_mj.runs.files import atomic_folder, atomic_write
 from codrl_mj.viz.films.strip import (
     AXIS_WIDTH,
     HEADER_HEIGHT,

@@ -18,8 +18,8 @@ from codrl_mj.actuators import (
     parameters_type,
 )
 from codrl_mj.sizing import (
-    LoopDesign,
     CurrentLoopActuator,
+    LoopDesign,
     Response,
     abilities,
     closed_loop,

@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from codrl_mj.actuators import Drive
 from codrl_mj.catalogue import MotorEntry
-from codrl_mj.sizing import LoopDesign, design, designs, explain, step_responses, describe_unknown
+from codrl_mj.sizing import LoopDesign, describe_unknown, design, designs, explain, step_responses
 from codrl_mj.viz.pages import page
 from codrl_mj.viz.pages.diagrams import (
     Loops,

@@ -15,7 +15,7 @@ import jinja2
 from markupsafe import Markup
 
 from codrl_mj import __version__
-from codrl_mj.runs.files import check_page, atomic_write
+from codrl_mj.runs.files import atomic_write, check_page
 from codrl_mj.viz.pages.plots import Plot, describe, to_json, to_svg
 
 _HERE = Path(__file__).parent

@@ -19,10 +19,10 @@ from codrl_mj.runs.summaries import (
     RunSummary,
     compare,
     describe_rank,
+    median_seed,
     read_evaluation,
     read_reports,
     read_run,
-    median_seed,
 )
 from codrl_mj.sizing import CurrentLoopActuator, is_closed
 from codrl_mj.training.folder import load_config

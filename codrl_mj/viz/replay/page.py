@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from codrl_mj.evaluation.episodes import Episode
-from codrl_mj.runs.files import check_page, atomic_write
+from codrl_mj.runs.files import atomic_write, check_page
 from codrl_mj.viz.replay.scene import (
     TRIANGLES,
     Shape,
